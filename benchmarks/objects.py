@@ -107,7 +107,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     clicked = click_errors(tasks, range(FIRST_SEED, FIRST_SEED + count))
     touched = touch_errors(tasks, range(FIRST_SEED, FIRST_SEED + TAKES_OF_TOUCH * count))
     best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
-    offs = {f"{task} {name}": float(np.median(e.off_mm)) for (task, name), e in touched.items()}
+    offs = {
+        f"{task} {name}": float(np.median(one.off_mm)) if len(one.off_mm) else float("nan")
+        for (task, name), one in touched.items()
+    }
     return StageReport(
         stage="objects",
         machine=describe_machine(PACKAGES),
@@ -306,7 +309,7 @@ def _touch_table(touched: Mapping[tuple[str, str], TouchErrors]) -> ResultTable:
                 f"{one.share:.2f}",
                 _middle_and_most(one.off_mm),
                 _middle_and_most(one.first_mm),
-                "symmetric" if np.isnan(turned).all() else _middle_and_most(turned),
+                _middle_and_most(turned[~np.isnan(turned)]),
                 _middle_and_most(one.end_mm),
             )
         )
@@ -316,4 +319,6 @@ def _touch_table(touched: Mapping[tuple[str, str], TouchErrors]) -> ResultTable:
 
 
 def _middle_and_most(values: Float64[np.ndarray, " n"]) -> str:
+    if not len(values):
+        return "none"
     return f"{np.quantile(values, 0.5):.1f} / {np.quantile(values, 0.95):.1f}"

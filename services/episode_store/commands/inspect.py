@@ -21,6 +21,7 @@ from dextouch.episodes import (
     LocalGroup,
     RecordingReader,
     clicked_poses,
+    has_object_poses,
     shard_path,
     stream_arrays,
     touched_objects,
@@ -254,11 +255,12 @@ def clicks(context: Context) -> Outcome:
     rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
     for name, one in found.items():
         reader = context.store.open(name)
+        clicked = None
         if one is not None:
             is_lenient = name not in given.episodes
             clicked = clicked_poses(reader.attributes, given, one, may_lack_headings=is_lenient)
             rows += _clicked_rows(name, one, clicked)
-        rows += _touched_rows(reader, given, one)
+        rows += _touched_rows(reader, given, clicked)
     for line in table(rows):
         context.say(line)
     episodes = {name: one for name, one in found.items() if one is not None}
@@ -283,17 +285,19 @@ def _clicked_rows(
 
 
 def _touched_rows(
-    reader: EpisodeReader, objects: SceneObjects, clicked: EpisodeClicks | None
+    reader: EpisodeReader, objects: SceneObjects, clicked: ClickedPoses | None
 ) -> Iterator[tuple[str, ...]]:
-    """Places of objects that have `touch` and were not clicked, of an episode that succeeded."""
+    """Places that touch alone gives, of objects that neither clicks nor streams place."""
     about = reader.attributes
     listed = objects.tasks.get(about.task, ())
-    done = () if clicked is None else clicked.objects
-    if not about.success or all(one.touch is None for one in listed):
+    names = tuple(one.name for one in listed)
+    is_touched = about.success and any(one.touch is not None for one in listed)
+    if not is_touched or has_object_poses(reader) or about.object_names not in {(), names}:
         return
+    done = np.zeros(len(listed), dtype=np.bool_) if clicked is None else clicked.known
     track = touched_objects(EpisodeGrid(reader), objects)
     for index, one in enumerate(listed):
-        if one.touch is not None and one.name not in done:
+        if one.touch is not None and not done[index]:
             place = ("no clear hold", *[""] * 3)
             if track.known[0, index]:
                 place = _place(one, track.poses[0, index], track.sd_m[index])

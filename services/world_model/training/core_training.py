@@ -194,8 +194,8 @@ def _read_start(
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
     The noise of each object has its own standard deviation, of up to `pose_noise_m`; that of clicks
-    is in the poses already. Poses from touch say that the hand held the object, that is, the
-    outcome: such episodes start from what the reader sees, as all others without labels do.
+    is in the poses already. Poses from touch are those of takes that succeeded: where a task has
+    some, all of its episodes start from what the reader sees, or starts would tell the outcome.
     """
     true = data.table.objects_at(rows, start_step)
     sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()

@@ -62,8 +62,8 @@ class SceneTable:
 
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
     pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
-    measurement, `touched` those with poses from touch, and `placed_sd_m` is the standard deviation
-    of positions from clicks or touch, 0 of others.
+    measurement, `touched` those of tasks of which some have poses from touch, and `placed_sd_m` is
+    the standard deviation of positions from clicks or touch, 0 of others.
     `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
     given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
@@ -286,6 +286,7 @@ def scene_table(
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
     boxes_m = usual_boxes_m(episodes)
+    touched_tasks = {one.task for one, track in tracked if "touch" in track.sources}
     return SceneTable(
         sent=HandTable.of(sent),
         measured=HandTable.of(measured),
@@ -307,7 +308,7 @@ def scene_table(
         length=torch.tensor(lengths),
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
-        touched=torch.tensor(["touch" in track.sources for track in tracks]),
+        touched=torch.tensor([episode.task in touched_tasks for episode in episodes]),
         placed_sd_m=torch.from_numpy(np.stack([_sd_m(track) for track in tracks])),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),

@@ -36,7 +36,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
-from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
+from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
@@ -48,6 +48,8 @@ from services.world_model.training.transfer import Base
 logger = structlog.get_logger(__name__)
 # Fewer takes with clicks and touch correct no grip: their median would hardly be better than it.
 _LEAST_GRIPS: Final = 5
+# Larger corrections are made with a warning: the file may describe another grip or object.
+_LARGE_SHIFT_MM, _LARGE_TURN_DEG = 100.0, 45.0
 _NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
 
 
@@ -93,25 +95,29 @@ class SceneGrid(EpisodeGrid):
         track = super().objects
         if track is None:
             track = ObjectTrack.unknown(len(self), len(self.object_names))
-        if self._clicked is not None:
-            track = track.filled(self._clicked.track(len(self)))
-        if self._touched is None or track.known.any(axis=0).all():
-            return track
-        return track.filled(self._touched)
+        if not track.known.any(axis=0).all() and self._touched is not None:
+            track = track.filled(self._touched)
+        return track if self._clicked is None else track.filled(self._clicked.track(len(self)))
 
     @cached_property
     def _touched(self) -> ObjectTrack | None:
-        """Poses from touch, corrected if there is a correction; None where touch says nothing."""
-        if self._file is None or not self._is_touched:
+        """Poses from touch, corrected by clicks; None where touch says nothing."""
+        track = self._touched_alone
+        if track is None:
             return None
-        track = touched_objects(self, self._file)
-        if self._Ts_touched_object is None:
-            return track
-        Ts = transform_from_pose(track.poses.astype(np.float64)) @ self._Ts_touched_object
+        errors, is_clicked = self.grip_errors()
+        others = np.eye(4) if self._Ts_touched_object is None else self._Ts_touched_object
+        Ts = transform_from_pose(track.poses.astype(np.float64))
+        Ts = Ts @ np.where(is_clicked[:, None, None], errors, others)
         return replace(track, poses=pose_from_transform(Ts).astype(np.float32))
 
+    @cached_property
+    def _touched_alone(self) -> ObjectTrack | None:
+        may = self._file is not None and self._may_be_touched
+        return touched_objects(self, self._file) if may and self._file else None
+
     @property
-    def _is_touched(self) -> bool:
+    def _may_be_touched(self) -> bool:
         return self.success and any(one.touch is not None for one in self._listed)
 
     def grip_errors(
@@ -119,13 +125,14 @@ class SceneGrid(EpisodeGrid):
     ) -> tuple[Float64[np.ndarray, "objects 4 4"], Bool[np.ndarray, " objects"]]:
         """T_touched_object at the first step, of objects that were clicked and touched, too."""
         count = len(self.object_names)
-        if self._clicked is None or self._touched is None:
+        touched = self._touched_alone
+        if self._clicked is None or touched is None:
             return np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, dtype=np.bool_)
-        touched = transform_from_pose(self._touched.poses[0].astype(np.float64))
-        clicked = transform_from_pose(self._clicked.poses)
-        return invert(touched) @ clicked, np.logical_and(
-            self._clicked.known, self._touched.known[0]
-        )
+        # Objects that are absent have no error.
+        is_seen = np.logical_and(self._clicked.known, self._clicked.sd_m > 0)
+        before = transform_from_pose(touched.poses[0].astype(np.float64))
+        errors = invert(before) @ transform_from_pose(self._clicked.poses)
+        return errors, np.logical_and(is_seen, touched.known[0])
 
     def correct_grips(self, Ts_touched_object: Float64[np.ndarray, "objects 4 4"]) -> None:
         """Correct poses from touch by what grips of the task are off, before they are used."""
@@ -146,7 +153,7 @@ class SceneGrid(EpisodeGrid):
     def may_have_poses(self) -> bool:
         """Whether the pose of an object may be known at some step, as seen without reading it."""
         is_clicked = self._clicked is not None and bool(self._clicked.known.any())
-        return is_clicked or self._is_touched or has_object_poses(self.reader)
+        return is_clicked or self._may_be_touched or has_object_poses(self.reader)
 
 
 def load_scene_episodes(
@@ -308,22 +315,27 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
 
     What a grip is stated to be is off by much the same in all takes.
     """
-    grids = [one for one in episodes if isinstance(one, SceneGrid)]
-    for task, domain in sorted({(one.task, one.domain) for one in grids}):
-        of_both = [one for one in grids if (one.task, one.domain) == (task, domain)]
+    groups: dict[tuple[str, str, tuple[str, ...]], list[SceneGrid]] = {}
+    for one in episodes:
+        if isinstance(one, SceneGrid):
+            groups.setdefault((one.task, one.domain, one.object_names), []).append(one)
+    for (task, domain, names), of_both in sorted(groups.items()):
         errors = [one.grip_errors() for one in of_both]
         Ts, known = np.stack([T for T, _ in errors]), np.stack([is_known for _, is_known in errors])
         corrections = np.tile(np.eye(4), (known.shape[1], 1, 1))
         for index in np.flatnonzero(known.sum(axis=0) >= _LEAST_GRIPS):
             own = Ts[known[:, index], index]
-            turn = np.median(vector_from_rotation(own[:, :3, :3]), axis=0)
-            shift_m = np.median(own[:, :3, 3], axis=0)
-            corrections[index] = transform(rotation_from_vector(turn), shift_m)
-            logger.info(
-                "touch_corrected_by_clicks", task=task, domain=domain,
-                object=of_both[0].object_names[index],
-                shift_mm=round(1e3 * float(np.linalg.norm(shift_m)), 1),
-                turn_deg=round(float(np.rad2deg(np.linalg.norm(turn))), 1), takes=len(own),
+            R, shift_m = own[:, :3, :3], np.median(own[:, :3, 3], axis=0)
+            # The turn that is nearest to all others; a mean of turns far apart is none of them.
+            apart_rad = rotation_angle(np.swapaxes(R, 1, 2)[:, None] @ R)
+            turn = R[apart_rad.sum(axis=1).argmin()]
+            corrections[index] = transform(turn, shift_m)
+            shift_mm = 1e3 * float(np.linalg.norm(shift_m))
+            turn_deg = float(np.rad2deg(rotation_angle(turn)))
+            is_large = shift_mm > _LARGE_SHIFT_MM or turn_deg > _LARGE_TURN_DEG
+            (logger.warning if is_large else logger.info)(
+                "touch_corrected_by_clicks", task=task, domain=domain, object=names[index],
+                shift_mm=round(shift_mm, 1), turn_deg=round(turn_deg, 1), takes=len(own),
             )  # fmt: skip
         for one in of_both:
             one.correct_grips(corrections)
@@ -460,7 +472,8 @@ def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSetti
         raise InvalidInputError(
             f"--labelled-share {settings.labelled_share:g}: leaves no scene with known objects of "
             f"{', '.join(sorted(without))} to train on; choose a larger share, a smaller "
-            "--heldout-share, or click the objects of more episodes"
+            "--heldout-share, or click the objects of more episodes (`dextouch store clicks` lists "
+            "what clicks and touch give)"
         )
     return labelled
 

@@ -91,13 +91,13 @@ class TouchedAt(FrozenModel):
     Touch counts in takes that succeeded; how the object stands before is as `click` says.
 
     Attributes:
-        event: "grasp" for an object where it is first held; one that is not fixed moves with the
+        event: "grasp" for an object where it is held; one that is not fixed moves with the
             hand until it is let go. "release" for one where what was held is let go.
-        hand: the hand that holds; both if None, and then the middle between their grips counts.
+        hand: the hand that holds; both together if None, with the middle between their grips.
         point_m: the middle of the grip, in the object's frame; by default the middle of the box.
-        closing_deg: angle, as seen from above and counterclockwise, from the axis `heading` to the
-            direction from the thumb to the fingers (of both hands: from the left one to the right
-            one). Objects that are not symmetric need it.
+        closing_deg: of objects that are not symmetric, the angle, as seen from above and
+            counterclockwise, from the axis `heading` to the direction from the thumb to the fingers
+            (of both hands: from the left one to the right one).
     """
 
     event: Literal["grasp", "release"] = "grasp"
@@ -138,17 +138,20 @@ class SceneObject(FrozenModel):
             raise ValueError(
                 f"{self.name}: got box_m with half sizes {self.box_m[3:]}, expected positive ones"
             )
-        clicked = self.click.point_m or self.box_m[:3]
-        off_m = max(abs(clicked["xyz".index(axis)]) for axis in {*"xyz"} - {self.click.up[-1]})
-        if self.click.symmetric and off_m > _UNIT:
+        points = {"clicked": self.click.point_m, "touched": self.touch and self.touch.point_m}
+        for what, point_m in points.items() if self.click.symmetric else ():
+            place_m = point_m or self.box_m[:3]
+            off_m = max(abs(place_m["xyz".index(axis)]) for axis in {*"xyz"} - {self.click.up[-1]})
+            if off_m > _UNIT:
+                raise ValueError(
+                    f"{self.name}: got a symmetric object whose {what} point {place_m} is "
+                    f"{off_m:.3g} m from its axis of symmetry, expected it there; shift its frame"
+                )
+        if self.touch and (self.touch.closing_deg is None) is not self.click.symmetric:
             raise ValueError(
-                f"{self.name}: got a symmetric object whose clicked point {clicked} is {off_m:.3g} "
-                "m from its axis of symmetry, expected it there; shift its frame"
-            )
-        if self.touch and self.touch.closing_deg is None and not self.click.symmetric:
-            raise ValueError(
-                f"{self.name}: touch has no closing_deg, which an object needs that is not "
-                "symmetric; measure it, or set click.symmetric if it looks the same from all sides"
+                f"{self.name}: got touch.closing_deg {self.touch.closing_deg} and click.symmetric "
+                f"{self.click.symmetric}, expected an angle where it is not symmetric, and none "
+                "where it looks the same from all sides"
             )
         return self
 
@@ -163,6 +166,11 @@ class SceneObject(FrozenModel):
     def stream(self) -> str:
         """Name of the stream of its pose."""
         return object_stream(self.name)
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether a hand that touches it carries it."""
+        return self.touch is not None and self.touch.event == "grasp" and not self.fixed
 
 
 class SceneObjects(FrozenModel):
@@ -192,6 +200,13 @@ class SceneObjects(FrozenModel):
             for what, values in (("names", names), ("marker ids", ids)):
                 if len(set(values)) != len(values):
                     raise ValueError(f"task {task!r}: got {what} {values}, expected different ones")
+            held = [one.touch.hand for one in objects if one.touch and one.is_carried]
+            if len(set(held)) != len(held):
+                raise ValueError(
+                    f"task {task!r}: several objects are grasped and carried by the same hand "
+                    f"({', '.join(hand or 'both' for hand in held)}), whose holds touch cannot "
+                    "tell apart; expected one a hand, or `fixed` for those that stay"
+                )
             count = DICTIONARY_SIZES[self.dictionary]
             if max(ids, default=0) >= count:
                 raise ValueError(

@@ -16,7 +16,7 @@ TOUCHES = slice(10, 40)
 # The hand counts as closed two steps after the first contact.
 CLOSED, LAST = 12, 39
 THUMB, INDEX, PALM = 0, 1, 5
-TABLE_Z_M = 0.02
+TABLE_Z_M = 0.15
 BOX = {"name": "box", "box_m": [0.0, 0.0, 0.05, 0.03, 0.02, 0.05]}
 
 
@@ -102,15 +102,17 @@ def test_an_object_stands_is_carried_and_stays():
 def test_what_is_fixed_stays_where_it_was_touched():
     track = touched_objects(grid(pinched()), objects(fixed=True, **HELD))
     moving = touched_objects(grid(pinched()), objects(**HELD))
-    np.testing.assert_array_equal(track.poses, np.tile(moving.poses[:1], (NUM_STEPS, 1, 1)))
+    expected = np.tile(moving.poses[:1], (NUM_STEPS, 1, 1))
+    np.testing.assert_allclose(track.poses, expected, atol=1e-6)
 
 
 def test_what_a_thing_is_put_on_is_where_it_is_let_go():
-    touch = {"touch": {"event": "release", "hand": "right"}, "click": {"symmetric": True}}
+    stands = {"symmetric": True, "base_m": 0.2}
+    touch = {"touch": {"event": "release", "hand": "right"}, "click": stands}
     track = touched_objects(grid(pinched()), objects(**touch))
     Ts, (thumb, index) = wrist(), tips_m()[:2]
     middle_m = Ts[LAST, :3, :3] @ (0.5 * (thumb + index)) + Ts[LAST, :3, 3]
-    expected = np.tile([*middle_m[:2], TABLE_Z_M, 1, 0, 0, 0], (NUM_STEPS, 1))
+    expected = np.tile([*middle_m[:2], TABLE_Z_M + 0.2, 1, 0, 0, 0], (NUM_STEPS, 1))
     np.testing.assert_allclose(track.poses[:, 0], expected, atol=1e-6)
 
 
@@ -146,12 +148,54 @@ def test_both_hands_hold_between_them():
         pytest.param(pinched(side=0), {}, id="the other hand"),
         pytest.param([(1, INDEX, TOUCHES)], {}, id="without the thumb no direction"),
         pytest.param([], {}, id="touched nothing"),
+        pytest.param([(1, pad, slice(0, 40)) for pad in (THUMB, INDEX)], {}, id="held before"),
     ],
 )  # fmt: skip
 def test_an_unclear_hold_gives_no_pose(touches, changes):
     track = touched_objects(grid(touches, **changes), objects(**HELD))
     assert not track.known.any()
     assert track.sources == ("none",)
+
+
+def test_what_is_never_let_go_is_put_on_nothing():
+    forever = [(1, pad, slice(10, 60)) for pad in (THUMB, INDEX)]
+    stands = {"symmetric": True, "base_m": 0.2}
+    touch = {"touch": {"event": "release", "hand": "right"}, "click": stands}
+    assert not touched_objects(grid(forever), objects(**touch)).known.any()
+
+
+@pytest.mark.parametrize(
+    "touches",
+    [
+        pytest.param(pinched(), id="one hand alone"),
+        pytest.param(
+            [(0, PALM, slice(10, 34)), (1, PALM, slice(28, 52))], id="one hand after the other"
+        ),
+    ],
+)
+def test_both_hands_have_to_hold_together(touches):
+    track = touched_objects(grid(touches), objects(touch={}, click={"symmetric": True}))
+    assert not track.known.any()
+
+
+def test_a_grip_far_above_the_object_holds_something_else():
+    assert touched_objects(grid(pinched()), objects(**HELD)).known.all()
+    below = objects(**HELD | {"click": {"base_m": -0.15}})
+    assert not touched_objects(grid(pinched()), below).known.any()
+
+
+def test_a_glove_without_samples_goes_on_holding():
+    whole = grid(pinched())
+    gone = grid(
+        [(1, pad, part) for pad in (THUMB, INDEX) for part in (slice(10, 20), slice(30, 40))]
+    )
+    valid = np.ones((NUM_STEPS, 2), dtype=bool)
+    valid[20:30, 1] = False
+    gone.touch = lambda: (gone.kpa, valid)
+    expected = touched_objects(whole, objects(**HELD))
+    np.testing.assert_allclose(
+        touched_objects(gone, objects(**HELD)).poses, expected.poses, atol=1e-6
+    )
 
 
 def test_a_flicker_of_contact_does_not_end_a_hold():
@@ -162,9 +206,25 @@ def test_a_flicker_of_contact_does_not_end_a_hold():
 
 
 def test_one_that_is_not_symmetric_needs_the_direction_of_the_grip():
-    with pytest.raises(ValidationError, match="box: touch has no closing_deg"):
+    with pytest.raises(
+        ValidationError, match=r"touch\.closing_deg None and click\.symmetric False"
+    ):
         objects(touch={"hand": "right"})
     assert objects(touch={}, click={"symmetric": True}).tasks["lift"][0].touch.closing_deg is None
+
+
+def test_descriptions_that_touch_cannot_serve_are_refused():
+    held = {"touch": {"hand": "right", "closing_deg": 0.0}}
+    both = [BOX | held, BOX | held | {"name": "lid"}]
+    with pytest.raises(ValidationError, match="carried by the same hand"):
+        ObjectClicks.model_validate({"tasks": {"lift": both}})
+    both[1]["fixed"] = True
+    assert ObjectClicks.model_validate({"tasks": {"lift": both}})
+    symmetric = {"click": {"symmetric": True}}
+    with pytest.raises(ValidationError, match=r"closing_deg 0\.0 and click\.symmetric True"):
+        objects(touch={"closing_deg": 0.0}, **symmetric)
+    with pytest.raises(ValidationError, match="touched point"):
+        objects(touch={"point_m": [0.03, 0.0, 0.05]}, **symmetric)
 
 
 def test_an_episode_does_not_depend_on_how_its_objects_are_held():
