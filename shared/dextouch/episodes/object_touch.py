@@ -171,7 +171,7 @@ def _grip(
     pads_m: Float64[np.ndarray, "steps 6 3"], touches: Bool[np.ndarray, "steps 6"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"] | None]:
     """The middle of a grip in the wrist's frame, and the way from the thumb to the fingers."""
-    middles: list[Float64[np.ndarray, 3] | None] = []
+    middles: list[np.ndarray | None] = []
     for part in _PARTS:
         used = touches[:, part]
         takes_part = used.any(axis=1).mean() >= _PART_SHARE

@@ -113,8 +113,8 @@ class SceneObject(FrozenModel):
     as the head camera sees them or, if there are none, from the recorded stream `object_NAME` of a
     tracker, which sits on the object at `tracker_pose`, T_tracker_object. An object that is `fixed`
     stands still during a take: all sightings of its markers give one pose. `click` says how clicks
-    in an episode's first image give a pose, where neither measured it, and `touch` how hands touch
-    it, where nobody clicked either.
+    in an episode's first image give a pose, where neither measured it, and `touch` how hands hold
+    it, so that touch does.
     """
 
     name: ObjectName
