@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
+from torch.nn import functional
 
 from dextouch.errors import EndedError, InvalidInputError, UnavailableError
 from dextouch.hands.actions import (
@@ -33,6 +34,7 @@ from services.world_model.dynamics.features import (
     Commands,
     ObjectPoses,
     hand_motion,
+    instruction_features,
     poses_from_objects,
 )
 from services.world_model.dynamics.model import (
@@ -72,6 +74,8 @@ ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
 # at four times that length, since no longer ones were trained on.
 UNRELIABLE_HORIZONS, LAST_HORIZONS = 1.5, 4.0
+# Cosine of the same words in another order or with other punctuation.
+_SAME_INSTRUCTION = 0.999
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,8 @@ class StateWorld:
         self._dynamics = checkpoint.dynamics
         self._dynamics.trace()
         self._renderer = Renderer(checkpoint.renderer)
+        known = checkpoint.metadata.dynamics
+        self._instructions = instruction_features(known.instructions, known)
         self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
         config = self._metadata.dynamics
         self._description = WorldDescription(
@@ -226,6 +232,7 @@ class StateWorld:
             torch.from_numpy(first.tactile_kpa)[None],
             Commands.holding([motion]),
             torch.tensor([float(start.action_kind == "commanded")]),
+            instruction_features([start.instruction], self._metadata.dynamics),
         )
         rollout = StateRollout(
             task=start.task,
@@ -401,6 +408,8 @@ class StateWorld:
         elif distance > bounds.latent_distance:
             times = distance / bounds.latent_distance
             reason = f"hands are {times:.1f} times as far from training as allowed"
+        elif not self._knows_instruction(state):
+            reason = "the instruction is none of training"
         success = steps.success[:, index, -1]
         return Uncertainty(
             disagreement=disagreement_m,
@@ -411,6 +420,13 @@ class StateWorld:
             success_spread=float(success.max() - success.min()),
             size_deviation=self._size_deviation(state),
         )
+
+    def _knows_instruction(self, state: StateRollout) -> bool:
+        """Whether the model reads no instruction, or was trained with that of the rollout."""
+        cosines = functional.cosine_similarity(
+            self._instructions, state.memory.start.instruction[0], dim=1
+        )
+        return not self._instructions.numel() or float(cosines.max()) > _SAME_INSTRUCTION
 
     def _size_deviation(self, state: StateRollout) -> float:
         """Largest deviation of a movable object's size from the usual one, as a share of it."""

@@ -106,11 +106,17 @@ def untrained_checkpoint() -> Checkpoint:
 
 
 @functools.cache
-def untrained_state_checkpoint() -> StateCheckpoint:
-    """A small state model of random weights."""
+def untrained_state_checkpoint(instructions: tuple[str, ...] = ()) -> StateCheckpoint:
+    """A small state model of random weights, which may read instructions."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    config = DynamicsConfig(tasks=("stand_bottle",), num_objects=(1,), image_px=32, width=16)
+    config = DynamicsConfig(
+        tasks=("stand_bottle",),
+        num_objects=(1,),
+        image_px=32,
+        width=16,
+        instructions=instructions,
+    )
     dynamics = DynamicsModel(config, num_members=2)
     dynamics.codec.fit(10 * torch.rand(272, 320))
     shape = RendererConfig(widths=(8, 8), depths=(1, 1))

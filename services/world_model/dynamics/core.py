@@ -72,7 +72,7 @@ class SceneStart:
     … little, palm; left, right); `sd_m` is how uncertain each object's position is, on each axis of
     the table; `size` are factors of its usual width (x and y of its frame) and height (z);
     `commanded` is 1 for commanded actions and 0 for measured ones. `task` selects the objects'
-    boxes.
+    boxes; `instruction` are the features of the sentence, none for cores that read no instruction.
     """
 
     objects: ObjectPoses
@@ -82,6 +82,7 @@ class SceneStart:
     pads_kpa: Float32[Tensor, "*batch 12"]
     task: Int64[Tensor, "*batch"]
     commanded: Float32[Tensor, "*batch"]
+    instruction: Float32[Tensor, "*batch features"]
 
 
 @dataclass(frozen=True)
@@ -216,8 +217,8 @@ class RecurrentCore(nn.Module):
             linear(128, _SLOT_WIDTH), nn.GELU(),
         )  # fmt: skip
         self.hand = nn.Sequential(linear(_SLOT_WIDTH + OWN_SIZE, _HAND_WIDTH), nn.GELU())
-        # Whether actions are commanded, and whether a person acts.
-        flags = 2 if config.has_humans else 1
+        # Whether actions are commanded, whether a person acts, and the instruction.
+        flags = 1 + config.has_humans + config.instruction_size
         self.mix = nn.Sequential(
             linear(_SIDES * _HAND_WIDTH + flags, width), MemberNorm(members, width), nn.GELU()
         )
@@ -277,10 +278,12 @@ class RecurrentCore(nn.Module):
         return max(self.config.num_objects[index] for index in task.tolist())
 
     def _flags(self, start: SceneStart, human: Tensor | None) -> Float32[Tensor, "batch flags"]:
-        flags = [start.commanded]
+        flags = [start.commanded[:, None]]
         if self.config.has_humans:
-            flags.append(torch.zeros_like(start.commanded) if human is None else human)
-        return torch.stack(flags, dim=1)
+            flags.append(torch.zeros_like(flags[0]) if human is None else human[:, None])
+        if self.config.instructions:
+            flags.append(start.instruction)
+        return torch.cat(flags, dim=1)
 
     def first_state(
         self, start: SceneStart, holding: Commands, human: Float32[Tensor, " batch"] | None = None

@@ -1,6 +1,9 @@
 """What the dynamics read and predict: configuration, commands, hands, objects and touch."""
 
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import not_
 from typing import Final
 
 import numpy as np
@@ -17,6 +20,7 @@ from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
 from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.principal_axes import principal_axes, root_pressure
+from services.networks.subwords import subwords
 from services.world_model.dynamics.trees import mapped
 
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
@@ -42,6 +46,9 @@ BOX_AXES = [0, 0, 1, 0, 0, 1]
 _SHORTEST = 1e-3
 # Pads with a lower peak pressure count as free when contact is learned.
 FREE_KPA = 2.0
+# Chosen: a sentence has some 60 subwords, and few of them tell it from another one.
+_INSTRUCTION_SIZE = 64
+_SIGN_BIT = 1 << 31
 
 
 @dataclass(frozen=True)
@@ -142,6 +149,7 @@ class DynamicsConfig(FrozenModel):
     `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
     objects fill the first slots in the order of the episode's `object_names`. With the domain
     `human`, cores are given whose hands act, and predict the touch of either by heads of its own.
+    With `instructions`, the sentences of training, cores read the instruction of a rollout.
     """
 
     tasks: tuple[str, ...] = Field(min_length=1)
@@ -154,6 +162,12 @@ class DynamicsConfig(FrozenModel):
     domains: tuple[Domain, ...] = Field(
         default=_ROBOT_ALONE, exclude_if=lambda domains: domains == _ROBOT_ALONE
     )
+    instructions: tuple[str, ...] = Field(default=(), exclude_if=not_)
+
+    @property
+    def instruction_size(self) -> int:
+        """Size of `instruction_features`; 0 of cores that read no instruction."""
+        return _INSTRUCTION_SIZE if self.instructions else 0
 
     @property
     def has_humans(self) -> bool:
@@ -172,6 +186,23 @@ class DynamicsConfig(FrozenModel):
                 f"num_objects: got {self.num_objects}, expected 1 … {MAX_OBJECTS} for every task"
             )
         return self
+
+
+def instruction_features(
+    sentences: Sequence[str], config: DynamicsConfig
+) -> Float32[Tensor, "sentences features"]:
+    """Words and trigrams of sentences as vectors with a mean square of 1, by signed hashing.
+
+    The cosine of two is about the share of subwords that they have in common (Weinberger et al.
+    2009, eq. 1). Without words all are 0, and for cores that read no instruction there are none.
+    """
+    size = config.instruction_size
+    features = torch.zeros(len(sentences), size)
+    for row, sentence in zip(features, sentences, strict=True):
+        for part in subwords(sentence) if size else ():
+            digest = zlib.crc32(part.encode())
+            row[digest % size] += 1.0 if digest & _SIGN_BIT else -1.0
+    return functional.normalize(features, dim=1) * size**0.5
 
 
 @dataclass(frozen=True)

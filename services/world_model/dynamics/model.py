@@ -222,6 +222,7 @@ class DynamicsModel(nn.Module):
         tactile_kpa: Float32[Tensor, "batch 2 320"],
         holding: Commands,
         commanded: Float32[Tensor, " batch"],
+        instruction: Float32[Tensor, "batch features"],
     ) -> SceneMemory:
         """Estimate the scene at an observed step.
 
@@ -232,8 +233,9 @@ class DynamicsModel(nn.Module):
             tactile_kpa: pressure at that step.
             holding: the measured hands, from `Commands.holding`.
             commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
+            instruction: features of the sentence, from `instruction_features`.
         """
-        known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded)
+        known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded, instruction)
         readings: list[Reading] = [reader(first) for reader in self.readers()]
         start = stacked([SceneStart(one.objects, one.sd_m, one.size, *known) for one in readings])
         each, still = folded(start), holding.repeated(self.core.members)
@@ -415,7 +417,9 @@ def _batch_axis(name: str) -> int:
 
 def memory_arrays(memory: SceneMemory) -> dict[str, np.ndarray]:
     """Arrays of a single rollout's memory, for a snapshot."""
-    return {name: value.contiguous().numpy() for name, value in by_name(memory).items()}
+    # Models that read no instruction have none in their snapshots.
+    arrays = {name: value.contiguous().numpy() for name, value in by_name(memory).items()}
+    return {name: array for name, array in arrays.items() if array.size}
 
 
 def memory_from_arrays(
@@ -460,6 +464,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         pads_kpa=zeros(members, 1, NUM_PADS),
         task=torch.zeros((members, 1), dtype=torch.int64),
         commanded=zeros(members, 1),
+        instruction=zeros(members, 1, config.instruction_size),
     )
     state = CoreState(
         hidden=zeros(members, 1, config.width),
@@ -483,6 +488,8 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
 def _checked(name: str, arrays: Mapping[str, np.ndarray], expected: Tensor) -> Tensor:
     """One array of a snapshot as a tensor, within the range of what this world writes."""
     array, like = arrays.get(name), expected.numpy()
+    if not like.size:
+        return expected
     if array is None or array.shape != like.shape or array.dtype != like.dtype:
         got = "nothing" if array is None else f"{array.dtype.name} {array.shape}"
         raise InvalidInputError(

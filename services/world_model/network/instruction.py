@@ -8,7 +8,6 @@ a folder is given, on disk, so that serving known instructions needs no text enc
 
 import hashlib
 import html
-import re
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,16 +18,14 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+from services.networks.subwords import MAX_SUBWORDS, WORD, subwords
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.network.configuration import WanConfig
 
 InstructionKind = Literal["hashed_words", "subwords"]
 MAX_WORDS = 16
 NO_WORD = 0
-# Trigrams of at most 24 words of average length.
-MAX_SUBWORDS = 160
 NUM_SUBWORD_BUCKETS = 4096
-_WORD = re.compile(r"\w+")
 ENCODER_FOLDER: Final = "text_encoder"
 TOKENIZER_FOLDER: Final = "tokenizer"
 _KEY: Final = "features"
@@ -47,20 +44,13 @@ def instruction_ids(
 
 def hash_words(instruction: str, num_buckets: int) -> Int64[Tensor, " max_words"]:
     """Bucket of each of the first 16 words (lower case), padded with `NO_WORD`."""
-    words = _WORD.findall(instruction.lower())[:MAX_WORDS]
+    words = WORD.findall(instruction.lower())[:MAX_WORDS]
     return _padded([_bucket(word, num_buckets) for word in words], MAX_WORDS)
 
 
 def hash_subwords(instruction: str) -> Int64[Tensor, " max_subwords"]:
-    """Bucket of each word and of its trigrams, in lower case with a mark at both ends.
-
-    Words of one stem share trigrams, and words that share a bucket by chance differ by theirs.
-    """
-    parts = []
-    for word in _WORD.findall(instruction.lower()):
-        marked = f"<{word}>"
-        parts += [marked, *(marked[i : i + 3] for i in range(len(marked) - 2))]
-    ids = [_bucket(part, NUM_SUBWORD_BUCKETS) for part in parts[:MAX_SUBWORDS]]
+    """Bucket of each of the first 160 subwords."""
+    ids = [_bucket(part, NUM_SUBWORD_BUCKETS) for part in subwords(instruction)]
     return _padded(ids, MAX_SUBWORDS)
 
 

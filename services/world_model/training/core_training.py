@@ -167,6 +167,7 @@ def _draw(
             table.pads_kpa[rows, start_step],
             table.task[rows],
             (~measured).float(),
+            table.instruction[rows],
         ),
         commands=_held_still(commands, held),
         is_held=held,

@@ -24,6 +24,7 @@ from services.world_model.dynamics.features import (
     HandMotion,
     ObjectPoses,
     hand_motion,
+    instruction_features,
     objects_from_poses,
 )
 from services.world_model.dynamics.model import by_pad
@@ -69,7 +70,8 @@ class SceneTable:
     given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
     share in what is drawn, NaN if it follows from their number. `labelled` marks episodes whose
     object poses are trained on; `boxes_m` are the usual boxes of each task's objects in their
-    frames (middle, half sizes), and `size` factors of their width and height.
+    frames (middle, half sizes), and `size` factors of their width and height. `instruction` are the
+    features of each episode's sentence.
     """
 
     sent: HandTable
@@ -96,6 +98,7 @@ class SceneTable:
     placed_sd_m: Float32[Tensor, "episodes objects"]
     size: Float32[Tensor, "episodes objects 2"]
     boxes_m: Float32[Tensor, "tasks objects 6"]
+    instruction: Float32[Tensor, "episodes features"]
 
     def __len__(self) -> int:
         return len(self.success)
@@ -312,6 +315,7 @@ def scene_table(
         placed_sd_m=torch.from_numpy(np.stack([_sd_m(track) for track in tracks])),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
+        instruction=instruction_features([e.about.instruction for e in episodes], config),
     )
 
 

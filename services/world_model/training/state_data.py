@@ -400,8 +400,15 @@ def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
             raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
 
 
-def configured(data: StateData, settings: StateTrainSettings) -> DynamicsConfig:
+def configured(
+    data: StateData, settings: StateTrainSettings, base: Base | None = None
+) -> DynamicsConfig:
     """The configuration of a model of some episodes.
+
+    Args:
+        data: the episodes.
+        settings: of the training.
+        base: model that it starts from.
 
     Raises:
         InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or
@@ -426,7 +433,27 @@ def configured(data: StateData, settings: StateTrainSettings) -> DynamicsConfig:
         image_px=sides.pop(),
         width=settings.width,
         domains=("robot", "human") if data.has_both_domains else ("robot",),
+        instructions=_instructions(episodes, settings, base),
     )
+
+
+def _instructions(
+    episodes: Sequence[EpisodeGrid], settings: StateTrainSettings, base: Base | None
+) -> tuple[str, ...]:
+    """The sentences that cores learn to read; none if they read no instruction.
+
+    They do if some episodes have the same objects and another sentence: elsewhere the scene says
+    what is to be done.
+    """
+    sentences = {one.about.instruction for one in episodes}
+    base_reads = base is not None and bool(base.checkpoint.metadata.dynamics.instructions)
+    scenes = {(one.object_names, one.about.instruction) for one in episodes}
+    if not base_reads and len(scenes) == len({objects for objects, _ in scenes}):
+        return ()
+    if base is not None and not base_reads and settings.learn != "all":
+        logger.warning("instructions_not_read", reason="cores of --init do not; use --learn all")
+        return ()
+    return tuple(sorted(sentences))
 
 
 def drawn_episodes(data: StateData) -> Sequence[EpisodeGrid]:

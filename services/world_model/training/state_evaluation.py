@@ -148,6 +148,6 @@ def _imagined(dynamics: DynamicsModel, table: SceneTable, start: int) -> Imagine
         commands = table.commands(rows, start, torch.zeros(len(rows), dtype=torch.bool))
         touch = table.tactile_kpa[rows, start].float()
         sent = table.commanded[rows].float()
-        memory = dynamics.begin(first, touch, commands[:1], sent)
+        memory = dynamics.begin(first, touch, commands[:1], sent, table.instruction[rows])
         parts.append(dynamics.advance(memory, commands[1:])[1])
     return batched(parts)

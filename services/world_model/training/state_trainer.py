@@ -105,8 +105,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     command = _command(settings)
     data = load_state_data(settings)
     training, heldout = data.training, data.heldout
-    config = configured(data, settings)
     base = None if settings.init is None else Base(settings.init)
+    config = configured(data, settings, base)
     check_new(data, settings, base)
     if base is not None:
         settings = _with_base(base, config, settings)
@@ -260,6 +260,7 @@ class _Work:
         # Which scenes are labelled depends on whether some of them are held out.
         is_split = self.settings.heldout is None
         text = f"{version} {chosen} {self.data_hash} {base} {self.config.domains} {is_split}"
+        text += "".join(f" {sentence}" for sentence in self.config.instructions)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

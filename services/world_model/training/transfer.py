@@ -57,8 +57,12 @@ class Base:
             )
         if keeps_tasks:
             return own
-        domains = own.domains if own.has_humans else config.domains
-        of_data = {"tasks": config.tasks, "num_objects": config.num_objects, "domains": domains}
+        of_data = {
+            "tasks": config.tasks,
+            "num_objects": config.num_objects,
+            "domains": own.domains if own.has_humans else config.domains,
+            "instructions": config.instructions,
+        }
         return own.model_copy(update=of_data)
 
     def has_tasks_of(self, config: DynamicsConfig) -> bool:
@@ -107,7 +111,7 @@ class Base:
             for name, value in known.named_parameters()
             if learns_all or not name.startswith(_SUCCESS)
         }
-        core.load_state_dict(_with_humans(kept, core), strict=False)
+        core.load_state_dict(_with_new_inputs(kept, known.config, core), strict=False)
         self._copy_tasks(config, core.state_dict(), known.state_dict())
         core.lowest.copy_(known.lowest)
         core.highest.copy_(known.highest)
@@ -126,17 +130,28 @@ class Base:
         return core
 
 
-def _with_humans(kept: dict[str, Tensor], core: RecurrentCore) -> dict[str, Tensor]:
-    """Weights of a core that knows robots alone, for one that tells people from robots.
+def _with_new_inputs(
+    kept: dict[str, Tensor], own: DynamicsConfig, core: RecurrentCore
+) -> dict[str, Tensor]:
+    """Weights of a core for one that also tells people from robots, or reads an instruction.
 
-    Its new input, the last one, has no effect at first, and people feel as robots do.
+    The new inputs have no effect at first, and people feel as robots do. The last inputs are
+    whether a person acts, and then the instruction.
     """
     shapes = {name: value.shape for name, value in core.named_parameters()}
     known = dict(kept)
+    new_sentence = core.config.instruction_size - own.instruction_size
     for name, value in kept.items():
         missing = shapes[name][1] - value.shape[1] if value.ndim == 3 else 0
         if missing:
-            known[name] = functional.pad(value, (0, 0, 0, missing))
+            sentence = value[:, value.shape[1] - own.instruction_size :]
+            before = functional.pad(
+                value[:, : value.shape[1] - own.instruction_size],
+                (0, 0, 0, missing - new_sentence),
+            )
+            known[name] = functional.pad(
+                torch.cat([before, sentence], dim=1), (0, 0, 0, new_sentence)
+            )
     for name in shapes:
         robots = name.removeprefix("human.")
         if name not in kept and robots in kept:

@@ -252,6 +252,7 @@ def start(batch=2, seed=0):
         torch.rand(batch, 12, generator=generator),
         torch.arange(batch) % 2,
         torch.ones(batch),
+        torch.zeros(batch, 0),
     )
 
 
@@ -365,7 +366,9 @@ def begun(model, tasks=(0, 1)):
         torch.tensor(tasks),
     )  # fmt: skip
     touch = 5 * torch.rand(batch, 2, 320, generator=torch.Generator().manual_seed(3))
-    return model.begin(first, touch, Commands.holding([motion] * batch), torch.ones(batch))
+    return model.begin(
+        first, touch, Commands.holding([motion] * batch), torch.ones(batch), torch.zeros(batch, 0)
+    )
 
 
 def lifted(num_steps):

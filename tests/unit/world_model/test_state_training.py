@@ -268,7 +268,7 @@ def test_rollouts_from_the_middle_are_measured_with_true_context(config):
     commands = held_out.commands(rows, 32, torch.zeros(8, dtype=torch.bool))
     first = held_out.first_steps(rows, torch.full((8,), 32))
     touch = held_out.tactile_kpa[:, 32].float()
-    memory = dynamics.begin(first, touch, commands[:1], torch.ones(8))
+    memory = dynamics.begin(first, touch, commands[:1], torch.ones(8), torch.zeros(8, 0))
     _, imagined = dynamics.advance(memory, commands[1:])
     off_mm = 1e3 * (imagined.poses.position_m[:, -1, 0] - true).norm(dim=-1)
     np.testing.assert_allclose(measured["object_mm_from_32_chunk_1"], off_mm.median(), atol=1e-3)
@@ -506,6 +506,7 @@ def test_a_core_feels_the_size_that_was_read(config, table):
     start = SceneStart(
         table.objects_at(rows, 0), torch.zeros(2, 3), torch.ones(2, 3, 2),
         torch.zeros(2, 2, 8), table.pads_kpa[rows, 0], table.task[rows], torch.ones(2),
+        torch.zeros(2, 0),
     )  # fmt: skip
     boxes = []
     core.slot.register_forward_pre_hook(lambda _, inputs: boxes.append(inputs[0]))

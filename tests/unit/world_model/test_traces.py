@@ -56,6 +56,7 @@ def inputs(model, seed, *, batch=1, latents=4, task=0):
         torch.ones(members, batch, MAX_OBJECTS, 2),
         normal(members, batch, 2, config.touch_channels), normal(members, batch, NUM_PADS),
         torch.full((members, batch), task), torch.ones(members, batch),
+        torch.zeros(members, batch, 0),
     )  # fmt: skip
     state = CoreState(
         normal(members, batch, config.width), each.position_m, each.axes,

@@ -43,6 +43,7 @@ def asked(dynamics, table, start):
         table.tactile_kpa[rows, start].float(),
         commands[:1],
         table.commanded[rows].float(),
+        table.instruction,
     )
     found = []
     for first in range(1, len(commands), 4):
