@@ -191,6 +191,7 @@ class Experiments:
             "human": (human, f"human-pretraining {by_devices} {moving}"),
             "downstream": (sizes.downstream_per_task, "downstream"),
             "downstream-human": (downstream_human, f"downstream {by_devices}"),
+            "demonstrations": (sizes.downstream_per_task, "downstream --exact --images 8"),
         }
         for name in ("robot", "cans", "downstream"):
             heldout = f"{amounts[name][1]} --first {_FIRST_HELDOUT_SEED}"
@@ -385,16 +386,6 @@ class Experiments:
             needs=(imagined,),
         )
 
-    def _policy(self, name: str, flags: str, *needs: Step, early: bool = False) -> Step:
-        """A policy cloned from demonstrations, and the same early in training if asked for."""
-        return _step(
-            name,
-            f"train policy --episodes data/downstream/store {flags} "
-            f"--training.num-training-steps {self.sizes.policy_steps} --output {name}/{_POLICY}",
-            *((_POLICY, _EARLY_POLICY) if early else (_POLICY,)),
-            needs=(self._data["downstream"], *needs),
-        )
-
     def _evaluator(self) -> Iterator[Step]:
         """Adapted world models and their judges, and a study of policies in them and the twin."""
         named = [(world, seed) for world in ADAPTED for seed in self.seeds]
@@ -402,7 +393,15 @@ class Experiments:
         judges = {f"{world} {seed}": self._judge(world, seed) for world, seed in named}
         for model in worlds.values():
             yield self._rolled_out(model, data="downstream")
-        cloned = self._policy("evaluator/policy", "--splits A,B --early-at 0.15", early=True)
+        cloned = _step(
+            "evaluator/policy",
+            "train policy --episodes data/downstream/store --splits A,B --early-at 0.15 "
+            f"--training.num-training-steps {self.sizes.policy_steps} "
+            f"--output evaluator/policy/{_POLICY}",
+            _POLICY,
+            _EARLY_POLICY,
+            needs=(self._data["downstream"],),
+        )
         policies = {"cloned": _POLICY, "cloned early": _EARLY_POLICY}
         files = {name: f"{cloned.name}/{made}" for name, made in policies.items()}
         scripts = "".join(f'[policies."{name}"]\nscript = "{name}"\n' for name in SCRIPTS)
@@ -418,14 +417,22 @@ class Experiments:
         policies: dict[str, Step] = {}
         for seed in self.seeds:
             for column in GENERATED:
-                flags, needs = f"--splits {'A,B' if column == 'Real' else 'B'}", list[Step]()
-                if column.startswith("+"):
-                    needs = [self._demonstrations(column, seed)]
-                    flags += f" --imagined {needs[0].name}/store"
-                policies[policy_of(column, seed)] = self._policy(
-                    f"generation/{column}/seed-{seed}/policy",
-                    f"{flags} --training.seed {seed}",
-                    *needs,
+                is_generated = column.startswith("+")
+                model = self._adapted(
+                    column.removeprefix("+") if is_generated else "WM-Robot", seed
+                )
+                needs = [self._data["demonstrations"], model]
+                flags = f"--splits {'A,B' if column == 'Real' else 'B'}"
+                if is_generated:
+                    needs.append(self._demonstrations(column, seed))
+                    flags += f" --imagined {needs[-1].name}/store"
+                name = f"generation/{column}/seed-{seed}/policy"
+                policies[policy_of(column, seed)] = _step(
+                    name,
+                    f"train policy --episodes data/demonstrations/store {flags} "
+                    f"--places {model.name}/{_MODEL} --output {name}/{_POLICY}",
+                    _POLICY,
+                    needs=tuple(needs),
                 )
         files = {name: f"{step.name}/{_POLICY}" for name, step in policies.items()}
         yield self._study("generation", {}, files, tuple(policies.values()))
@@ -435,11 +442,11 @@ class Experiments:
         name = f"generation/{column}/seed-{seed}/demonstrations"
         return _step(
             name,
-            f"generate --episodes data/downstream/store --split {_UNSEEN_SPLIT} "
+            f"generate --episodes data/demonstrations/store --split {_UNSEEN_SPLIT} "
             f"--store {name}/store --checkpoint {model.name}/{_MODEL} "
             f"--count {self.sizes.num_generated} --strips {name}/strips.html",
             "store",
-            needs=(self._data["downstream"], model),
+            needs=(self._data["demonstrations"], model),
         )
 
     def _study(

@@ -115,8 +115,8 @@ COMMANDS = {
         "pipelines.parsers:imagined_parser",
     ),
     "train policy": Command(
-        "train a closed-loop policy on demonstrations",
-        "evaluation.command_line:run_train_policy",
+        "train a policy on demonstrations",
+        "pipelines.place_policy:run_train_policy",
         "evaluation_train_policy",
     ),
     "train judge": Command(

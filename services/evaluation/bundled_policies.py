@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -26,10 +25,15 @@ class Bundled:
 
 
 _POLICIES: Final = "services.evaluation.policies"
+# Classes of policies that `dextouch train policy` writes, by the kind of their checkpoint. Those of
+# places also need the start readers of a world model, so that they join two services.
+TRAINED: Final[Mapping[str, str]] = {
+    "cloned-policy": f"{_POLICIES}.behaviour_cloning:BehaviourCloningPolicy",
+    "place-policy": "services.pipelines.place_policy:PlacePolicy",
+}
 BUNDLED: Final[Mapping[str, Bundled]] = {
-    "behaviour-cloning": Bundled(
-        f"{_POLICIES}.behaviour_cloning:BehaviourCloningPolicy.load", DEFAULT_POLICY
-    ),
+    # With another checkpoint, any policy of `dextouch train policy`.
+    "behaviour-cloning": Bundled(f"{__name__}:trained_policy", DEFAULT_POLICY),
     # Knows only the tasks stand_bottle and open_drawer.
     "colour-servo": Bundled(f"{_POLICIES}.colour_servo:ColourServo"),
     "hold": Bundled(f"{_POLICIES}.replay:HoldPolicy"),
@@ -53,11 +57,28 @@ def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
     Raises:
         NotFoundError, CorruptDataError: a checkpoint that cannot be read.
     """
-    module, _, factory = BUNDLED[name].factory.partition(":")
+    make = _imported(BUNDLED[name].factory)
     path = checkpoint_of(name, checkpoint)
-    make: Any = attrgetter(factory)(import_module(module))
     made: Policy = make() if path is None else make(path)
     return made
+
+
+def trained_policy(path: Path) -> "Policy":
+    """Load a policy of `dextouch train policy`, of any kind.
+
+    Raises:
+        NotFoundError, CorruptDataError, InvalidInputError: a file that is no such policy.
+    """
+    from services.evaluation.trained_networks import load_checkpoint
+
+    checkpoint = load_checkpoint(path, kind=tuple(TRAINED))
+    made: Policy = _imported(TRAINED[checkpoint.metadata.kind])(checkpoint)
+    return made
+
+
+def _imported(address: str) -> Any:  # noqa: ANN401 - a class or function
+    module, _, name = address.partition(":")
+    return getattr(import_module(module), name)
 
 
 def training_starts_of(policy: "Policy") -> tuple[str, ...]:

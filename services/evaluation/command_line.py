@@ -60,8 +60,8 @@ def run_train_policy(arguments: list[str]) -> int:
         early_at=settings.early_at,
     )
     if early is not None:
-        _keep(early, settings.early_output(), None)
-    return _keep(finished, settings.output, settings.json_path)
+        keep(early, settings.early_output(), None)
+    return keep(finished, settings.output, settings.json_path)
 
 
 def run_train_judge(arguments: list[str]) -> int:
@@ -90,7 +90,7 @@ def run_train_judge(arguments: list[str]) -> int:
             settings.training,
             command=command_line("probe", arguments),
         )
-        return _keep(calibrated, settings.output, settings.json_path)
+        return keep(calibrated, settings.output, settings.json_path)
     checkpoint = train_success_classifier(
         read(settings.episodes),
         settings.training,
@@ -99,10 +99,11 @@ def run_train_judge(arguments: list[str]) -> int:
         held_out=read(settings.held_out),
         jobs=settings.jobs,
     )
-    return _keep(checkpoint, settings.output, settings.json_path)
+    return keep(checkpoint, settings.output, settings.json_path)
 
 
-def _keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
+def keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
+    """Write a checkpoint, and its figures if wanted; print both."""
     save_checkpoint(output, checkpoint)
     print(f"{output}  {output.stat().st_size / 1e6:.2f} MB")
     for name, value in checkpoint.metadata.metrics.items():

@@ -116,10 +116,16 @@ class ClassifierSettings(FrozenModel):
 
 
 class TrainPolicySettings(CommandSettings):
-    """Train a closed-loop policy on the successful robot episodes of some stores.
+    """Train a policy on the successful robot episodes of some stores.
+
+    By default a closed-loop network on images, touch and poses. With `--places`, the start readers
+    of a state model find the objects in the first image, and whole motions are a regression on
+    these places: it is fitted in seconds and needs far fewer demonstrations, which have to start
+    alike, but it does not react to what happens later.
 
     Example:
       dextouch train policy --episodes runs/episodes --output runs/cloned.safetensors
+      dextouch train policy --episodes runs/episodes --places runs/lab.safetensors
     """
 
     model_config = service_config("evaluation_train_policy", "dextouch train policy")
@@ -132,6 +138,9 @@ class TrainPolicySettings(CommandSettings):
     tasks: Tasks = ()
     splits: Splits = ()
     image_px: ImagePx = USUAL_IMAGE_PX
+    places: Path | None = Field(
+        default=None, description="state model whose start readers find the objects"
+    )
     imagined: tuple[str, ...] = Field(
         default=(), description="additional stores of imagined episodes; --splits does not apply"
     )

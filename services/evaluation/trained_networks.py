@@ -75,8 +75,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     write_weights(path, checkpoint.tensors, checkpoint.metadata, _METADATA_KEY)
 
 
-def load_checkpoint(path: Path, *, kind: str) -> Checkpoint:
-    """Read a checkpoint of one kind.
+def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
+    """Read a checkpoint of a kind, or of one of several.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
@@ -85,8 +85,11 @@ def load_checkpoint(path: Path, *, kind: str) -> Checkpoint:
     tensors, metadata, _ = read_weights(
         path, CheckpointMetadata, _METADATA_KEY, max_bytes=2 * MAX_CHECKPOINT_BYTES
     )
-    if metadata.kind != kind:
-        raise InvalidInputError(f"checkpoint {path.name}: got {metadata.kind}, expected {kind}")
+    kinds = (kind,) if isinstance(kind, str) else kind
+    if metadata.kind not in kinds:
+        raise InvalidInputError(
+            f"checkpoint {path.name}: got {metadata.kind}, expected {' or '.join(kinds)}"
+        )
     return Checkpoint(metadata, tensors)
 
 

@@ -15,9 +15,9 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging
+from services.evaluation.bundled_policies import trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.perceptual_networks import Metric
-from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.prediction import (
@@ -134,9 +134,9 @@ def recorded_main(arguments: Sequence[str]) -> int:
             description,
             probe,
             trained_on={
-                f"policy {name!r}": policy.metadata.training_starts
+                f"policy {name!r}": starts
                 for name, policy in policies.items()
-                if isinstance(policy, BehaviourCloningPolicy)
+                if (starts := training_starts_of(policy))
             },
         )
     print("\n".join(score_lines(scores)))
@@ -173,7 +173,7 @@ def _policies(options: argparse.Namespace) -> dict[str, Policy]:
     for source in sources:
         add(source.name, source.load(options.policy_arguments.get(source.name, {})))
     for name, path in options.cloned:
-        add(name, BehaviourCloningPolicy.load(path))
+        add(name, trained_policy(path))
     if options.hold:
         add("hold", HoldPolicy())
     return policies
