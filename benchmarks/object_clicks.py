@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import clicked_poses
+from dextouch.episodes import EpisodeGrid, clicked_poses
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform_from_pose
 from dextouch.schemas import (
@@ -27,6 +27,10 @@ from services.twin.stage import Stage
 
 SIDES_PX: Final = (64, 320, 480)
 NOISE_PX: Final = (0, 1, 2, 3)
+# Standard deviation of a person's click on each axis, in an image of 480 px.
+USUAL_NOISE_PX: Final = 3.0
+# Shorter ways between two clicks, as shares of the image, say no direction.
+_LEAST_WAY: Final = 1.2 / 64
 # Of every object of a take.
 NUM_DRAWS: Final = 25
 # Sides of a box that differ by less look alike: such an object gets one click.
@@ -159,7 +163,7 @@ def _errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> ClickError
         about, K = start.about(side_px), start.camera(side_px)
         objects = SceneObjects(tasks={start.task: start.objects})
         for index, (one, true) in enumerate(zip(start.objects, start.Ts_world_object, strict=True)):
-            exact_px = _places_px(one, start, K, true)
+            exact_px = _places_px(one, start.T_world_camera, K, true)
             for _ in range(NUM_DRAWS):
                 noisy = (exact_px + noise_px * draw.normal(size=(2, 2))).clip(0, side_px)
                 point_px, heading_px = ((u, v) for u, v in noisy.tolist())
@@ -182,8 +186,38 @@ def _errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> ClickError
     return ClickErrors(np.array(off), np.array(turned), np.array(told), share)
 
 
+def clicked_image(
+    take: EpisodeGrid,
+    objects: Sequence[SceneObject],
+    draw: np.random.Generator,
+    noise_px: float = USUAL_NOISE_PX,
+) -> EpisodeClicks:
+    """Clicks on the first image of a take of the twin, with normal noise (px of 480).
+
+    Objects that lie outside the image, or whose direction cannot be told from it, are hidden.
+    """
+    Ts = transform_from_pose(take.reader.read("object_poses").values[0])
+    side_px = take.image_size_px[0]
+    clicks = {}
+    for one, T in zip(objects, Ts, strict=True):
+        exact_px = _places_px(one, take.anchor.T_world_camera_head, take.K_head, T)
+        noisy = exact_px + noise_px * side_px / 480 * draw.normal(size=(2, 2))
+        point_px, heading_px = ((u, v) for u, v in noisy.clip(0, side_px).tolist())
+        length_px = np.linalg.norm(np.subtract(heading_px, point_px))
+        is_seen = (noisy[0] >= 0).all() and (noisy[0] <= side_px).all()
+        if is_seen and (one.click.symmetric or length_px > _LEAST_WAY * side_px):
+            heading = None if one.click.symmetric else heading_px
+            clicks[one.name] = ObjectClick(point_px=point_px, heading_px=heading)
+        else:
+            clicks[one.name] = ObjectClick(state="hidden")
+    return EpisodeClicks(objects=clicks)
+
+
 def _places_px(
-    one: SceneObject, start: _Start, K: Float64[np.ndarray, "3 3"], T: Float64[np.ndarray, "4 4"]
+    one: SceneObject,
+    T_world_camera: Float64[np.ndarray, "4 4"],
+    K: Float64[np.ndarray, "3 3"],
+    T: Float64[np.ndarray, "4 4"],
 ) -> Float64[np.ndarray, "2 2"]:
     """Where the middle of the top of a box is seen, and a place farther along its longer side."""
     box_m = np.array(one.box_m)
@@ -192,5 +226,5 @@ def _places_px(
     top_m[up] += box_m[3 + up] * (-1 if one.click.up[0] == "-" else 1)
     farther_m = top_m.copy()
     farther_m[ahead] += _SHARE_OUT * box_m[3 + ahead]
-    points_m = apply(invert(start.T_world_camera) @ T, np.stack([top_m, farther_m]))
+    points_m = apply(invert(T_world_camera) @ T, np.stack([top_m, farther_m]))
     return project(K, points_m)[0]

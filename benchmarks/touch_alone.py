@@ -1,20 +1,24 @@
-"""The stage `touch`: a world model of takes whose objects nothing but touch has located."""
+"""The stage `touch`: a world model of takes whose objects touch, and some clicks, have located."""
 
 import argparse
 import json
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from benchmarks.figures import Requirement
 from benchmarks.machine import describe_machine
+from benchmarks.object_clicks import clicked_image
 from benchmarks.object_touch import GRIPS, described_objects
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.reproduction.steps import Step, run
 from benchmarks.stages import Bar
-from dextouch.episodes import EpisodeGrid, EpisodeStore
+from dextouch.episodes import EpisodeGrid, EpisodeStore, split_of
 from dextouch.errors import ConflictError
-from dextouch.schemas import ObjectClicks
+from dextouch.schemas import EpisodeClicks, ObjectClicks, SceneObject
 
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 NUM_TAKES: Final = 84
@@ -31,6 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--tasks", default=",".join(GRIPS), metavar="A,B", help="(%(default)s)")
     init = "state model of other tasks to adapt, such as `evaluator/pretrained/model/"
     add("--init", type=Path, metavar="PATH", help=init + "model.safetensors` of a reproduction")
+    add("--clicks", type=int, default=0, help="first images a task that are clicked (%(default)s)")
     keep = Path("runs/touch")
     add("--keep", type=Path, default=keep, help="folder of data and results (%(default)s)")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
@@ -52,14 +57,19 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         exits=(0, 1),
     )
     _run([data], keep)
-    _strip(keep)
+    _strip(keep, options.clicks)
     _run(_trainings(options, data), keep)
     scores = json.loads((keep / "scored" / _SCORES).read_text(encoding="utf-8"))
     trust: dict[str, dict[str, Any]] = scores["trust"]
     return StageReport(
         stage="touch",
         machine=describe_machine(PACKAGES),
-        options={"takes": options.takes, "tasks": options.tasks, "init": options.init is not None},
+        options={
+            "takes": options.takes,
+            "tasks": options.tasks,
+            "clicks": options.clicks,
+            "init": options.init is not None,
+        },
         tables=[_table(trust)],
         panels=[],
         requirements=[
@@ -82,8 +92,8 @@ def _run(steps: list[Step], keep: Path) -> None:
         raise ConflictError(f"touch: {failed[0]} failed; its log is in {keep / failed[0]}")
 
 
-def _strip(keep: Path) -> None:
-    """The takes as a lab has them, and the file of their objects.
+def _strip(keep: Path, num_clicked: int) -> None:
+    """The takes as a lab has them, and the file of their objects, with clicks on some first images.
 
     Of the twin remain what devices recorded, the outcome, and the seed, which names the scene.
     """
@@ -94,12 +104,18 @@ def _strip(keep: Path) -> None:
         "object_boxes_m": (),
         "event_times_s": {},
     }
-    tasks = {}
+    tasks: dict[str, tuple[SceneObject, ...]] = {}
+    clicks: dict[str, EpisodeClicks] = {}
+    counts: Counter[str] = Counter()
+    draw = np.random.default_rng(0)
     for name in source.list():
         reader = source.open(name)
-        about = reader.attributes
+        about, take = reader.attributes, EpisodeGrid(reader)
         if about.task not in tasks:
-            tasks[about.task] = described_objects(EpisodeGrid(reader))
+            tasks[about.task] = described_objects(take)
+        if counts[about.task] < num_clicked and split_of(about) in ("A", "B"):
+            clicks[name] = clicked_image(take, tasks[about.task], draw)
+            counts[about.task] += 1
         if lab.exists(name):
             continue
         with lab.writer(kind="episode", attributes=about.model_copy(update=hidden)) as writer:
@@ -108,7 +124,8 @@ def _strip(keep: Path) -> None:
                     kept = reader.read(stream.name)
                     writer.add_stream(stream)
                     writer.append(stream.name, values=kept.values, t_ref_ns=kept.t_ref_ns)
-    (keep / _OBJECTS).write_text(ObjectClicks(tasks=tasks).model_dump_json(), encoding="utf-8")
+    described = ObjectClicks(tasks=tasks, episodes=clicks)
+    (keep / _OBJECTS).write_text(described.model_dump_json(), encoding="utf-8")
 
 
 def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:

@@ -6,8 +6,9 @@ import pytest
 
 from benchmarks import touch_alone
 from benchmarks.command import stage_parser
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, split_of
 from dextouch.errors import ConflictError
+from dextouch.schemas import load_object_clicks
 from services.world_model.checkpoints import read_state_checkpoint
 
 
@@ -23,7 +24,8 @@ def bar(*_):
 
 @pytest.mark.slow
 def test_takes_without_poses_train_a_model_and_are_scored(tmp_path):
-    report = touch_alone.measure(options("--takes", "30", "--keep", str(tmp_path)), tmp_path, bar)
+    given = options("--takes", "30", "--clicks", "3", "--keep", str(tmp_path))
+    report = touch_alone.measure(given, tmp_path, bar)
     ((task, num_takes, *_),) = report.tables[0].rows
     assert task == "stand_bottle"
     assert int(num_takes) >= 3
@@ -34,7 +36,11 @@ def test_takes_without_poses_train_a_model_and_are_scored(tmp_path):
         assert not about.object_names
         assert not about.event_times_s
     sources = read_state_checkpoint(tmp_path / "model/model.safetensors").metadata.object_sources
-    assert set(sources) == {"touch", "none"}
+    assert {"touch", "none"} < set(sources)
+    clicks = load_object_clicks(tmp_path / "objects.json").episodes
+    assert len(clicks) == 3
+    splits = {split_of(lab.open(name).attributes) for name in clicks}
+    assert splits <= {"A", "B"}
 
 
 def test_a_command_that_fails_is_named(tmp_path):
