@@ -53,10 +53,10 @@ LEAST_DEMONSTRATIONS: Final = 5
 # Motions are combinations of at most this many principal ones; 48 suffice for chunks of the cloned
 # policy, too.
 _NUM_COMPONENTS: Final = 48
-# An axis of an object counts as much as a shift by this much: about the half length of one.
-_AXIS_M: Final = 0.15
-# Places that vary less in demonstrations say nothing.
+# Inputs that vary less in demonstrations say nothing (m). A turn of an object counts as the way of a
+# point this far from its middle, about the half length of an object.
 _LEAST_SD: Final = 1e-3
+_AXIS_M: Final = 0.15
 # Places are clipped to this many standard deviations: beyond them a trend is a guess.
 _FARTHEST: Final = 3.0
 # Chosen: a linear trend of this variance, with smooth deviations of variance 1 and a length of some
