@@ -53,8 +53,8 @@ LEAST_DEMONSTRATIONS: Final = 5
 # Motions are combinations of at most this many principal ones; 48 suffice for chunks of the cloned
 # policy, too.
 _NUM_COMPONENTS: Final = 48
-# Inputs that vary less in demonstrations say nothing (m). A turn of an object counts as the way of a
-# point this far from its middle, about the half length of an object.
+# Inputs that vary less in demonstrations say nothing (m). A turn of an object counts as the way of
+# a point this far from its middle, about the half length of an object.
 _LEAST_SD: Final = 1e-3
 _AXIS_M: Final = 0.15
 # Places are clipped to this many standard deviations: beyond them a trend is a guess.
