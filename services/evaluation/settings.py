@@ -120,7 +120,7 @@ class TrainPolicySettings(CommandSettings):
 
     By default a closed-loop network on images, touch and poses. With `--places`, the start readers
     of a state model find the objects in the first image, and whole motions are a regression on
-    these places: it is fitted in seconds and needs far fewer demonstrations, which have to start
+    these places: it is fitted in seconds and needs far fewer demonstrations, which have to go
     alike, but it does not react to what happens later.
 
     Example:
