@@ -91,17 +91,18 @@ class Sizes(FrozenModel):
 
     The paper has 5 h of robot and up to 100 h of human data, that is 20 times as much. `multiples`
     are human episodes as multiples of the robot episodes, `pretraining_per_task` robot episodes
-    with mistakes for the model that is adapted, `adapt_half` the robot and the human episodes of
-    WM-Mix.
+    with mistakes for the model that is adapted. `adapt_robot_per_task` are the robot episodes of
+    WM-Robot, `adapt_half_per_task` the robot ones and the human ones of WM-Mix, 200 and 100 as in
+    the paper; `downstream_per_task` are the scenes of which two thirds have to suffice for them.
     """
 
     robot_per_task: int = Field(default=4, ge=2)
     multiples: tuple[int, ...] = (1, 5, 10)
     pretraining_per_task: int = Field(default=200, ge=2)
     heldout_per_task: int = Field(default=6, ge=1)
-    downstream_per_task: int = Field(default=84, ge=3)
-    adapt_robot: int = Field(default=200, ge=1)
-    adapt_half: int = Field(default=100, ge=1)
+    downstream_per_task: int = Field(default=315, ge=3)
+    adapt_robot_per_task: int = Field(default=200, ge=1)
+    adapt_half_per_task: int = Field(default=100, ge=1)
     tokenizer_cpu_s: int = Field(default=60, ge=1)
     train_cpu_s: int = Field(default=300, ge=1)
     option_cpu_s: int = Field(default=120, ge=1)
@@ -109,8 +110,8 @@ class Sizes(FrozenModel):
     core_steps: int = Field(default=2000, ge=2)
     pretraining_reader_steps: int = Field(default=1000, ge=2)
     pretraining_core_steps: int = Field(default=1500, ge=2)
-    adapt_reader_steps: int = Field(default=500, ge=1)
-    adapt_core_steps: int = Field(default=1000, ge=1)
+    adapt_reader_steps: int = Field(default=2000, ge=1)
+    adapt_core_steps: int = Field(default=1500, ge=1)
     core_batch: int = Field(default=32, ge=1)
     drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
@@ -124,8 +125,8 @@ QUICK: Final = Sizes(
     pretraining_per_task=8,
     heldout_per_task=1,
     downstream_per_task=24,
-    adapt_robot=8,
-    adapt_half=4,
+    adapt_robot_per_task=2,
+    adapt_half_per_task=1,
     tokenizer_cpu_s=3,
     train_cpu_s=6,
     option_cpu_s=4,
@@ -179,7 +180,8 @@ class Experiments:
         num_robot = sizes.robot_per_task * len(ROBOT_PRETRAINING)
         # Two more, of which alignment may refuse some; two thirds of the scenes have to suffice.
         human = 2 + max(sizes.multiples) * num_robot // len(HUMAN_PRETRAINING)
-        downstream_human = 3 + 2 * sizes.adapt_half // len(DOWNSTREAM)
+        # Of these, the splits B and C, about two thirds, are adapted on.
+        downstream_human = 3 + 16 * sizes.adapt_half_per_task // 10
         # Demonstrations move all the time; the default mix has takes in which nothing does, whose
         # images any prediction gets right.
         moving = "--mix demonstrations"
@@ -187,10 +189,10 @@ class Experiments:
         amounts = {
             "robot": (sizes.robot_per_task, f"robot-pretraining {moving}"),
             "cans": (sizes.robot_per_task, f"{_CANS} --exact"),
-            "pretraining": (sizes.pretraining_per_task, "robot-pretraining"),
+            "pretraining": (sizes.pretraining_per_task, "robot-pretraining --images 4"),
             "human": (human, f"human-pretraining {by_devices} {moving}"),
-            "downstream": (sizes.downstream_per_task, "downstream"),
-            "downstream-human": (downstream_human, f"downstream {by_devices}"),
+            "downstream": (sizes.downstream_per_task, "downstream --images 4"),
+            "downstream-human": (downstream_human, f"downstream {by_devices} --images 4"),
             "demonstrations": (sizes.downstream_per_task, "downstream --exact --images 8"),
         }
         for name in ("robot", "cans", "downstream"):
@@ -348,9 +350,11 @@ class Experiments:
             num_human=self._num_human(max(sizes.multiples)),
             flags="--human-share 0.2",
         )
+        num_robot = len(DOWNSTREAM) * sizes.adapt_robot_per_task
+        num_half = len(DOWNSTREAM) * sizes.adapt_half_per_task
         flags = {
-            "WM-Robot": f"--robot-episodes {sizes.adapt_robot}",
-            "WM-Mix": f"--robot-episodes {sizes.adapt_half} --human-episodes {sizes.adapt_half} "
+            "WM-Robot": f"--robot-episodes {num_robot}",
+            "WM-Mix": f"--robot-episodes {num_half} --human-episodes {num_half} "
             "--human data/downstream-human/store",
         }
         name = f"evaluator/{world}/seed-{seed}/model"
