@@ -217,9 +217,12 @@ class RecordStore:
         with suppress(StorageError, UnavailableError):
             await self._store.delete(key)
 
-    async def write(self, record: RolloutRecord) -> int:
-        """Replace the version that the record was computed from, and return the new one."""
-        info = record.info.model_dump(mode="json")
+    async def write(self, record: RolloutRecord, info: Mapping[str, Any] | None = None) -> int:
+        """Replace the version that the record was computed from, and return the new one.
+
+        `info` is the record's as JSON, where the caller has it.
+        """
+        info = info or record.info.model_dump(mode="json")
         return await self._store.set(
             _key_of(record.info.id),
             record.to_bytes(info),

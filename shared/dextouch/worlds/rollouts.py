@@ -181,7 +181,7 @@ class RolloutService:
             )
             # No chunk has this response; it is kept for those who watch.
             record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
-            version = await self._records.write(record)
+            version = await self._records.write(record, parts[0]["rollout"])
         self._keep(RolloutRecord(info, b"", version=version, note=note), started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         return Answer(record.payload, parts)
@@ -311,7 +311,7 @@ class RolloutService:
         record = RolloutRecord(
             info, outcome.snapshot, request_sha256, payload, stored.version, note
         )
-        version = await self._records.write(record)
+        version = await self._records.write(record, parts[0]["rollout"])
         self._keep(RolloutRecord(info, b"", version=version, note=note), outcome.stepped.state)
         stored_s = time.perf_counter() - began_s - encoded_s
         spent_s = {"queue": outcome.queued_s, "device": outcome.device_s}
