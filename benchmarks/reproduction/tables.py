@@ -367,10 +367,14 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     title = "Policy evaluation"
     success = tuple(_success_rows(report, experiments))
     pages = []
-    for of, estimate in (("judges' probabilities", _judged), ("worlds' own estimates", _own)):
-        *estimates, pooled = _estimate_rows(folder, estimate)
+    for of, estimate, truth in (
+        ("judges' probabilities of success", _judged, _succeeded),
+        ("worlds' own estimates of success", _own, _succeeded),
+        ("rubric scores", _rubric, _rubric),
+    ):
+        *estimates, pooled = _estimate_rows(folder, estimate, truth)
         pages += [
-            Page(f"{title}: the {of} of success", tuple(estimates)),
+            Page(f"{title}: the {of}", tuple(estimates)),
             Page(f"{title}: the two worlds by the {of}", (pooled,)),
         ]
     return [
@@ -396,24 +400,36 @@ def _own(score: RolloutScore) -> float | None:
     return score.world_probability
 
 
-def _estimate_rows(folder: Path, estimate: Callable[[RolloutScore], float | None]) -> Iterator[Row]:
-    """How well estimates of success say what succeeds in the twin, by task and seed.
+def _rubric(score: RolloutScore) -> float | None:
+    """Share of the task's points: by what the twin reports, or as a judge expects it."""
+    return score.rubric_score
 
-    AUC is of single rollouts; correlation and MMRV are of the means of policies, over all rollouts,
-    decided or not. The last row compares the two worlds.
+
+def _succeeded(score: RolloutScore) -> float | None:
+    return float(score.success)
+
+
+def _estimate_rows(
+    folder: Path,
+    estimate: Callable[[RolloutScore], float | None],
+    truth: Callable[[RolloutScore], float | None],
+) -> Iterator[Row]:
+    """How well estimates in imagined worlds say what the twin gives, by task and seed.
+
+    AUC is of single rollouts, where the truth is yes or no; correlation and MMRV are of the means
+    of policies, over all rollouts, decided or not. The last row compares the two worlds.
     """
     outcomes = StudyResults.read(folder / "evaluator/study/results").outcomes.values()
     scores = [one for one in outcomes if isinstance(one, RolloutScore)]
-    succeeded = {(o.task, o.policy, o.seed): o.success for o in scores if o.world == REAL}
+    true = {(o.task, o.policy, o.seed): truth(o) for o in scores if o.world == REAL}
+    known = {key: value for key, value in true.items() if value is not None}
     found: dict[tuple[str, str], list[EstimateFigures]] = {}
     means: dict[str, list[np.ndarray]] = {world: [] for world in ADAPTED}
     for world in ADAPTED:
         names = sorted({one.world for one in scores if one.world.startswith(f"{world} ")})
         for name in names:
             own = [one for one in scores if one.world == name]
-            figures = {
-                task: estimate_figures(own, succeeded, task, estimate) for task in DOWNSTREAM
-            }
+            figures = {task: estimate_figures(own, known, task, estimate) for task in DOWNSTREAM}
             for task, figure in figures.items():
                 found.setdefault((world, task), []).append(figure)
             means[world].append(np.concatenate([one.policy_means for one in figures.values()]))
@@ -430,7 +446,7 @@ def _estimate_rows(folder: Path, estimate: Callable[[RolloutScore], float | None
 
 
 class EstimateFigures(NamedTuple):
-    """Agreement of estimates in a world with success, and their means by policy."""
+    """Agreement of estimates in a world with the truth, and their means by policy."""
 
     auc: float
     pearson: float
@@ -440,7 +456,7 @@ class EstimateFigures(NamedTuple):
 
 def estimate_figures(
     scores: Sequence[RolloutScore],
-    succeeded: Mapping[tuple[str, str, int], bool],
+    true: Mapping[tuple[str, str, int], bool | float],
     task: str,
     estimate: Callable[[RolloutScore], float | None] = _own,
 ) -> EstimateFigures:
@@ -448,25 +464,25 @@ def estimate_figures(
 
     Args:
         scores: of rollouts in one imagined world.
-        succeeded: real outcome by task, policy and seed; rollouts without one are left out.
+        true: success (0 or 1) or score in the real world by task, policy and seed; rollouts
+            without one are left out.
         task: to measure.
-        estimate: of a rollout's success.
+        estimate: of it, of a rollout.
     """
     used = [
-        (one.policy, value, succeeded[one.task, one.policy, one.seed])
+        (one.policy, value, float(true[one.task, one.policy, one.seed]))
         for one in scores
         if one.task == task
         and (value := estimate(one)) is not None
-        and (one.task, one.policy, one.seed) in succeeded
+        and (one.task, one.policy, one.seed) in true
     ]
-    outcomes = np.array([success for _, _, success in used], dtype=bool)
+    outcomes = np.array([value for _, _, value in used])
     policies = sorted({policy for policy, _, _ in used})
     own = np.array([np.mean([p for name, p, _ in used if name == policy]) for policy in policies])
     real = np.array([np.mean([s for name, _, s in used if name == policy]) for policy in policies])
-    if outcomes.all() or not outcomes.any():
-        auc = math.nan
-    else:
-        auc = area_under_roc(np.array([value for _, value, _ in used]), outcomes)
+    auc = math.nan
+    if {*outcomes.tolist()} == {0.0, 1.0}:
+        auc = area_under_roc(np.array([value for _, value, _ in used]), outcomes > 0)
     if not policies:
         return EstimateFigures(auc, math.nan, math.nan, own)
     agreement = pearson(real=real, imagined=own), mmrv(real=real, imagined=own)

@@ -8,7 +8,7 @@ failure, and the others continue.
 
 import itertools
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +23,7 @@ from dextouch.schemas import (
     Observation,
     ReturnSelector,
     RolloutUncertainty,
+    milestones_told,
     rollout_uncertainty,
 )
 from dextouch.streams import HEAD_CAMERA
@@ -40,6 +41,7 @@ from services.evaluation.matched_starts import (
 )
 from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.progress import Progress
+from services.evaluation.rating.marks import Rubric, read_rubrics
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier
 
@@ -140,14 +142,16 @@ class PlayedRollout:
     """What happened in a finished rollout.
 
     `observations` are those of step 0 and of every chunk; `commanded` [T, 67] are the actions, row
-    0 the poses of step 0; `success` is the world's own report, None if it has none. `trace_id` is
-    that of its requests.
+    0 the poses of step 0; `success` is the world's own report, None if it has none. `milestones`
+    are 1 for those of the task that a chunk reached, by its own report. `trace_id` is that of its
+    requests.
     """
 
     observations: Sequence[Observation]
     commanded: Float64[np.ndarray, "steps 67"]
     success: bool | None
     trace_id: str | None = None
+    milestones: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def ending(self) -> Observation:
@@ -171,6 +175,7 @@ class RolloutRunner:
         shows_all: whether the head camera's images of all steps are requested. Otherwise worlds
             render only the images that the policy uses, and the ending.
         own_probes: success classifiers that were calibrated for single worlds, by world.
+        rubrics: by task.
     """
 
     worlds: StudyWorlds
@@ -178,6 +183,7 @@ class RolloutRunner:
     num_steps: int
     shows_all: bool = False
     own_probes: Mapping[str, SuccessClassifier] = field(default_factory=dict)
+    rubrics: Mapping[str, Rubric] = field(default_factory=read_rubrics)
 
     def run(
         self,
@@ -210,6 +216,8 @@ class RolloutRunner:
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None
         verdict = self.own_probes.get(world, self.probe).verdict(ending)
+        milestones = played.milestones if world == REAL else verdict.milestones
+        rubric = self.rubrics.get(start.task)
         score = RolloutScore(
             world,
             policy,
@@ -221,6 +229,7 @@ class RolloutRunner:
             cannot_tell=None if played.success is not None else verdict.reason,
             repeat=repeat,
             world_probability=verdict.world_probability,
+            rubric_score=None if rubric is None else rubric.score_by_milestones(milestones),
         )
         return score, played
 
@@ -258,6 +267,7 @@ class RolloutRunner:
         with self._begin(start, policy, world, repeat) as rollout:
             seen = [rollout.observation]
             commanded = [rollout.observation.action_reached[-1:]]
+            milestones: dict[str, float] = {}
             # The world's images may be smaller than that of the start.
             given = replace(start.for_policy(), K_head=rollout.K_head)
             ask(actor.reset, given, where=f"{where}: reset")
@@ -267,18 +277,23 @@ class RolloutRunner:
                 chunk = action_chunk(answer, description, where=acting)[:left]
                 commanded.append(chunk)
                 looks, multiple = getattr(actor, "looks", True), description.chunk_multiple
-                seen += self._step(rollout, chunk, left, looks=looks, multiple=multiple)
+                for observation in self._step(rollout, chunk, left, looks=looks, multiple=multiple):
+                    seen.append(observation)
+                    for name, value in milestones_told(rollout.told).items():
+                        milestones[name] = max(value, milestones.get(name, 0.0))
             success = rollout.observation.success if world == REAL else None
         if len(seen[-1]) < NUM_SEEN_STEPS:
             raise InvalidInputError(
                 f"{where}: the last chunk has {len(seen[-1])} steps, expected at least "
                 f"{NUM_SEEN_STEPS}; send longer chunks"
             )
-        return PlayedRollout(seen, np.concatenate(commanded), success, current_trace_id())
+        return PlayedRollout(
+            seen, np.concatenate(commanded), success, current_trace_id(), milestones
+        )
 
     def _step(
         self, rollout: Rollout, chunk: np.ndarray, left: int, *, looks: bool | str, multiple: int
-    ) -> list[Observation]:
+    ) -> Iterator[Observation]:
         """Advance by a chunk; images, which take most of the time, only where they are needed.
 
         Args:
@@ -291,20 +306,20 @@ class RolloutRunner:
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or looks is True or (looks and is_last):
             shown = ReturnSelector(cameras=cameras if looks else (HEAD_CAMERA,))
-            return [rollout.step(chunk, selector=shown, validated=True)]
+            yield rollout.step(chunk, selector=shown, validated=True)
+            return
         if looks:
             newest = ReturnSelector(cameras=cameras, steps="last")
-            return [rollout.step(chunk, selector=newest, validated=True)]
+            yield rollout.step(chunk, selector=newest, validated=True)
+            return
         # Only the ending is rendered, in a chunk of its own.
         num_shown = -(-NUM_SEEN_STEPS // multiple) * multiple if is_last else 0
         num_unseen = max(len(chunk) - num_shown, 0)
-        seen = []
         if num_unseen:
             blind = ReturnSelector(cameras=())
-            seen.append(rollout.step(chunk[:num_unseen], selector=blind, validated=True))
+            yield rollout.step(chunk[:num_unseen], selector=blind, validated=True)
         if num_unseen < len(chunk):
-            seen.append(rollout.step(chunk[num_unseen:], validated=True))
-        return seen
+            yield rollout.step(chunk[num_unseen:], validated=True)
 
 
 class ResultLog:

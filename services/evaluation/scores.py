@@ -31,6 +31,7 @@ NOTABLE_INFLUENCE = 0.1
 # A correlation that may be below this is not shown to be good.
 VAGUE_R = 0.5
 _SEED = 0
+_RUBRIC_FIGURES: Final = ("pearson", "mmrv")
 # Policies of one task that are compared, for the agreement over all tasks.
 _Compared = tuple[tuple[str, ...], MatchedScores, Draws]
 
@@ -44,6 +45,9 @@ class RolloutScore:
     `cannot_tell` is the reason why the probe abstains on an imagined rollout; `success` is then the
     more likely outcome, which counts in no rate. `repeat` numbers imagined rollouts that differ by
     their noise alone. `world_probability` is the world's own estimate of success, if it has one.
+    `rubric_score` is the share of the rubric's points, by the milestones that the real world
+    reports, or in imagined worlds the mean over what the probe deems possible; None where the task
+    has no rubric or a milestone is unknown.
     """
 
     world: str
@@ -56,6 +60,7 @@ class RolloutScore:
     cannot_tell: str | None = None
     repeat: int = 0
     world_probability: float | None = None
+    rubric_score: float | None = None
 
 
 @dataclass(frozen=True)
@@ -166,6 +171,8 @@ class ClosedLoopReport:
         }
         # Repeats of one start are one observation of the policy.
         starts: dict[int, list[RolloutScore]] = {}
+        if math.isfinite(rubric := self._rubric(world, task, policy)):
+            counts[f"{name}_rubric"] = rubric
         for score in _decided(mine):
             starts.setdefault(score.seed, []).append(score)
         if not starts:
@@ -195,6 +202,31 @@ class ClosedLoopReport:
         `pearson_chance` is the permutation p value, and `differences` compares policies in pairs.
         """
         return {task: self._agreement(world, task)[0] for task in self.tasks}
+
+    def rubric_agreement(self, world: str) -> dict[str, dict[str, Any]]:
+        """Agreement of the policies' mean rubric scores in a world with the real ones, by task.
+
+        Over all rollouts, decided or not, of policies and tasks that have scores in both worlds.
+        """
+        found = {}
+        for task in self.tasks:
+            worlds = {"real": REAL, "imagined": world}
+            means = {
+                side: np.array([self._rubric(name, task, policy) for policy in self.policies])
+                for side, name in worlds.items()
+            }
+            known = np.isfinite(means["real"]) & np.isfinite(means["imagined"])
+            if num_policies := int(known.sum()):
+                pair = {side: values[known] for side, values in means.items()}
+                figures = {n: defined(FIGURES[n](**pair), num_policies) for n in _RUBRIC_FIGURES}
+                found[task] = {**figures, "num_policies": num_policies}
+        return found
+
+    def _rubric(self, world: str, task: str, policy: str) -> float:
+        """Mean rubric score of the rollouts that have one; NaN where none has."""
+        scores = [s.rubric_score for s in self._of(world, task) if s.policy == policy]
+        known = [score for score in scores if score is not None]
+        return float(np.mean(known)) if known else math.nan
 
     def _agreements(self, world: str) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
         """Report entries by task, and over all tasks at once if they compare the same policies."""
@@ -273,6 +305,7 @@ class ClosedLoopReport:
             },
             "real_differences": {task: self.real_differences(task) for task in self.tasks},
             "agreement_of_other_worlds": {world: self.agreement(world) for world in others},
+            "rubrics": {world: self.rubric_agreement(world) for world in self.imagined_worlds},
             "imagined_world": first,
             "probe_accuracy_on_real": self.probe_accuracy(),
             "num_rollouts": len(self.rollouts),

@@ -11,7 +11,14 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
-from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
+from dextouch.schemas import (
+    EVERYTHING,
+    MILESTONE_PREFIX,
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    WorldDescription,
+)
 from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
 from services.twin.episodes import GridLog
@@ -113,17 +120,23 @@ class TwinWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
-        """See `World`; wrists, fingers and head follow the actions."""
+        """See `World`; wrists, fingers and head follow the actions.
+
+        Reports which milestones of the task a step of the chunk reached.
+        """
         del seed
         commands = poses_from_actions(actions, state.anchor, where="world twin: actions")
         stage = self.stage(state.task)
         stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
         log = _StepLog(stage, tuple(filter(selector.wants, self._settings.cameras)))
+        reached = dict.fromkeys(stage.task.milestones, 0.0)
         for row in range(len(actions)):
             for step_index in stage.simulation.advance(command_row(commands, row)):
                 if step_index % STEPS_PER_TACTILE == 0:
                     log.touch()
             log.step()
+            held = zip(reached, stage.task.reached(stage.simulation), strict=True)
+            reached.update((name, 1.0) for name, holds in held if holds)
             if selector.steps == "all" or row == len(actions) - 1:
                 log.draw()
         after = TwinState(
@@ -134,7 +147,8 @@ class TwinWorld:
             state.anchor,
         )
         seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
-        return SteppedRollout(after, seen)
+        told = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
+        return SteppedRollout(after, seen, told)
 
     def snapshot(self, state: TwinState) -> bytes:
         """See `World`."""

@@ -309,13 +309,20 @@ def test_a_table_of_two_policies_says_that_these_are_no_correlation(tmp_path):
     results = StudyResults.create_or_resume(tmp_path / "evaluator/study/results", header)
     for one in scores:
         estimate = None if one.world == "real" else 0.9 if one.success else 0.2
-        results.keep(replace(one, world_probability=estimate))
+        # "first" gets 0.5, 0, 0 points and "second" 1, 0.5, 0.5, in all worlds alike.
+        points = (
+            0.5 * (one.success + (one.policy == "second")) if one.task == DOWNSTREAM[0] else None
+        )
+        results.keep(replace(one, world_probability=estimate, rubric_score=points))
     pages = make_pages(tmp_path, experiments, "evaluator")
     shown = [row for page in pages for table in page.tables() for row in table.rows]
     rows = [cells for name, *cells in shown if name.startswith("Pearson, ")]
     assert sum("undefined (2 policies)" in row[0] for row in rows) == len(DOWNSTREAM)
     assert not any(cell.startswith(("1 ", "1.0")) or cell == "1" for row in rows for cell in row)
     named = {page.title: page for page in pages}
+    points = named["Policy evaluation: the rubric scores"]
+    has_figures = [row.metric for row in points.rows if row.is_available]
+    assert has_figures == [f"MMRV, {DOWNSTREAM[0]}"]
     (auc, *_) = named["Policy evaluation: the worlds' own estimates of success"].rows
     assert {world: one.values for world, one in auc.cells.items()} == dict.fromkeys(ADAPTED, (1.0,))
 

@@ -203,11 +203,12 @@ class Rubric(FrozenModel):
         """Whether every criterion has a milestone of the twin."""
         return all(criterion.milestone is not None for criterion in self.criteria)
 
-    def score(self, holds: Mapping[str, bool], *, is_inconsistent: bool = False) -> float:
+    def score(self, holds: Mapping[str, bool | float], *, is_inconsistent: bool = False) -> float:
         """Score of a rollout in 0 … 1: its points as a share of the maximum.
 
         Args:
-            holds: whether each criterion holds, for all of them.
+            holds: whether each criterion holds, for all of them, or with what probability: a
+                criterion is then as probable as the least probable one that it requires.
             is_inconsistent: whether it shows something physically impossible (once or more: the
                 penalty counts once).
 
@@ -224,12 +225,25 @@ class Rubric(FrozenModel):
                 f"marks: no mark for {', '.join(missing)}; expected one for each of "
                 f"{', '.join(names)}"
             )
-        met: dict[str, bool] = {}
+        met: dict[str, float] = {}
         for criterion in self.criteria:
-            met[criterion.name] = holds[criterion.name] and all(map(met.get, criterion.requires))
-        points = sum(criterion.points for criterion in self.criteria if met[criterion.name])
+            required = (met[name] for name in criterion.requires)
+            met[criterion.name] = min(holds[criterion.name], *required, 1.0)
+        points = sum(criterion.points * met[criterion.name] for criterion in self.criteria)
         points -= self.penalty * is_inconsistent
         return min(max(points / self.max_points, 0.0), 1.0)
+
+    def score_by_milestones(self, reached: Mapping[str, float]) -> float | None:
+        """Score by whether each milestone was reached, or with what probability.
+
+        None where a criterion has no milestone, or it is unknown whether one was reached.
+        """
+        known = {
+            one.name: reached[one.milestone]
+            for one in self.criteria
+            if one.milestone is not None and one.milestone in reached
+        }
+        return self.score(known) if len(known) == len(self.criteria) else None
 
     def holds_in_twin(self, event_times_s: Mapping[str, float]) -> dict[str, bool]:
         """Whether each criterion holds in a rollout of the twin, by the times of its milestones.

@@ -298,6 +298,7 @@ class PolicyPanel:
     agreement: list[AgreementFigure]
     comments: list[str]
     chart: Markup | None
+    rubric: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -390,7 +391,8 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
         ]
         chart = agreement_chart(points) if points else None
         figures = agreement_figures(agreement.get(task, {}))
-        panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart))
+        rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
+        panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
     return panels
 
 

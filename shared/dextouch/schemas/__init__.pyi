@@ -85,6 +85,7 @@ from .observations import start_from as start_from
 from .observations import validate_fields as validate_fields
 from .rollouts import CHUNK_STEPS as CHUNK_STEPS
 from .rollouts import MAX_SEED as MAX_SEED
+from .rollouts import MILESTONE_PREFIX as MILESTONE_PREFIX
 from .rollouts import ActionKind as ActionKind
 from .rollouts import ForkRequest as ForkRequest
 from .rollouts import RolloutInfo as RolloutInfo
@@ -96,6 +97,7 @@ from .rollouts import WatchedRollouts as WatchedRollouts
 from .rollouts import WorldDescription as WorldDescription
 from .rollouts import WorldKind as WorldKind
 from .rollouts import WorldList as WorldList
+from .rollouts import milestones_told as milestones_told
 from .scene_objects import MAX_OBJECTS as MAX_OBJECTS
 from .scene_objects import ClickedAt as ClickedAt
 from .scene_objects import EpisodeClicks as EpisodeClicks

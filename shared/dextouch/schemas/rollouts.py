@@ -27,6 +27,19 @@ _QUALITY: Final = {
 # Of these, the world's own estimates after a chunk.
 _ESTIMATES: Final = ("success_probability", "success_spread", "size_deviation")
 
+# Names of numbers by which a world reports milestones of the task, 1 where a step of the chunk
+# reached one and 0 where none did.
+MILESTONE_PREFIX: Final = "milestone/"
+
+
+def milestones_told(info: Mapping[str, float]) -> dict[str, float]:
+    """Milestones by name among the numbers that a world reports about a chunk."""
+    return {
+        name.removeprefix(MILESTONE_PREFIX): value
+        for name, value in info.items()
+        if name.startswith(MILESTONE_PREFIX)
+    }
+
 
 def _is_none(value: object) -> bool:
     """For fields that are omitted where they are unknown, so that older clients can read them."""

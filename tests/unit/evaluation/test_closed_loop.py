@@ -11,11 +11,12 @@ from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
-from services.evaluation.closed_loop import EvaluationPlan, evaluate
-from services.evaluation.matched_starts import WorldAddress, matched_start
+from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, evaluate
+from services.evaluation.matched_starts import StudyWorlds, WorldAddress, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.replay import HoldPolicy
-from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.rating.marks import Rubric
+from services.evaluation.success_classifier import SuccessClassifier, Verdict
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
@@ -39,6 +40,15 @@ class Hesitant(toy.ToyWorld):
         )
 
 
+class Reporting(toy.ToyWorld):
+    """Says after each chunk whether the hand was near the target in it, and how far it moved."""
+
+    def step(self, state, actions, **options):
+        stepped = super().step(state, actions, **options)
+        near = float(stepped.observation.tactile_kpa.max() > 0)
+        return toy.replace(stepped, info={"milestone/near": near, "moved_m": 0.1})
+
+
 class Forgetful(toy.ToyWorld):
     """A judge that never begins the same way twice."""
 
@@ -57,6 +67,7 @@ def client():
         "nightmare": toy.ToyWorld("nightmare", judge=False, drift_m=0.05),
         "hesitant": Hesitant("hesitant", judge=False),
         "choosy": Choosy("choosy", judge=True),
+        "reporting": Reporting("reporting", judge=True),
         "forgetful": Forgetful("forgetful", judge=True),
         "copy-first": CopyFirstWorld.beside(judge.description),
         "wide": toy.ToyWorld("wide", judge=False, cameras=toy.TWO_CAMERAS),
@@ -159,6 +170,36 @@ def test_the_real_world_alone_is_enough(client, probe):
     )
     assert [score.world for score in found.scores] == ["real"]
     assert found.to_report()["agreement"] == {}
+
+
+def test_rubric_scores_by_reported_and_by_probable_milestones(client, policies, probe):
+    criterion = {"name": "near", "points": 2, "description": "Near.", "milestone": "near"}
+    rubrics = {"reach": Rubric.model_validate({"criteria": [criterion]})}
+    worlds = StudyWorlds.ask(WorldAddress(client, "reporting"), addresses(client, "dream"))
+
+    class Unsure(SuccessClassifier):
+        def __init__(self):
+            """Nothing trained."""
+
+        def verdict(self, ending):
+            milestones = {"near": 0.25, "far": 1.0}
+            return Verdict(0.5, "cannot tell", likely_success=True, milestones=milestones)
+
+    runner = RolloutRunner(worlds, probe, 80, own_probes={"dream": Unsure()}, rubrics=rubrics)
+
+    def scored(policy, world, task="reach"):
+        start = matched_start(worlds.addresses["real"], task, SEEDS[0], "")
+        return runner.run(start, policies[policy], policy, world)[0].rubric_score
+
+    assert scored("script", "real") == 1.0
+    assert scored("hold", "real") == 0.0
+    assert scored("hold", "dream") == 0.25
+    # A world that reports nothing, a probe that classifies none, a task without a rubric.
+    assert scored("hold", "real", task="reach far") is None
+    silent = StudyWorlds.ask(WorldAddress(client, "judge"), addresses(client, "dream"))
+    runner = RolloutRunner(silent, probe, 80, rubrics=rubrics)
+    assert scored("script", "real") is None
+    assert scored("script", "dream") is None
 
 
 class SeesAll(BehaviourCloningPolicy):

@@ -118,6 +118,19 @@ def test_scores_by_hand():
     assert rubric.score(dict.fromkeys(names, False), is_inconsistent=True) == 0
 
 
+def test_probable_milestones_score_by_hand():
+    rubric = rubric_of("place_shoes", RUBRICS)
+    reached = {"one_lifted": 0.9, "both_lifted": 0.6, "one_placed": 0.8, "both_placed": 0.7}
+    # Both placed is no more probable than both picked up, 0.6: (0.9 + 0.6 + 0.8 + 0.6) / 4.
+    assert rubric.score_by_milestones(reached) == pytest.approx(0.725)
+    assert rubric.score_by_milestones({**reached, "touched": 1.0}) == pytest.approx(0.725)
+    assert rubric.score_by_milestones(dict.fromkeys(reached, 1.0)) == 1
+    del reached["one_placed"]
+    assert rubric.score_by_milestones(reached) is None
+    by_people_alone = rubric_of("stack_three_bowls", RUBRICS)
+    assert by_people_alone.score_by_milestones({"nested": 1.0}) is None
+
+
 def test_marks_that_do_not_fit_are_refused():
     rubric = rubric_of("place_phone", RUBRICS)
     with pytest.raises(UnknownNameError, match="'flew'"):

@@ -146,6 +146,16 @@ def test_agreement_counts_ties_and_says_what_it_means(tmp_path):
     assert "pearson_interval" not in words
 
 
+def test_rubric_scores_stand_below_the_rates(tmp_path):
+    first = REPORT["policies"][0] | {"real_rubric": 0.75, "imagined_rubric": 0.625}
+    agreement = {"pearson": 0.93, "mmrv": 0.0, "num_policies": 2}
+    told = {"imagined_world": "dream", "rubrics": {"dream": {"stand_bottle": agreement}}}
+    text, _ = page(tmp_path, REPORT | told | {"policies": [first, REPORT["policies"][1]]})
+    words = re.sub(r"<[^>]*>|\s+", " ", text.split("<h2>All figures")[0])
+    assert re.search(r"rubric 0\.750.* rubric 0\.625", words)
+    assert re.search(r"Rubric scores: Pearson +0\.930 +· MMRV, ties counted +0\.0", words)
+
+
 def test_failed_rollouts_are_counted_by_kind(tmp_path):
     failure = {"policy": "mine", "world": "real", "task": "t", "error": "InvalidInputError",
                "message": "act raised <ValueError>", "traceback": None}  # fmt: skip

@@ -198,6 +198,27 @@ def test_two_policies_of_two_tasks_are_no_correlation_together():
     assert whole["agreement_of_all_tasks"]["mmrv"] == 0.0
 
 
+def test_rubric_scores_of_all_rollouts_are_compared_by_hand():
+    points = {"real": {"a": 1.0, "b": 0.5, "c": 0.0}, "model": {"a": 0.8, "b": 0.2, "c": 0.3}}
+    scores = tuple(
+        replace(
+            s,
+            rubric_score=points.get(s.world, {}).get(s.policy),
+            cannot_tell=None if s.world == "real" else "too close",
+        )
+        for s in report(GOOD).scores
+    )
+    whole = ClosedLoopReport(scores, ("model", "copy"), ("a", "b", "c")).to_report()
+    found = whole["rubrics"]["model"]["stand"]
+    assert found["pearson"] == pytest.approx(np.corrcoef([1, 0.5, 0], [0.8, 0.2, 0.3])[0, 1])
+    # b and c change places: each is wrong by the real difference, 0.5, and a by nothing.
+    assert found["mmrv"] == pytest.approx(1 / 3)
+    assert found["num_policies"] == 3
+    assert whole["rubrics"]["copy"] == {}
+    row = whole["policies"][1]
+    assert (row["real_rubric"], row["imagined_rubric"]) == (0.5, 0.2)
+
+
 def test_rates_that_differ_by_rounding_alone_are_equal():
     """Three starts of ten repeats: shares 0.1, 0.2, 0.3 in another order are the same rate."""
     scores = [

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.schemas import ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart, milestones_told
 from services.twin.cameras import CameraRig
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
+from services.twin.tasks import get_task
 from services.twin.world import TwinWorld
 
 SMALL = TwinSettings(image_height_px=16, image_width_px=16)
@@ -27,8 +28,13 @@ def test_replaying_the_commanded_actions_reproduces_the_demonstration(world, tas
     commanded = episode.streams["action_commanded"].values
     started = world.reset(RolloutStart(task, 11, ""))
     state, seen = started.state, [started.observation]
+    reached_by: dict[str, int] = {}
     for first in range(1, 81, CHUNK):
         stepped = world.step(state, commanded[first : first + CHUNK], seed=first)
+        told = milestones_told(stepped.info)
+        assert tuple(told) == get_task(task).milestones
+        for name in (name for name, value in told.items() if value):
+            reached_by.setdefault(name, first + CHUNK)
         state = world.restore(world.snapshot(stepped.state))
         seen.append(stepped.observation)
     reached = np.concatenate([observation.action_reached for observation in seen])
@@ -42,6 +48,11 @@ def test_replaying_the_commanded_actions_reproduces_the_demonstration(world, tas
     np.testing.assert_array_equal(tactile[0], native[0])
     assert seen[-1].success is True
     assert episode.attributes.success is True
+    # The recorder notes the time of the same milestones, to a step.
+    steps = {name: 15 * time_s for name, time_s in episode.attributes.event_times_s.items()}
+    assert reached_by.keys() == steps.keys()
+    for name, step in steps.items():
+        assert reached_by[name] - CHUNK <= round(step) < reached_by[name]
 
 
 def test_standing_still_does_not_succeed(world):
