@@ -190,4 +190,6 @@ class DeletionWatch:
                 if error.message != problem:
                     logger.warning("fail_deletions", reason=error.message)
                 problem = error.message
+            else:
+                problem = ""
             self._stopping.wait(WATCH_PERIOD_S)

@@ -1,12 +1,14 @@
 """Uploads of deleted takes: a deletion may come at any moment, from another process."""
 
 import pytest
+from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords, DeletionRequest, delete_for_good
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch
+from services.episode_store import deletions
 from services.episode_store.committing import commit_spool
 from services.episode_store.deletions import DeletionWatch
 from services.episode_store.ingest import Ingest
@@ -92,3 +94,24 @@ def test_other_uploads_go_on(store, settings, attributes, delete):
     assert ingest.drop_deleted() == []
     assert ingest.finish("take-1", ALL).state == "finished"
     assert store.list(kind="recording") == ["take-1"]
+
+
+def test_a_problem_that_comes_back_is_logged_again(store, monkeypatch):
+    """The same failure twice in a row is one warning; after a look that succeeded it is another."""
+    monkeypatch.setattr(deletions, "WATCH_PERIOD_S", 0.0)
+    records = DeletionRecords(store.root)
+    watch = DeletionWatch(records, list, lambda _: None)
+    looks = iter(["full", "full", None, "full"])
+
+    def look():
+        reason = next(looks, "")
+        if reason == "":
+            watch._stopping.set()
+        elif reason is not None:
+            raise StorageError(reason)
+
+    monkeypatch.setattr(watch, "look", look)
+    with capture_logs() as logs:
+        watch.start()
+        watch._thread.join()
+    assert [(one["event"], one["reason"]) for one in logs] == [("fail_deletions", "full")] * 2
