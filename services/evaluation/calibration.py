@@ -252,7 +252,7 @@ def fit_combinations(
     return found
 
 
-def milestones_that_can_be_told(
+def classifiable_milestones(
     probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
 ) -> dict[str, tuple[str, ...]]:
     """Milestones of every task that the probe classifies well on held-out endings."""

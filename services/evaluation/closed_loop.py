@@ -23,7 +23,7 @@ from dextouch.schemas import (
     Observation,
     ReturnSelector,
     RolloutUncertainty,
-    milestones_told,
+    reported_milestones,
     rollout_uncertainty,
 )
 from dextouch.streams import HEAD_CAMERA
@@ -279,7 +279,7 @@ class RolloutRunner:
                 looks, multiple = getattr(actor, "looks", True), description.chunk_multiple
                 for observation in self._step(rollout, chunk, left, looks=looks, multiple=multiple):
                     seen.append(observation)
-                    for name, value in milestones_told(rollout.told).items():
+                    for name, value in reported_milestones(rollout.reported).items():
                         milestones[name] = max(value, milestones.get(name, 0.0))
             success = rollout.observation.success if world == REAL else None
         if len(seen[-1]) < NUM_SEEN_STEPS:

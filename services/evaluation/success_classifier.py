@@ -302,7 +302,7 @@ class SuccessClassifier:
             name: Combination.model_validate(values)
             for name, values in settings.get("combination", {}).items()
         }
-        self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
+        self._classifiable: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
         self._network = ClassifierNetwork(self.shape)
         load_network(self._network, checkpoint)
 
@@ -387,7 +387,7 @@ class SuccessClassifier:
         milestones = {
             name: float(reached[index])
             for index, name in enumerate(names)
-            if name in self._told.get(ending.task, ())
+            if name in self._classifiable.get(ending.task, ())
         }
         return Verdict(
             probability,

@@ -19,10 +19,10 @@ from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.calibration import (
+    classifiable_milestones,
     fit_calibrations,
     fit_combinations,
     held_out_figures,
-    milestones_that_can_be_told,
 )
 from services.evaluation.endings import (
     Ending,
@@ -381,7 +381,7 @@ def _calibrated(
     calibrated = _with_settings(
         checkpoint,
         calibration={name: one.model_dump() for name, one in calibrations.items()},
-        told_milestones=milestones_that_can_be_told(probe, sets.development),
+        told_milestones=classifiable_milestones(probe, sets.development),
     )
     combinations = fit_combinations(
         SuccessClassifier(calibrated),

@@ -134,7 +134,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         return {
             "success": rollout.observation.success,
             "last_step": rollout.info.last_step,
-            "told": dict(rollout.told),
+            "reported": dict(rollout.reported),
             "uncertainty": rollout.observation.uncertainty,
             "rollout_uncertainty": rollout.info.rollout_uncertainty,
             "ended": None,

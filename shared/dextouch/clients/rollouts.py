@@ -143,7 +143,7 @@ class Rollout:
         anchor: absolute poses of step 0, which actions are relative to for the whole rollout.
         K_head: the head camera's matrix in pixels.
         info: its state.
-        told: numbers that the world reports about the newest chunk.
+        reported: numbers that the world reports about the newest chunk.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class Rollout:
         self.observation = answer.observation
         self.anchor = origin.anchor
         self.K_head = origin.K_head
-        self.told = answer.info
+        self.reported = answer.info
 
     @property
     def id(self) -> str:
@@ -199,7 +199,7 @@ class Rollout:
             headers={"x-session-id": self.id},
         )
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
-        self.info, self.observation, self.told = answer.rollout, answer.observation, answer.info
+        self.info, self.observation, self.reported = answer.rollout, answer.observation, answer.info
         return self.observation
 
     def fork(self, *, seed: int | None = None) -> "Rollout":

@@ -97,7 +97,7 @@ from .rollouts import WatchedRollouts as WatchedRollouts
 from .rollouts import WorldDescription as WorldDescription
 from .rollouts import WorldKind as WorldKind
 from .rollouts import WorldList as WorldList
-from .rollouts import milestones_told as milestones_told
+from .rollouts import reported_milestones as reported_milestones
 from .scene_objects import MAX_OBJECTS as MAX_OBJECTS
 from .scene_objects import ClickedAt as ClickedAt
 from .scene_objects import EpisodeClicks as EpisodeClicks

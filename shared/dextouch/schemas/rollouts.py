@@ -32,7 +32,7 @@ _ESTIMATES: Final = ("success_probability", "success_spread", "size_deviation")
 MILESTONE_PREFIX: Final = "milestone/"
 
 
-def milestones_told(info: Mapping[str, float]) -> dict[str, float]:
+def reported_milestones(info: Mapping[str, float]) -> dict[str, float]:
     """Milestones by name among the numbers that a world reports about a chunk."""
     return {
         name.removeprefix(MILESTONE_PREFIX): value

@@ -56,7 +56,7 @@ def test_a_rollout_from_task_and_seed(client):
         assert seen.images[CAMERAS[1]].max() == 1
         np.testing.assert_array_equal(seen.action_reached, actions(16, 0.5))
         assert rollout.info.next_chunk == 1
-        assert "noise" in rollout.told
+        assert "noise" in rollout.reported
         assert rollout.step(actions(4)).first_step == 17
 
 

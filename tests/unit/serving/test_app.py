@@ -247,6 +247,21 @@ async def test_metrics_count_by_route_template_in_an_own_registry():
     assert "python_info" not in text
 
 
+async def test_requests_are_counted_once_however_many_wait_for_it(monkeypatch):
+    monkeypatch.setattr("dextouch.serving.connections.MAX_UNCOUNTED", 3)
+    app = make_app()
+    async with client_of(app) as client:
+        for _ in range(7):
+            await client.get("/fail/0")
+        label = {"method": "GET", "route": "/fail/{index}", "status": "400"}
+        counted = app.state.registry.get_sample_value("dextouch_http_requests_total", label)
+        again = app.state.registry.get_sample_value("dextouch_http_requests_total", label)
+        timed = app.state.registry.get_sample_value(
+            "dextouch_http_request_seconds_count", {"method": "GET", "route": "/fail/{index}"}
+        )
+    assert counted == again == timed == 7.0
+
+
 async def test_request_id_is_kept_when_sane_and_timing_is_told():
     async with client_of(make_app()) as client:
         kept = await client.post(

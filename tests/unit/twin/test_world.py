@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.schemas import ReturnSelector, RolloutStart, milestones_told
+from dextouch.schemas import ReturnSelector, RolloutStart, reported_milestones
 from services.twin.cameras import CameraRig
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
@@ -31,7 +31,7 @@ def test_replaying_the_commanded_actions_reproduces_the_demonstration(world, tas
     reached_by: dict[str, int] = {}
     for first in range(1, 81, CHUNK):
         stepped = world.step(state, commanded[first : first + CHUNK], seed=first)
-        told = milestones_told(stepped.info)
+        told = reported_milestones(stepped.info)
         assert tuple(told) == get_task(task).milestones
         for name in (name for name, value in told.items() if value):
             reached_by.setdefault(name, first + CHUNK)
