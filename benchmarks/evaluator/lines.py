@@ -21,7 +21,7 @@ from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.resampling import rates_of_draws
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
-from services.evaluation.calibration import UNDECIDED_RISK
+from services.evaluation.settings import RISK_OF_DECIDED
 from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
 from services.twin.scripted_actions import mistake_of
 
@@ -146,7 +146,7 @@ def _decision_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Dra
             [(one.rows[kind]["decision"] == "success") != one.success for one in mine], dtype=float
         )
         what = f"wrong among the decided {name} endings"
-        found.append(sampling.mean(what, wrong, mine, ("at most", UNDECIDED_RISK)))
+        found.append(sampling.mean(what, wrong, mine, ("at most", RISK_OF_DECIDED)))
     return found
 
 

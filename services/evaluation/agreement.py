@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from statistics import NormalDist
 from typing import Final
 
 import numpy as np
@@ -22,6 +21,7 @@ from services.evaluation.statistics import (
     Interval,
     MatchedScores,
     ScoreDraws,
+    Z,
     bootstrap_scores,
     central_interval,
     known_mean,
@@ -276,15 +276,14 @@ def paired_differences(
     """
     if rollouts.shape[1] < 1:
         raise InvalidInputError("paired differences: got no starts, expected at least one")
-    z, rows = NormalDist().inv_cdf(0.975), range(len(policies))
     found = []
-    for first, second in itertools.combinations(rows, 2):
+    for first, second in itertools.combinations(range(len(policies)), 2):
         paired = rollouts[first] - rollouts[second]
         paired = paired[np.isfinite(paired)]
         if len(paired) == 0:
             continue
         widened = np.concatenate([paired, [1.0, -1.0]])
-        centre, half = widened.mean(), z * widened.std() / math.sqrt(len(widened))
+        centre, half = widened.mean(), Z * widened.std() / math.sqrt(len(widened))
         interval = Interval(max(-1.0, float(centre - half)), min(1.0, float(centre + half)))
         found.append(
             Difference(

@@ -1,4 +1,4 @@
-"""Bundled policies by name: a new one is its module and a line of `BUNDLED`."""
+"""Built-in (bundled) policies by name: a new one is its module and a line of `BUNDLED`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

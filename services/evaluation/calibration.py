@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.scores import LEAST_DECIDED
+from services.evaluation.settings import RISK_OF_DECIDED
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_classifier import (
     IMAGINED,
@@ -36,9 +37,6 @@ _WIDEST_BAND: Final = 0.45
 _MAX_NEWTON_STEPS: Final = 50
 # Weight of the prior (temperature 1, bias 0) in the fit, in endings.
 _PRIOR_ENDINGS: Final = 2.0
-# Allowed share of wrong answers among the decided endings. Kinds of mistakes that nothing was
-# calibrated on are judged wrongly about twice as often.
-UNDECIDED_RISK: Final = 0.05
 # No calibration is fitted with fewer endings of either outcome.
 MIN_OUTCOMES: Final = 5
 # Milestones with a lower area under the ROC curve are not reported by the probe.
@@ -72,7 +70,7 @@ def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
 
 
 def fit_calibration(
-    log_odds: np.ndarray, success: np.ndarray, *, risk: float = UNDECIDED_RISK
+    log_odds: np.ndarray, success: np.ndarray, *, risk: float = RISK_OF_DECIDED
 ) -> Calibration:
     """Fit temperature, bias and undecided band to endings that were not trained on.
 
@@ -108,7 +106,7 @@ def fit_combination(
     world: np.ndarray,
     success: np.ndarray,
     *,
-    risk: float = UNDECIDED_RISK,
+    risk: float = RISK_OF_DECIDED,
     margin: float = 0.0,
 ) -> Combination:
     """Fit the weights and the undecided band to imagined endings that were not trained on.

@@ -94,6 +94,7 @@ def _object_error(pairs: Pairs) -> float:
     return 1e3 * float(np.median(found_m)) if len(found_m) else float("nan")
 
 
+# A new one needs its name in `prediction_names`, too, which command lines read without networks.
 METRICS: Final = {metric.name: metric for metric in (
     Metric("psnr", "PSNR", "dB", "higher", "images", _of_images(image_metrics.psnr),
            "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100"),

@@ -36,7 +36,7 @@ from services.evaluation.matched_starts import (
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
-from services.evaluation.statistics import area_under_roc, wilson_interval
+from services.evaluation.statistics import area_under_roc, central_interval, wilson_interval
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.training_settings import USUAL_IMAGE_PX
 
@@ -263,7 +263,8 @@ def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
                        outcome)
         for _ in range(_DRAWS)
     ]  # fmt: skip
-    return [float(bound) for bound in np.quantile(areas, [0.025, 0.975])]
+    interval = central_interval(np.array(areas))
+    return [interval.low, interval.high]
 
 
 def score_lines(scores: RecordedScores) -> list[str]:

@@ -142,7 +142,10 @@ class ClosedLoopReport:
         return [f for f in self.failures if f.world == world and f.task == task]
 
     def policy_rows(self) -> list[dict[str, Any]]:
-        """One row per policy and task: real and imagined success rate with Wilson intervals."""
+        """One row per policy and task: real and imagined success rate with Wilson intervals.
+
+        Shown by `report.html.j2`, `print_scores`, `latex_tables` and `study_figures`.
+        """
         rows = []
         for task in self.tasks:
             for policy in self.policies:

@@ -32,6 +32,10 @@ EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
 # Word of `--base` for the next.
 PACKAGE = Path("package")
 DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
+# Allowed share of wrong answers among the decided endings; a smaller one leaves more undecided from
+# the next calibration on. Kinds of mistakes that nothing was calibrated on are judged wrongly about
+# twice as often.
+RISK_OF_DECIDED = 0.05
 _SEEDS = re.compile(r"(\d+):(\d+)")
 DEFAULT_MARKS = Path("runs/ratings.sqlite")
 _MARKS = "append-only SQLite file of the marks"
@@ -99,10 +103,13 @@ class ClassifierSettings(FrozenModel):
     )
     held_out_share: float = Field(default=0.2, gt=0, lt=1, description="share of held-out seeds")
     risk: float = Field(
-        default=0.05, gt=0, lt=1, description="allowed share of errors among decided endings"
+        default=RISK_OF_DECIDED,
+        gt=0,
+        lt=1,
+        description="allowed share of errors among decided endings",
     )
     imagined_risk: float = Field(
-        default=0.05,
+        default=RISK_OF_DECIDED,
         gt=0,
         lt=1,
         description="the same for imagined endings of worlds that estimate success",

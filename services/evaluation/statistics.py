@@ -18,7 +18,9 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.metrics.policy import MIN_POLICIES
 
+# Of all intervals of evaluations; texts and documents say 95 %.
 CONFIDENCE: Final = 0.95
+Z: Final = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 Counts = Float64[np.ndarray, "draws starts"]
 # Grid of the spread of policies' true scores in each world, and of their correlation; the prior is
 # uniform in both spreads and in artanh of the correlation.
@@ -84,11 +86,10 @@ def wilson_interval(successes: int | float, trials: int) -> Interval:
             f"Wilson interval: got {successes} successes of {trials} trials, "
             "expected at least one trial and 0 … trials successes"
         )
-    z = NormalDist().inv_cdf(0.975)
     rate = successes / trials
-    spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    shrink = 1 + z * z / trials
-    centre = rate + z * z / (2 * trials)
+    spread = Z * math.sqrt(rate * (1 - rate) / trials + Z * Z / (4 * trials * trials))
+    shrink = 1 + Z * Z / trials
+    centre = rate + Z * Z / (2 * trials)
     return Interval(
         max(0.0, (centre - spread) / shrink) if successes else 0.0,
         min(1.0, (centre + spread) / shrink) if successes < trials else 1.0,

@@ -401,6 +401,8 @@ class SuccessClassifier:
     def _judged(self, ending: Ending, probability: float) -> tuple[float, str | None]:
         """Probability of success by all that is known, and why nothing is decided from it.
 
+        The bands are those of the checkpoint, fitted by `calibration`.
+
         Args:
             ending: what is judged.
             probability: calibrated, of the probe alone.
