@@ -147,11 +147,7 @@ class ObjectGroup:
 
     def __init__(self, bucket: Bucket, folder: str, known: dict[str, bytes]) -> None:
         self._bucket, self._folder, self._known = bucket, folder, known
-
-    @property
-    def item_id(self) -> str:
-        """Id of the group."""
-        return self._folder.rpartition("/")[2]
+        self.item_id = folder.rpartition("/")[2]
 
     def get(self, name: str) -> bytes | None:
         """Contents of a small file; None if it does not exist."""

@@ -18,7 +18,7 @@ import numpy as np
 import zstandard
 from jaxtyping import Shaped
 
-from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_all
+from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_parts
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 
@@ -358,4 +358,4 @@ class ShardWriter:
 
     def _write(self, data: bytes) -> None:
         with disk_errors(f"write array {self._name}", advice="free space on the disk of the store"):
-            write_all(self._file, data)
+            write_parts(self._file, data)

@@ -125,13 +125,8 @@ def test_forms_are_near_the_plain_way(store, unit):
         assert abs(got.astype(int) - transform_pixels(full, form)).mean() < 2.5, form
 
 
-def test_images_go_into_the_callers_buffer(store):
+def test_images_that_are_not_there_are_refused(store):
     reader = write(store, moving_images())
-    out = np.zeros((5, HEIGHT, WIDTH, 3), np.uint8)
-    assert reader.images("camera_head", 6, 11, out=out) is out
-    np.testing.assert_array_equal(out, reader.images("camera_head", 6, 11))
-    with pytest.raises(ShapeError, match="out is"):
-        reader.images("camera_head", 6, 12, out=out)
     with pytest.raises(InvalidInputError, match="within 0 … 21"):
         reader.images("camera_head", 6, 22)
     with pytest.raises(UnknownNameError, match="camera_head"):
