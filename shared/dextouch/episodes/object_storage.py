@@ -258,7 +258,10 @@ class ObjectStorage:
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
-        delete_group(self._bucket, kind, item_id)
+        group = group_key(kind, item_id)
+        self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
+        self._bucket.remove([f"{group}/{COMMIT_FILE}"])
+        _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
 
     def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
         """Put a file beside the content in place of an earlier one; None removes it."""
@@ -378,14 +381,6 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
         # First, so that the remainder after a kill does not pass for a group.
         (folder / COMMIT_FILE).unlink()
         shutil.rmtree(folder)
-
-
-def delete_group(bucket: Bucket, kind: Kind, item_id: str) -> None:
-    """Delete a group: its commit record first, then its other objects."""
-    group = group_key(kind, item_id)
-    bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
-    bucket.remove([f"{group}/{COMMIT_FILE}"])
-    _remove_files(bucket, group, [facts.key for facts in bucket.list(group)])
 
 
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:

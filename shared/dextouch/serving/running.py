@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import ServiceSettings, load_settings
-from dextouch.serving.spans import configure_spans
+from dextouch.serving.spans import SPANS
 
 # Address that a service listens on, checked before anything is loaded or started.
 
@@ -169,6 +169,6 @@ def serve(
     settings = load_settings(kind, list(arguments))
     check_address(service, settings)
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
-    configure_spans(service)
+    SPANS.configure(service)
     run(create_app(settings), settings)
     return 0

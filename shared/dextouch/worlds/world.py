@@ -56,7 +56,11 @@ class SteppedRollout(Generic[State]):
 
 @runtime_checkable
 class World(Protocol[State]):
-    """A world. Implementations need not be thread-safe."""
+    """A world. Implementations need not be thread-safe.
+
+    Each call of one with an attribute `is_quick` that is true takes well below a millisecond. It is
+    then made in the event loop itself: changing to another thread and back would take longer.
+    """
 
     @property
     def description(self) -> WorldDescription:
@@ -150,20 +154,6 @@ class ReconstructingWorld(World[State], Protocol[State]):
         Returns:
             Images and touch of the steps after the first.
         """
-        ...
-
-
-@runtime_checkable
-class QuickWorld(World[State], Protocol[State]):
-    """A world that may say that each of its calls takes well below a millisecond.
-
-    Its calls are then made in the event loop itself: changing to another thread and back takes
-    longer, and nobody else is kept waiting for long.
-    """
-
-    @property
-    def is_quick(self) -> bool:
-        """Whether calls take well below a millisecond."""
         ...
 
 
