@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dextouch.bridges.exporting import BLOCK_IMAGES
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import (
     EpisodeFrames,
@@ -26,7 +27,6 @@ from dextouch.bridges.lerobot.layout import (
     value_statistics,
 )
 from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
-from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
