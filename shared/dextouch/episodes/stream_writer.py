@@ -32,6 +32,8 @@ from dextouch.schemas import StreamContent
 from dextouch.streams import SampleBatch, StreamDescriptor, check_encoded_image
 
 MAX_WAITING_IMAGES = 32
+# Images of a storage chunk.
+_CHUNK_IMAGES = {"jpeg": 1, "h264": GOP_IMAGES}
 Stamps = Mapping[str, np.ndarray]
 
 
@@ -217,19 +219,17 @@ class _EncodedImages:
     def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
         """Add images; returns the completed storage chunks with their number of images."""
         images = list(values) if values.dtype == object else [self._encode(v) for v in values]
-        if self._codec == "jpeg":
-            return [(pack_chunk("jpeg", [data]), 1) for data in images]
         complete = []
         for data in images:
             self._group.append(data)
-            if len(self._group) == GOP_IMAGES:
+            if len(self._group) == _CHUNK_IMAGES[self._codec]:
                 complete += self.rest()
         return complete
 
     def rest(self) -> list[tuple[bytes, int]]:
         """The last, partial storage chunk."""
         group, self._group = self._group, []
-        return [(pack_chunk("h264", group), len(group))] if group else []
+        return [(pack_chunk(self._codec, group), len(group))] if group else []
 
     def _encode(self, image: np.ndarray) -> bytes:
         if self._codec == "jpeg":
@@ -321,11 +321,9 @@ class ContentDigest:
         if self._codec == "zstd":
             values.update(batch.values.astype(self._dtype, order="C", copy=False).data)
             return
-        # Storage chunks of images: one of JPEG, a group of H.264.
-        num_images = GOP_IMAGES if self._codec == "h264" else 1
         for image in batch.values:
             self._group.append(image)
-            if len(self._group) == num_images:
+            if len(self._group) == _CHUNK_IMAGES[self._codec]:
                 values.update(pack_chunk(self._codec, self._group))
                 self._group = []
 
