@@ -29,7 +29,6 @@ from dextouch.episodes.format import (
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages, unheld_folders
 from dextouch.errors import (
     ConflictError,
@@ -200,7 +199,7 @@ class ObjectStorage:
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
 
-    def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
         """Writer of a new group.
 
         Raises:
@@ -221,7 +220,7 @@ class ObjectStorage:
         if self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
         stage = new_stage(self.root, kind, item_id)
-        writer = UploadingWriter(stage=stage, target=target, attributes=attributes, options=options)
+        writer = UploadingWriter(stage=stage, target=target, attributes=attributes)
         writer.upload = lambda: self._upload(kind, target)
         return writer
 

@@ -28,7 +28,6 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.groups import read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
     CLICKS_FILE,
     REVIEW_FILE,
@@ -94,9 +93,7 @@ class EpisodeStore:
         """The folder that other machines must see to use this store; none for a bucket."""
         return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
 
-    def writer(
-        self, *, kind: Kind = "episode", attributes: Attributes, options: WriteOptions | None = None
-    ) -> EpisodeWriter:
+    def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
 
         Raises:
@@ -109,7 +106,7 @@ class EpisodeStore:
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
             )
         _check(kind, attributes_id(attributes))
-        return self._storage.writer(kind, attributes, options or WriteOptions())
+        return self._storage.writer(kind, attributes)
 
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
@@ -324,12 +321,12 @@ class _LocalStorage:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
         target = self._folder(kind, attributes_id(attributes))
         if target.exists():
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
         stage = new_stage(self.root, kind, target.name)
-        return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
+        return EpisodeWriter(stage=stage, target=target, attributes=attributes)
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
         if not self.exists(kind, item_id):

@@ -40,7 +40,7 @@ from dextouch.episodes.format import (
     shard_path,
     stream_arrays,
 )
-from dextouch.episodes.stream_writer import StreamWriter, WriteOptions
+from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import json_ready
 from dextouch.streams import (
@@ -144,13 +144,10 @@ class EpisodeWriter:
         stage: new folder on the store's file system.
         target: where the group appears at commit.
         attributes: of an episode or a recording.
-        options: quality and speed.
     """
 
-    def __init__(
-        self, *, stage: Path, target: Path, attributes: Attributes, options: WriteOptions
-    ) -> None:
-        self._stage, self._target, self._options = stage, target, options
+    def __init__(self, *, stage: Path, target: Path, attributes: Attributes) -> None:
+        self._stage, self._target = stage, target
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
         with disk_errors(f"create {stage}"):
@@ -189,9 +186,7 @@ class EpisodeWriter:
         for name in stream_arrays(descriptor, self._kind):
             if name in taken:
                 raise ConflictError(f"stream {descriptor.name!r}: array {name!r} exists already")
-        self._streams[descriptor.name] = StreamWriter(
-            self._stage, descriptor, self._kind, self._options
-        )
+        self._streams[descriptor.name] = StreamWriter(self._stage, descriptor, self._kind)
 
     def append(
         self,
