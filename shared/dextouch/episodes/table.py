@@ -189,19 +189,19 @@ class EpisodeGrid:
         reader: the episode.
         image_px: side that the middle square of larger images is scaled to; None leaves images as
             they are.
+
+    Attributes:
+        about: domain, origin, outcome, event times, names of objects and so on.
+        content_sha256: digest of all that the store holds of it, for `data_hash`.
     """
 
     def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:
-        self.reader = reader
-        self.image_px = image_px
+        self.reader, self.image_px = reader, image_px
+        self.about: EpisodeAttributes = reader.attributes
+        self.content_sha256 = reader.content_sha256
 
     def __len__(self) -> int:
         return self.reader.num_steps
-
-    @cached_property
-    def about(self) -> EpisodeAttributes:
-        """Domain, origin, outcome, event times, names of objects and so on."""
-        return self.reader.attributes
 
     @property
     def episode_id(self) -> str:
@@ -238,11 +238,6 @@ class EpisodeGrid:
         if self.about.success is None:
             raise InvalidInputError(f"episode {self.episode_id!r}: is {OUTCOME.lack}")
         return self.about.success
-
-    @cached_property
-    def content_sha256(self) -> str:
-        """Digest of all that the store holds of it, for `data_hash`."""
-        return self.reader.content_sha256
 
     @property
     def t_ref_ns(self) -> Int64[np.ndarray, " steps"]:

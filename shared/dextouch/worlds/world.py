@@ -25,11 +25,12 @@ from dextouch.errors import (
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import (
     EVERYTHING,
+    OBSERVED_ARRAYS,
     Observation,
     ReturnSelector,
     RolloutStart,
     WorldDescription,
-    check_observation,
+    check_observation_arrays,
 )
 
 State = TypeVar("State")
@@ -249,7 +250,8 @@ def _check_fits(
     *,
     where: str,
 ) -> None:
-    check_observation(observation, where=where)
+    arrays = {name: getattr(observation, name) for name in OBSERVED_ARRAYS}
+    check_observation_arrays(**arrays, where=where)
     if set(observation.images) != set(cameras):
         raise ShapeError(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
