@@ -24,8 +24,7 @@ ABSENT = -1
 COUNTED_SLOPE_SPAN_S = 0.5
 Source = Literal["device", "sequence", "arrival"]
 LOOK_AHEAD = 10
-# A sample counts as lost where everything behind is later by nearly a period: delays are common,
-# losses are rare.
+# A sample is lost where all behind it are later by nearly a period: delays are far more common.
 LOST_SHARE = 0.75
 # While a queue drains, the look-ahead may be extended by this factor.
 MAX_WAIT = 6

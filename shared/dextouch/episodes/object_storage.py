@@ -166,8 +166,7 @@ class ObjectGroup:
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
 
-    After an interrupted upload the group stays in the outbox, from where `complete_uploads` uploads
-    it.
+    After an interrupted upload the group stays in the outbox until `complete_uploads` uploads it.
     """
 
     upload: Callable[[], None]

@@ -62,8 +62,7 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
     if size > MAX_CHUNK_BYTES:
         raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
     try:
-        # Checked before decompression: a decompression bomb declares a size that is never
-        # allocated.
+        # Checked before decompression, so that the size that a bomb declares is never allocated.
         said = zstandard.get_frame_parameters(frame).content_size
         if said != size:
             raise CorruptDataError(f"{what}: holds {said} bytes, expected {size}")

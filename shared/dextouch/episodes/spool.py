@@ -322,8 +322,7 @@ class SpoolWriter:
     def encode(self, stream_name: str, batch: SampleBatch) -> EncodedBatch | None:
         """Encode a batch for `append_record`; None for an empty one.
 
-        It does not change the writer, so that several threads can call it while another one
-        appends.
+        It does not change the writer: threads may call it while another one appends.
 
         Raises:
             UnknownNameError: no such stream.

@@ -78,8 +78,7 @@ def select_episodes(
 
     Raises:
         NotFoundError: an empty store, or no such episode; what those that there are lack is named.
-        ConflictError: an id is in two stores, two episodes are of one recording, or their model
-            rates differ.
+        ConflictError: an id in two stores, two episodes of one recording, or other model rates.
     """
     passed_over: Counter[str] = Counter()
     unfit: Counter[str] = Counter()
@@ -187,18 +186,15 @@ class EpisodeGrid:
 
     Args:
         reader: the episode.
-        image_px: side that the middle square of larger images is scaled to; None leaves images as
-            they are.
+        image_px: side that the middle square of larger images is scaled to; None for no scaling.
 
     Attributes:
         about: domain, origin, outcome, event times, names of objects and so on.
-        content_sha256: digest of all that the store holds of it, for `data_hash`.
     """
 
     def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:
         self.reader, self.image_px = reader, image_px
         self.about: EpisodeAttributes = reader.attributes
-        self.content_sha256 = reader.content_sha256
 
     def __len__(self) -> int:
         return self.reader.num_steps
@@ -238,6 +234,11 @@ class EpisodeGrid:
         if self.about.success is None:
             raise InvalidInputError(f"episode {self.episode_id!r}: is {OUTCOME.lack}")
         return self.about.success
+
+    @cached_property
+    def content_sha256(self) -> str:
+        """Digest of all that the store holds of it, for `data_hash`."""
+        return self.reader.content_sha256
 
     @property
     def t_ref_ns(self) -> Int64[np.ndarray, " steps"]:

@@ -151,8 +151,7 @@ class EpisodeWriter:
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
         with disk_errors(f"create {stage}"):
-            # Lock held as long as the writer lives, so that a sweep does not consider the stage
-            # abandoned.
+            # Locked as long as the writer lives, so that no sweep takes the stage for abandoned.
             self._lock = make_held_folder(stage)
         try:
             for descriptor in attributes.streams:
@@ -212,8 +211,7 @@ class EpisodeWriter:
 
         Raises:
             UnknownNameError: no such stream.
-            InvalidInputError: stamps of the other kind or out of order, or values of another dtype
-                or shape.
+            InvalidInputError: stamps of the other kind or out of order, or unfit values.
             StorageFullError: the disk is full.
             StorageError: an earlier block of the stream was interrupted.
         """

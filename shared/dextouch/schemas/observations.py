@@ -453,8 +453,7 @@ def decode_images(
     """Inverse of `encode_images`, for a response that may hold JPEG.
 
     Raises:
-        InvalidInputError: sizes that are missing or do not fit the bytes, or images of different
-            sizes.
+        InvalidInputError: sizes that are missing or do not fit, or images that differ in size.
         LimitExceededError: images that take more than `max_bytes` once decoded.
         CorruptDataError: not JPEG.
     """

@@ -158,8 +158,7 @@ def read_configuration(path: Path) -> Mapping[str, Any]:
     """Sections of a configuration file, and its data folder if it names one.
 
     Raises:
-        InvalidInputError: it cannot be read, is no TOML, or has another setting outside of a
-            section.
+        InvalidInputError: it cannot be read, is no TOML, or has a setting outside of a section.
     """
     try:
         return _read(path, path.stat().st_mtime_ns)

@@ -32,8 +32,7 @@ def bound_socket(what: str, host: str, port: int, *, advice: str) -> socket.sock
         InvalidInputError: the host is not of this machine, or the port needs rights.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # The protocol is explicit so that asyncio sets TCP_NODELAY; otherwise every response takes 40
-    # ms.
+    # With the protocol asyncio sets TCP_NODELAY; otherwise every response takes 40 ms.
     bound = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -98,8 +98,7 @@ class World(Protocol[State]):
                 not depend on it.
 
         Raises:
-            InvalidInputError: wrong shape, NaN, infinity, or what this world cannot reach; nothing
-                has changed.
+            InvalidInputError: wrong shape, NaN, infinity, or out of reach; nothing has changed.
             EndedError: the world cannot continue from this state, for the given reason; the state
                 remains valid for `snapshot`.
         """
