@@ -252,21 +252,13 @@ class GroupReader(Generic[A]):
         self._check_span("samples", name, start, stop)
         return self._values(name, start, stop)
 
-    def images(
-        self,
-        name: str,
-        start: int = 0,
-        stop: int | None = None,
-        *,
-        form: ImageForm = FULL_FORM,
-    ) -> np.ndarray:
+    def images(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Images start … stop−1 of a camera, uint8 [n, h, w, channels].
 
         Args:
             name: of an image stream.
             start: first image.
             stop: one past the last; None for all.
-            form: half size or gray instead of the stored size and colours.
 
         Raises:
             UnknownNameError: no such stream.
@@ -277,12 +269,12 @@ class GroupReader(Generic[A]):
         self._check_span("images", name, start, stop)
         # A forged length must not be expanded to a list of numbers.
         self._contents.shard(name).check_index()
-        return self.images_at(name, np.arange(start, stop), form=form)
+        return self.images_at(name, np.arange(start, stop))
 
     def images_at(
         self, name: str, indices: np.ndarray, *, form: ImageForm = FULL_FORM
     ) -> np.ndarray:
-        """Images of a camera at non-decreasing indices; the rest and errors as of `images`."""
+        """Images of a camera at non-decreasing indices, or half their size or gray; as `images`."""
         descriptor: StreamDescriptor = self._stream(name)
         if descriptor.kind != "image":
             raise InvalidInputError(f"{self._what}: {name!r} holds no images")

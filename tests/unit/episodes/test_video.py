@@ -120,7 +120,7 @@ def test_forms_are_near_the_plain_way(store, unit):
         ImageForm(gray=True),
         ImageForm(half_size=True, gray=True),
     ):
-        got = reader.images("camera_head", 3, 14, form=form)
+        got = reader.images_at("camera_head", np.arange(3, 14), form=form)
         assert got.shape == (11, *form.shape((HEIGHT, WIDTH, 3)))
         assert abs(got.astype(int) - transform_pixels(full, form)).mean() < 2.5, form
 
