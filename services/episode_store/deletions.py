@@ -6,7 +6,6 @@ Deletions are made by `dextouch store delete` on the same folder, also while the
 import threading
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Annotated, Final
 
 import structlog
@@ -23,7 +22,6 @@ from dextouch.schemas import (
     Deletions,
     DeletionsRevision,
     DeletionStatus,
-    OutstandingTakes,
     PendingDeletion,
     RecordingAttributes,
     SpooledTake,
@@ -139,9 +137,7 @@ def deletion_statuses(records: DeletionRecords) -> list[DeletionStatus]:
             deleted_at=record.deleted_at,
             is_of_operator=record.operator_digest is not None,
             num_recordings=len(record.takes),
-            outstanding=tuple(
-                OutstandingTakes.model_validate(asdict(one)) for one in records.outstanding(key)
-            ),
+            outstanding=records.outstanding(key),
         )
         for key, record in records.read().items()
     ]

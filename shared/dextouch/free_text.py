@@ -39,7 +39,7 @@ def check_lines(text: str) -> str:
 
 def check_texts(model: BaseModel) -> None:
     """Raise ValueError if any text in a model, also as a name in a mapping, is not one line."""
-    for text in _texts_in(model):
+    for text in texts_in(model):
         check_line(text)
 
 
@@ -61,17 +61,17 @@ def _checked(text: str, unsafe: re.Pattern[str], expected: str) -> str:
     return text
 
 
-def _texts_in(value: object) -> Iterator[str]:
+def texts_in(value: object) -> Iterator[str]:
+    """All texts in a model, a mapping (names too) or a list, at any depth."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, BaseModel):
-        for _, one in value:
-            yield from _texts_in(one)
+        yield from texts_in([one for _, one in value])
     elif isinstance(value, Mapping):
-        yield from _texts_in([*value.keys(), *value.values()])
+        yield from texts_in([*value.keys(), *value.values()])
     elif isinstance(value, Iterable) and not isinstance(value, bytes):
         for one in value:
-            yield from _texts_in(one)
+            yield from texts_in(one)
 
 
 FreeText = Annotated[

@@ -20,17 +20,34 @@ def encode_jpeg(image: np.ndarray, *, quality: int = DEFAULT_QUALITY) -> bytes:
     return simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=quality)
 
 
-def decode_jpeg(data: bytes, *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+def decode_jpeg(
+    data: bytes,
+    *,
+    where: str = "image",
+    size_px: tuple[int, ...] | None = None,
+    gray: bool = False,
+    **reduced: int,
+) -> UInt8[np.ndarray, "h w c"]:
     """Decode a JPEG to an RGB image.
 
+    Args:
+        data: of the file.
+        where: names it in messages.
+        size_px: expected height and width.
+        gray: decode its luma alone, to one channel.
+        reduced: `min_height`, `min_width` and `min_factor` of `simplejpeg`, for a smaller image.
+
     Raises:
-        CorruptDataError: not a complete JPEG image; `where` names it in the message.
+        CorruptDataError: not a complete JPEG image, or one of another size.
     """
+    # Check the header first: the decoder allocates what it declares.
+    if size_px is not None and (size := jpeg_size(data, where=where)) != size_px:
+        raise CorruptDataError(f"{where}: got a JPEG image of {size} pixels, expected {size_px}")
     try:
-        return simplejpeg.decode_jpeg(data, colorspace="RGB")
+        return simplejpeg.decode_jpeg(data, colorspace="GRAY" if gray else "RGB", **reduced)
     except ValueError as error:
         raise CorruptDataError(
-            f"{where}: {len(data)} bytes are not a JPEG image ({error})"
+            f"{where}: {len(data)} bytes are not a complete JPEG image ({error})"
         ) from error
 
 
@@ -50,23 +67,12 @@ def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
 
 
 def check_jpeg(data: bytes, size_px: tuple[int, int], *, where: str = "image") -> None:
-    """Decode a JPEG of a known size by the rule of `decode_jpeg`, and discard the image.
+    """Decode a JPEG of a known size, and discard the image; raises as `decode_jpeg`.
 
     At an eighth of the size all coefficients are still read, so that the same images are refused
     in about 60 % of the time.
-
-    Raises:
-        CorruptDataError: not a complete JPEG image of that height and width (pixels).
     """
-    # Check the header first: the decoder allocates what it declares.
-    if (size := jpeg_size(data, where=where)) != size_px:
-        raise CorruptDataError(f"{where}: got a JPEG image of {size} pixels, expected {size_px}")
-    try:
-        simplejpeg.decode_jpeg(data, colorspace="RGB", min_height=1, min_width=1, min_factor=8)
-    except ValueError as error:
-        raise CorruptDataError(
-            f"{where}: {len(data)} bytes are not a complete JPEG image ({error})"
-        ) from error
+    decode_jpeg(data, where=where, size_px=size_px, min_height=1, min_width=1, min_factor=8)
 
 
 def scaled_square(

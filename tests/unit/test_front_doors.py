@@ -136,7 +136,7 @@ def test_an_import_past_a_door_is_found(line, importer):
     [
         ("from dextouch.streams import decode_batch", ""),
         ("from dextouch.streams.batch import decode_batch", "dextouch.streams.samples"),
-        ("from dextouch.bridges.model_grid import blocks", "dextouch.bridges.lerobot.video"),
+        ("from dextouch.bridges.exporting import blocks", "dextouch.bridges.lerobot.video"),
         ("from dextouch.hands.actions import reanchor", "dextouch.worlds.routes"),
         ("from dextouch.hands.hand_files import load_hand", ""),
         ("from dextouch.episodes.files import disk_errors", "dextouch.episodes.care.repair"),

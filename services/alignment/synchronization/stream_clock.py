@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.clocks import (
+    count_lost_samples,
     date_by_counting,
-    find_lost_samples,
     fit_clock,
     lateness_ns,
     prefers_sequence,
@@ -132,7 +132,7 @@ def _fitted(
     model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
     if not (batch.sequence == NO_SEQUENCE).any():
         bits = descriptor.capabilities.sequence_bits
-        num_lost = find_lost_samples(batch.sequence, bits=bits).num_missing
+        num_lost = count_lost_samples(batch.sequence, bits=bits)
     return _Dated(
         model.to_host_ns(device_ns, batch.t_host_ns),
         method,

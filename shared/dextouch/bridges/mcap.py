@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from dextouch import __version__
+from dextouch.bridges.exporting import Reader, blocks, exported_samples, new_file
 from dextouch.bridges.mcap_messages import (
     CALIBRATION,
     MessageCodec,
@@ -27,7 +28,6 @@ from dextouch.bridges.mcap_messages import (
     descriptor_set,
     raw_encoding,
 )
-from dextouch.bridges.model_grid import Reader, blocks, exported_samples, new_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, disk_errors
 from dextouch.errors import (
     CorruptDataError,

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from jaxtyping import UInt8
 from rerun.components import ImageFormat
 
-from dextouch.bridges.model_grid import Block, Reader, blocks, new_file
+from dextouch.bridges.exporting import Block, Reader, blocks, new_file
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready

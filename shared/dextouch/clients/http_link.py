@@ -1,7 +1,6 @@
 """Minimal HTTP client on the standard library that raises services' problems as our errors.
 
-It uses http.client, which needs no dependency and takes a third of the time of httpx on large
-bodies.
+It uses http.client, which needs no dependency and takes a third of httpx's time on large bodies.
 """
 
 import http.client

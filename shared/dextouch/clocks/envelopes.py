@@ -282,8 +282,7 @@ class RunningEnvelope:
         step_s = distance_s - period_s
         residual_s = (point[1] - line.at(point[0] - step_s)) * 1e-9 + step_s
         num_more = math.floor(residual_s / period_s + BELOW_SHARE)
-        # A sample delayed by more than a period at the step hides whole periods of it; the next
-        # ones reveal them.
+        # A sample delayed by more than a period at the step hides whole ones; the next reveal them.
         if abs(num_more) > MAX_PERIODS or (num_more < 0 and self._trial is None):
             return None
         return step_s - num_more * period_s

@@ -24,8 +24,7 @@ ABSENT = -1
 COUNTED_SLOPE_SPAN_S = 0.5
 Source = Literal["device", "sequence", "arrival"]
 LOOK_AHEAD = 10
-# A sample counts as lost where everything behind is later by nearly a period: delays are common,
-# losses are rare.
+# A sample is lost where all behind it are later by nearly a period: delays are far more common.
 LOST_SHARE = 0.75
 # While a queue drains, the look-ahead may be extended by this factor.
 MAX_WAIT = 6
@@ -83,23 +82,6 @@ def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
     return tick_ns > COARSE_SHARE * period_ns
 
 
-@dataclass(frozen=True)
-class SequenceReport:
-    """Lost samples of a stream.
-
-    `num_missing_before[i]` samples are missing between sample i-1 and i (0 for the first, at a
-    duplicate and at a restart); `restart_indices` are samples whose number went back or stood.
-    """
-
-    num_missing_before: Int64[np.ndarray, " n"]
-    restart_indices: Int64[np.ndarray, " r"]
-
-    @property
-    def num_missing(self) -> int:
-        """Total number of lost samples."""
-        return int(self.num_missing_before.sum())
-
-
 def unwrap_counter(
     raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
 ) -> Int64[np.ndarray, " n"]:
@@ -136,8 +118,8 @@ def unwrap_counter(
     return np.concatenate([straight[:1], straight[:1] + np.cumsum(steps)]).astype(np.int64)
 
 
-def find_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> SequenceReport:
-    """Gaps and restarts in a stream's sequence numbers.
+def count_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> int:
+    """Number of samples that are missing from a stream's sequence; none where it restarts.
 
     Args:
         sequence: numbers [n] as the device sent them.
@@ -147,8 +129,7 @@ def find_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> SequenceReport
         raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
     numbers = np.asarray(sequence, dtype=np.int64)
     straight = numbers if bits > 62 else unwrap_counter(numbers, modulus=2**bits)
-    steps = np.diff(straight, prepend=straight[:1] - 1)
-    return SequenceReport(np.maximum(steps - 1, 0), np.flatnonzero(steps <= 0).astype(np.int64))
+    return int(np.maximum(np.diff(straight) - 1, 0).sum())
 
 
 class OnlineClock:

@@ -55,7 +55,6 @@ from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
 from .store import write_rollout as write_rollout
 from .stream_writer import ContentDigest as ContentDigest
-from .stream_writer import WriteOptions as WriteOptions
 from .table import TRUE_ORIGINS as TRUE_ORIGINS
 from .table import EpisodeGrid as EpisodeGrid
 from .table import data_hash as data_hash

@@ -8,7 +8,7 @@ import fcntl
 import hashlib
 import mmap
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -44,15 +44,8 @@ def disk_errors(what: str, *, advice: str = "free space and try again") -> Itera
         raise StorageError(f"{what}: {error}") from error
 
 
-def write_all(descriptor: int, data: bytes | memoryview) -> None:
-    """Write every byte to an open file."""
-    view = memoryview(data)
-    while view:
-        view = view[os.write(descriptor, view) :]
-
-
-def write_parts(descriptor: int, parts: Sequence[bytes]) -> None:
-    """Write all parts in order without joining them first (writev)."""
+def write_parts(descriptor: int, *parts: bytes) -> None:
+    """Write every byte of all parts in order, without joining them first (writev)."""
     views = [memoryview(part) for part in parts if part]
     while views:
         num_written = os.writev(descriptor, views)
@@ -105,7 +98,7 @@ def write_file(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o644)
     """Write a new file; it is durable on return unless `sync` is false."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
-        write_all(descriptor, data)
+        write_parts(descriptor, data)
         if sync:
             os.fdatasync(descriptor)
     finally:
@@ -169,10 +162,7 @@ class ByteSource(Protocol):
 class GroupFiles(Protocol):
     """The files of one committed group, by relative names with `/`."""
 
-    @property
-    def item_id(self) -> str:
-        """Id of the group."""
-        ...
+    item_id: str
 
     def get(self, name: str) -> bytes | None:
         """All bytes of a small file; None where there is no such file."""
@@ -274,12 +264,7 @@ class LocalGroup:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    @property
-    def item_id(self) -> str:
-        """The folder's name."""
-        return self.folder.name
+        self.folder, self.item_id = folder, folder.name
 
     def get(self, name: str) -> bytes | None:
         """All bytes of a small file; None where there is no such file."""

@@ -35,7 +35,6 @@ from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
     NotFoundError,
-    ShapeError,
     StorageError,
     UnknownNameError,
 )
@@ -253,70 +252,40 @@ class GroupReader(Generic[A]):
         self._check_span("samples", name, start, stop)
         return self._values(name, start, stop)
 
-    def images(
-        self,
-        name: str,
-        start: int = 0,
-        stop: int | None = None,
-        *,
-        form: ImageForm = FULL_FORM,
-        out: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def images(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Images start … stop−1 of a camera, uint8 [n, h, w, channels].
 
         Args:
             name: of an image stream.
             start: first image.
             stop: one past the last; None for all.
-            form: half size or gray instead of the stored size and colours.
-            out: destination; allocated when not given.
 
         Raises:
             UnknownNameError: no such stream.
             InvalidInputError: images outside the stream, or a stream without images.
-            ShapeError: an `out` of another shape or dtype.
             CorruptDataError: damaged bytes.
         """
         stop = self.num_samples(name) if stop is None else stop
         self._check_span("images", name, start, stop)
         # A forged length must not be expanded to a list of numbers.
         self._contents.shard(name).check_index()
-        return self.images_at(name, np.arange(start, stop), form=form, out=out)
+        return self.images_at(name, np.arange(start, stop))
 
     def images_at(
-        self,
-        name: str,
-        indices: np.ndarray,
-        *,
-        form: ImageForm = FULL_FORM,
-        out: np.ndarray | None = None,
+        self, name: str, indices: np.ndarray, *, form: ImageForm = FULL_FORM
     ) -> np.ndarray:
-        """Images of a camera at non-decreasing indices; the rest and errors as of `images`."""
+        """Images of a camera at non-decreasing indices, or half their size or gray; as `images`."""
         descriptor: StreamDescriptor = self._stream(name)
         if descriptor.kind != "image":
             raise InvalidInputError(f"{self._what}: {name!r} holds no images")
         if len(indices):
             self._check_span("images", name, int(indices[0]), int(indices[-1]) + 1)
-        shape = (len(indices), *form.shape(descriptor.shape))
-        if out is not None and (out.shape != shape or out.dtype != np.uint8):
-            raise ShapeError(
-                f"{descriptor.name}: out is {out.dtype} {out.shape}, not uint8 {shape}"
-            )
         if codec_of(descriptor) == "zstd":
-            images = self._pick_plain(descriptor, indices, form)
-            if out is None:
-                return images
-            out[...] = images
-            return out
-        images = np.empty(shape, dtype=np.uint8) if out is None else out
+            return self._pick_plain(descriptor, indices, form)
         unique, places = np.unique(indices, return_inverse=True)
-        if len(unique) == len(indices):
-            self._decode_images(descriptor, unique, form, images)
-        else:
-            once = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
-            self._decode_images(descriptor, unique, form, once)
-            images[...] = once[places]
-        return images
+        images = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
+        self._decode_images(descriptor, unique, form, images)
+        return images if len(unique) == len(indices) else images[places]
 
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
         """Encoded images start … stop−1 of a `jpeg` or `h264` stream.

@@ -19,7 +19,6 @@ from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import simplejpeg
 from pydantic import Field
 
 from dextouch.episodes.format import GOP_IMAGES, Codec
@@ -34,7 +33,7 @@ from dextouch.episodes.h264_headers import (
 )
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.images import check_jpeg, jpeg_size
+from dextouch.images import check_jpeg, decode_jpeg
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -406,23 +405,10 @@ class ImageChunks:
             ) from error
 
     def _decode_jpeg(self, data: bytes, form: ImageForm, out: np.ndarray) -> None:
-        # Check the header first: the decoder allocates what it declares.
-        if (size := jpeg_size(data)) != self.shape[:2]:
-            raise CorruptDataError(f"got a JPEG image of {size} pixels, expected {self.shape[:2]}")
-        try:
-            # At half size libjpeg skips half of the DCT coefficients, which is faster than
-            # averaging.
-            image = simplejpeg.decode_jpeg(
-                data,
-                colorspace="GRAY" if form.gray else "RGB",
-                min_height=out.shape[0] if form.half_size else 0,
-                min_width=out.shape[1] if form.half_size else 0,
-                min_factor=2 if form.half_size else 1,
-            )
-        except ValueError as error:
-            raise CorruptDataError(
-                f"{len(data)} bytes are not a complete JPEG ({error})"
-            ) from error
+        # At half size libjpeg skips half of the DCT coefficients, which is faster than averaging.
+        half = {"min_height": out.shape[0], "min_width": out.shape[1], "min_factor": 2}
+        reduced = half if form.half_size else {}
+        image = decode_jpeg(data, size_px=self.shape[:2], gray=form.gray, **reduced)
         # A half of an odd size is rounded up there and down here.
         out[...] = image[: out.shape[0], : out.shape[1]]
 

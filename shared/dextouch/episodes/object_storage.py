@@ -29,7 +29,6 @@ from dextouch.episodes.format import (
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages, unheld_folders
 from dextouch.errors import (
     ConflictError,
@@ -147,11 +146,7 @@ class ObjectGroup:
 
     def __init__(self, bucket: Bucket, folder: str, known: dict[str, bytes]) -> None:
         self._bucket, self._folder, self._known = bucket, folder, known
-
-    @property
-    def item_id(self) -> str:
-        """Id of the group."""
-        return self._folder.rpartition("/")[2]
+        self.item_id = folder.rpartition("/")[2]
 
     def get(self, name: str) -> bytes | None:
         """Contents of a small file; None if it does not exist."""
@@ -171,8 +166,7 @@ class ObjectGroup:
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
 
-    After an interrupted upload the group stays in the outbox, from where `complete_uploads` uploads
-    it.
+    After an interrupted upload the group stays in the outbox until `complete_uploads` uploads it.
     """
 
     upload: Callable[[], None]
@@ -204,7 +198,7 @@ class ObjectStorage:
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
 
-    def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
         """Writer of a new group.
 
         Raises:
@@ -225,7 +219,7 @@ class ObjectStorage:
         if self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
         stage = new_stage(self.root, kind, item_id)
-        writer = UploadingWriter(stage=stage, target=target, attributes=attributes, options=options)
+        writer = UploadingWriter(stage=stage, target=target, attributes=attributes)
         writer.upload = lambda: self._upload(kind, target)
         return writer
 
@@ -262,7 +256,10 @@ class ObjectStorage:
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
-        delete_group(self._bucket, kind, item_id)
+        group = group_key(kind, item_id)
+        self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
+        self._bucket.remove([f"{group}/{COMMIT_FILE}"])
+        _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
 
     def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
         """Put a file beside the content in place of an earlier one; None removes it."""
@@ -382,14 +379,6 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
         # First, so that the remainder after a kill does not pass for a group.
         (folder / COMMIT_FILE).unlink()
         shutil.rmtree(folder)
-
-
-def delete_group(bucket: Bucket, kind: Kind, item_id: str) -> None:
-    """Delete a group: its commit record first, then its other objects."""
-    group = group_key(kind, item_id)
-    bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
-    bucket.remove([f"{group}/{COMMIT_FILE}"])
-    _remove_files(bucket, group, [facts.key for facts in bucket.list(group)])
 
 
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 import zstandard
 from jaxtyping import Shaped
 
-from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_all
+from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_parts
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 
@@ -62,8 +62,7 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
     if size > MAX_CHUNK_BYTES:
         raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
     try:
-        # Checked before decompression: a decompression bomb declares a size that is never
-        # allocated.
+        # Checked before decompression, so that the size that a bomb declares is never allocated.
         said = zstandard.get_frame_parameters(frame).content_size
         if said != size:
             raise CorruptDataError(f"{what}: holds {said} bytes, expected {size}")
@@ -358,4 +357,4 @@ class ShardWriter:
 
     def _write(self, data: bytes) -> None:
         with disk_errors(f"write array {self._name}", advice="free space on the disk of the store"):
-            write_all(self._file, data)
+            write_parts(self._file, data)

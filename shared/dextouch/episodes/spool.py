@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -323,8 +322,7 @@ class SpoolWriter:
     def encode(self, stream_name: str, batch: SampleBatch) -> EncodedBatch | None:
         """Encode a batch for `append_record`; None for an empty one.
 
-        It does not change the writer, so that several threads can call it while another one
-        appends.
+        It does not change the writer: threads may call it while another one appends.
 
         Raises:
             UnknownNameError: no such stream.
@@ -419,12 +417,7 @@ class SpoolWriter:
     def __enter__(self) -> "SpoolWriter":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self.close()

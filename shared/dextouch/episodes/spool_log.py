@@ -242,20 +242,20 @@ def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
 class SpoolLogWriter:
     """Appends records to a spool's log; each append is one write.
 
-    It continues after `records`, where the file is truncated.
+    It continues after `records`, where the file is truncated; `end` is its length in bytes.
 
     Raises:
         StorageError: the file cannot be opened.
     """
 
     def __init__(self, folder: Path, records: LogRecords) -> None:
-        self._what, self._end = f"log of spool {folder.name!r}", records.end
+        self._what, self.end = f"log of spool {folder.name!r}", records.end
         # Of the rows of all records, and of those before the last one, for `undo`.
         self._rows = self._rows_before = hashlib.sha256(records.rows.tobytes())
         self._file = -1
         with disk_errors(f"open {self._what}"):
             self._file = os.open(folder / LOG_FILE, os.O_RDWR)
-            self._cut(self._end)
+            self._cut(self.end)
 
     def append(self, batch: EncodedBatch, *, stream: int, first_sample: int) -> int:
         """Append a batch atomically and return its offset, for `undo`.
@@ -263,7 +263,7 @@ class SpoolLogWriter:
         Raises:
             StorageFullError: no space; the file is unchanged.
         """
-        place, length = self._end, len(batch.body)
+        place, length = self.end, len(batch.body)
         counts = (first_sample, stream, batch.num_samples, length, batch.body_crc32c)
         header = _HEADER.pack(_RECORD_MAGIC, place, *counts)
         parts = (header, _CRC.pack(google_crc32c.value(header)), batch.body)
@@ -271,21 +271,16 @@ class SpoolLogWriter:
             with disk_errors(
                 self._what, advice="what was recorded stays, free space and try again"
             ):
-                write_parts(self._file, parts)
+                write_parts(self._file, *parts)
         except StorageError:
             # Truncating needs no space, so acknowledged records stay readable.
             self._cut(place)
             raise
-        self._end = place + HEADER_BYTES + length
+        self.end = place + HEADER_BYTES + length
         self._rows_before = self._rows.copy()
         row = (place, first_sample, stream, batch.num_samples, length, batch.body_crc32c)
         self._rows.update(_ROW.pack(*row, 0))
         return place
-
-    @property
-    def end(self) -> int:
-        """Length of the log in bytes."""
-        return self._end
 
     @property
     def records_sha256(self) -> str:
@@ -296,7 +291,7 @@ class SpoolLogWriter:
         """Remove the last record, at the given offset."""
         with disk_errors(f"cut {self._what}"):
             self._cut(place)
-        self._end, self._rows = place, self._rows_before
+        self.end, self._rows = place, self._rows_before
 
     def sync(self) -> None:
         """Sync all appended records to disk."""

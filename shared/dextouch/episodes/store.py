@@ -1,8 +1,7 @@
 """Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -26,9 +25,8 @@ from dextouch.episodes.format import (
     attributes_id,
     check_id,
 )
-from dextouch.episodes.groups import read_group
+from dextouch.episodes.groups import A, GroupContents, read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
     CLICKS_FILE,
     REVIEW_FILE,
@@ -94,9 +92,7 @@ class EpisodeStore:
         """The folder that other machines must see to use this store; none for a bucket."""
         return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
 
-    def writer(
-        self, *, kind: Kind = "episode", attributes: Attributes, options: WriteOptions | None = None
-    ) -> EpisodeWriter:
+    def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
 
         Raises:
@@ -109,7 +105,7 @@ class EpisodeStore:
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
             )
         _check(kind, attributes_id(attributes))
-        return self._storage.writer(kind, attributes, options or WriteOptions())
+        return self._storage.writer(kind, attributes)
 
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
@@ -118,21 +114,17 @@ class EpisodeStore:
             NotFoundError: no such episode.
             CorruptDataError, StorageError: damaged, or of a newer format.
         """
-        group = self._storage.group(*_check("episode", episode_id))
-        with self._deletion_told("episode", episode_id):
-            return EpisodeReader(read_group(group, EpisodeAttributes))
+        return EpisodeReader(self._read("episode", episode_id, EpisodeAttributes))
 
     def recording(self, recording_id: str) -> RecordingReader:
         """Open a finished recording; raises as `open`."""
-        group = self._storage.group(*_check("recording", recording_id))
-        with self._deletion_told("recording", recording_id):
-            return RecordingReader(read_group(group, RecordingAttributes))
+        return RecordingReader(self._read("recording", recording_id, RecordingAttributes))
 
-    @contextmanager
-    def _deletion_told(self, kind: Kind, item_id: str) -> Iterator[None]:
-        """Context manager in which the damage of a group that is gone is a NotFoundError."""
+    def _read(self, kind: Kind, item_id: str, model: type[A]) -> GroupContents[A]:
+        """Open a group; damage of one that is gone is a NotFoundError."""
+        group = self._storage.group(*_check(kind, item_id))
         try:
-            yield
+            return read_group(group, model)
         except CorruptDataError:
             self._storage.group(kind, item_id)
             raise
@@ -324,12 +316,12 @@ class _LocalStorage:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
         target = self._folder(kind, attributes_id(attributes))
         if target.exists():
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
         stage = new_stage(self.root, kind, target.name)
-        return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
+        return EpisodeWriter(stage=stage, target=target, attributes=attributes)
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
         if not self.exists(kind, item_id):

@@ -26,25 +26,14 @@ from dextouch.episodes.image_codecs import (
 )
 from dextouch.episodes.shards import ShardWriter
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
-from dextouch.frozen_model import FrozenModel
 from dextouch.images import DEFAULT_QUALITY, encode_jpeg
 from dextouch.schemas import StreamContent
 from dextouch.streams import SampleBatch, StreamDescriptor, check_encoded_image
 
 MAX_WAITING_IMAGES = 32
+# Images of a storage chunk.
+_CHUNK_IMAGES = {"jpeg": 1, "h264": GOP_IMAGES}
 Stamps = Mapping[str, np.ndarray]
-
-
-class WriteOptions(FrozenModel):
-    """Settings of a writer.
-
-    Attributes:
-        threads: whether images are encoded in background threads, one per camera.
-        video: quality of `h264` streams.
-    """
-
-    threads: bool = True
-    video: VideoSettings = VideoSettings()
 
 
 class StreamWriter:
@@ -53,10 +42,8 @@ class StreamWriter:
     Plain images of a `jpeg` or `h264` stream are encoded in a background thread.
     """
 
-    def __init__(
-        self, stage: Path, descriptor: StreamDescriptor, kind: Kind, options: WriteOptions
-    ) -> None:
-        self.descriptor, self._kind, self._options = descriptor, kind, options
+    def __init__(self, stage: Path, descriptor: StreamDescriptor, kind: Kind) -> None:
+        self.descriptor, self._kind = descriptor, kind
         self._last_stamp_ns: int | None = None
         # Arrival stamps may repeat: a device can hand over several samples at once.
         self._least_step_ns = 1 if kind == "episode" else 0
@@ -66,7 +53,7 @@ class StreamWriter:
         self._is_broken = False
         self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
-        self._images = _EncodedImages(descriptor, options.video)
+        self._images = _EncodedImages(descriptor)
         self._queue: _ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
         self.arrays = {name: ShardWriter(stage, name, entry) for name, entry in entries.items()}
@@ -95,9 +82,7 @@ class StreamWriter:
             self._images.check(values)
         self._check_order(stamps[STAMPS[self._kind][0]])
         self._plain = plain
-        if self._codec == "zstd" or (
-            self._queue is None and (values.dtype == object or not self._options.threads)
-        ):
+        if self._codec == "zstd" or (self._queue is None and values.dtype == object):
             self._write(values, stamps)
         else:
             # Once there is a queue, everything goes through it to keep the order.
@@ -189,8 +174,8 @@ class StreamWriter:
 class _EncodedImages:
     """Groups the images of a `jpeg` or `h264` stream into storage chunks."""
 
-    def __init__(self, descriptor: StreamDescriptor, settings: VideoSettings) -> None:
-        self._descriptor, self._settings = descriptor, settings
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._descriptor = descriptor
         self._codec = codec_of(descriptor)
         self._num_given = 0
         self._video: GopEncoder | None = None
@@ -217,19 +202,17 @@ class _EncodedImages:
     def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
         """Add images; returns the completed storage chunks with their number of images."""
         images = list(values) if values.dtype == object else [self._encode(v) for v in values]
-        if self._codec == "jpeg":
-            return [(pack_chunk("jpeg", [data]), 1) for data in images]
         complete = []
         for data in images:
             self._group.append(data)
-            if len(self._group) == GOP_IMAGES:
+            if len(self._group) == _CHUNK_IMAGES[self._codec]:
                 complete += self.rest()
         return complete
 
     def rest(self) -> list[tuple[bytes, int]]:
         """The last, partial storage chunk."""
         group, self._group = self._group, []
-        return [(pack_chunk("h264", group), len(group))] if group else []
+        return [(pack_chunk(self._codec, group), len(group))] if group else []
 
     def _encode(self, image: np.ndarray) -> bytes:
         if self._codec == "jpeg":
@@ -238,7 +221,7 @@ class _EncodedImages:
         if self._video is None:
             height, width, _ = self._descriptor.shape
             rate_hz = self._descriptor.nominal_rate_hz
-            self._video = GopEncoder(height, width, rate_hz=rate_hz, settings=self._settings)
+            self._video = GopEncoder(height, width, rate_hz=rate_hz, settings=VideoSettings())
             self.encoder = self._video.description
         return self._video.encode(image)
 
@@ -321,11 +304,9 @@ class ContentDigest:
         if self._codec == "zstd":
             values.update(batch.values.astype(self._dtype, order="C", copy=False).data)
             return
-        # Storage chunks of images: one of JPEG, a group of H.264.
-        num_images = GOP_IMAGES if self._codec == "h264" else 1
         for image in batch.values:
             self._group.append(image)
-            if len(self._group) == num_images:
+            if len(self._group) == _CHUNK_IMAGES[self._codec]:
                 values.update(pack_chunk(self._codec, self._group))
                 self._group = []
 

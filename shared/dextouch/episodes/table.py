@@ -78,8 +78,7 @@ def select_episodes(
 
     Raises:
         NotFoundError: an empty store, or no such episode; what those that there are lack is named.
-        ConflictError: an id is in two stores, two episodes are of one recording, or their model
-            rates differ.
+        ConflictError: an id in two stores, two episodes of one recording, or other model rates.
     """
     passed_over: Counter[str] = Counter()
     unfit: Counter[str] = Counter()
@@ -187,21 +186,18 @@ class EpisodeGrid:
 
     Args:
         reader: the episode.
-        image_px: side that the middle square of larger images is scaled to; None leaves images as
-            they are.
+        image_px: side that the middle square of larger images is scaled to; None for no scaling.
+
+    Attributes:
+        about: domain, origin, outcome, event times, names of objects and so on.
     """
 
     def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:
-        self.reader = reader
-        self.image_px = image_px
+        self.reader, self.image_px = reader, image_px
+        self.about: EpisodeAttributes = reader.attributes
 
     def __len__(self) -> int:
         return self.reader.num_steps
-
-    @cached_property
-    def about(self) -> EpisodeAttributes:
-        """Domain, origin, outcome, event times, names of objects and so on."""
-        return self.reader.attributes
 
     @property
     def episode_id(self) -> str:

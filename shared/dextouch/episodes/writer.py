@@ -10,7 +10,6 @@ import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -41,7 +40,7 @@ from dextouch.episodes.format import (
     shard_path,
     stream_arrays,
 )
-from dextouch.episodes.stream_writer import StreamWriter, WriteOptions
+from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import json_ready
 from dextouch.streams import (
@@ -145,18 +144,14 @@ class EpisodeWriter:
         stage: new folder on the store's file system.
         target: where the group appears at commit.
         attributes: of an episode or a recording.
-        options: quality and speed.
     """
 
-    def __init__(
-        self, *, stage: Path, target: Path, attributes: Attributes, options: WriteOptions
-    ) -> None:
-        self._stage, self._target, self._options = stage, target, options
+    def __init__(self, *, stage: Path, target: Path, attributes: Attributes) -> None:
+        self._stage, self._target = stage, target
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
         with disk_errors(f"create {stage}"):
-            # Lock held as long as the writer lives, so that a sweep does not consider the stage
-            # abandoned.
+            # Locked as long as the writer lives, so that no sweep takes the stage for abandoned.
             self._lock = make_held_folder(stage)
         try:
             for descriptor in attributes.streams:
@@ -190,9 +185,7 @@ class EpisodeWriter:
         for name in stream_arrays(descriptor, self._kind):
             if name in taken:
                 raise ConflictError(f"stream {descriptor.name!r}: array {name!r} exists already")
-        self._streams[descriptor.name] = StreamWriter(
-            self._stage, descriptor, self._kind, self._options
-        )
+        self._streams[descriptor.name] = StreamWriter(self._stage, descriptor, self._kind)
 
     def append(
         self,
@@ -218,8 +211,7 @@ class EpisodeWriter:
 
         Raises:
             UnknownNameError: no such stream.
-            InvalidInputError: stamps of the other kind or out of order, or values of another dtype
-                or shape.
+            InvalidInputError: stamps of the other kind or out of order, or unfit values.
             StorageFullError: the disk is full.
             StorageError: an earlier block of the stream was interrupted.
         """
@@ -262,12 +254,7 @@ class EpisodeWriter:
     def __enter__(self) -> "EpisodeWriter":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self._commit()

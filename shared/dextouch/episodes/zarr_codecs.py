@@ -1,7 +1,6 @@
 """Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for reading image arrays.
 
-zarr-python finds them through this package's entry points. They only decode; writing goes through
-`EpisodeWriter`.
+zarr-python finds them by this package's entry points. They only decode: `EpisodeWriter` writes.
 """
 
 from dataclasses import dataclass

@@ -116,6 +116,7 @@ class HandModel:
     """A hand of 1 to 5 fingers with 1 to 6 hinges each.
 
     Attributes:
+        fingers: the tables, which do not change: others are another hand.
         joint_names: in the order of the joint vector: finger by finger, from the wrist out.
         lower_rad: lower joint limits [joints].
         upper_rad: upper joint limits [joints].
@@ -139,16 +140,11 @@ class HandModel:
         _check_fingers(fingers, name)
         self.side = side
         self.name = name
-        self._fingers = tuple(fingers)
+        self.fingers = tuple(fingers)
         rows = [row for finger in fingers for row in finger.joints]
         self.joint_names = tuple(row.name for row in rows)
         self.lower_rad, self.upper_rad = np.array([row.limits_rad for row in rows]).T.copy()
         self._chains = _Chains.of(fingers)
-
-    @property
-    def fingers(self) -> tuple[FingerTable, ...]:
-        """The tables, which do not change: others are another hand."""
-        return self._fingers
 
     def joint_frames(
         self, joints_rad: np.ndarray

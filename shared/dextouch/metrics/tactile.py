@@ -34,8 +34,7 @@ def mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 def psnr(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
     """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
 
-    Pooled, since samples of an untouched hand are mostly exact and a mean would be dominated by the
-    cap.
+    Pooled, since samples of an untouched hand are mostly exact: the cap would dominate a mean.
     """
     a, b = _pair(predicted_kpa, true_kpa, "PSNR")
     return float(decibels(np.mean((a - b) ** 2), peak=peak_kpa))

@@ -23,20 +23,12 @@ def dynamic_time_warping(first: np.ndarray, second: np.ndarray) -> float:
     Args:
         first: points [n, d].
         second: points [m, d].
-
-    Raises:
-        ShapeError: not two trajectories of points of the same dimension.
     """
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1] or not len(a) or not len(b):
-        raise ShapeError(
-            f"trajectories: got shapes {a.shape} and {b.shape}, expected [n, d] and [m, d]"
-        )
-    distances = np.linalg.norm(a[:, None] - b[None], axis=2)
-    cost = np.full((len(a) + 1, len(b) + 1), np.inf)
+    distances = np.linalg.norm(first[:, None] - second[None], axis=2)
+    cost = np.full((len(first) + 1, len(second) + 1), np.inf)
     cost[0, 0] = 0.0
-    for i in range(len(a)):
-        for j in range(len(b)):
+    for i in range(len(first)):
+        for j in range(len(second)):
             before = min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
             cost[i + 1, j + 1] = distances[i, j] + before
     return float(cost[-1, -1])

@@ -67,13 +67,14 @@ from .episodes import json_ready as json_ready
 from .episodes import matrix_rows as matrix_rows
 from .observations import EVERYTHING as EVERYTHING
 from .observations import IMAGE_PREFIX as IMAGE_PREFIX
+from .observations import OBSERVED_ARRAYS as OBSERVED_ARRAYS
 from .observations import Observation as Observation
 from .observations import ReturnSelector as ReturnSelector
 from .observations import RolloutAnswer as RolloutAnswer
 from .observations import RolloutOrigin as RolloutOrigin
 from .observations import RolloutStart as RolloutStart
 from .observations import answer_parts as answer_parts
-from .observations import check_observation as check_observation
+from .observations import check_observation_arrays as check_observation_arrays
 from .observations import decode_answer as decode_answer
 from .observations import decode_images as decode_images
 from .observations import decode_observation as decode_observation

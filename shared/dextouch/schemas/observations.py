@@ -41,7 +41,7 @@ from dextouch.streams import pack, unpack
 
 # Tolerance of the norm of a unit quaternion in float32.
 QUATERNION_TOLERANCE: Final = 1e-3
-ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
+OBSERVED_ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
 ANCHOR_NAMES = tuple(AnchorPoses.__dataclass_fields__)
 RIGID_TOLERANCE = 1e-6
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -154,18 +154,6 @@ class RolloutStart:
     K_head: Float64[np.ndarray, "3 3"] | None = None
 
 
-def check_observation(observation: Observation, *, where: str) -> None:
-    """Check that the arrays of an observation are consistent and finite.
-
-    Raises:
-        ShapeError: inconsistent dtypes, lengths or shapes.
-        NonFiniteError: in touch, actions or object poses.
-        DegenerateRotationError: an object's quaternion is not of length 1.
-    """
-    arrays = {name: getattr(observation, name) for name in ARRAYS}
-    check_observation_arrays(**arrays, where=where)
-
-
 def check_observation_arrays(
     *,
     images: Mapping[str, np.ndarray],
@@ -174,7 +162,13 @@ def check_observation_arrays(
     object_poses: np.ndarray | None = None,
     where: str,
 ) -> None:
-    """Check arrays before they become an observation."""
+    """Check that the arrays of an observation are consistent and finite.
+
+    Raises:
+        ShapeError: inconsistent dtypes, lengths or shapes.
+        NonFiniteError: in touch, actions or object poses.
+        DegenerateRotationError: an object's quaternion is not of length 1.
+    """
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
         raise ShapeError(f"{where}: got 0 steps, expected at least 1")
@@ -391,9 +385,9 @@ def _observation_from(
         for name, array in arrays.items()
         if name.startswith(IMAGE_PREFIX)
     }
-    tactile_kpa, action_reached = (_array(arrays, name, where) for name in ARRAYS[1:3])
+    tactile_kpa, action_reached = (_array(arrays, name, where) for name in OBSERVED_ARRAYS[1:3])
     found = (images, tactile_kpa, action_reached, arrays.get("object_poses"))
-    known: dict[str, Any] = dict(zip(ARRAYS, found, strict=True))
+    known: dict[str, Any] = dict(zip(OBSERVED_ARRAYS, found, strict=True))
     check_observation_arrays(**known, where=where)
     return Observation(**dict(fields), **known)
 
@@ -459,8 +453,7 @@ def decode_images(
     """Inverse of `encode_images`, for a response that may hold JPEG.
 
     Raises:
-        InvalidInputError: sizes that are missing or do not fit the bytes, or images of different
-            sizes.
+        InvalidInputError: sizes that are missing or do not fit, or images that differ in size.
         LimitExceededError: images that take more than `max_bytes` once decoded.
         CorruptDataError: not JPEG.
     """

@@ -65,8 +65,7 @@ class ClickedAt(FrozenModel):
         heading: level axis, along which the second click lies.
         symmetric: whether the object looks the same from all sides around `up`, through the origin
             of its frame; it needs no second click, and `heading` counts as the world's x axis.
-        point_m: the point that is clicked, in the object's frame; by default the middle of the top
-            of the box.
+        point_m: the clicked point in the object's frame; by default the middle of the box's top.
         base_m: height of the lowest side of the box above the table.
     """
 

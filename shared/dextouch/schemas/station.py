@@ -432,7 +432,11 @@ class ConfirmRemoval(FrozenModel):
 
 
 class OutstandingTakes(FrozenModel):
-    """Takes that a station still holds, or has not yet said that it does not hold."""
+    """Takes of a deletion that a station still holds, or has not yet said that it does not.
+
+    `has_answered` is False where the station did not ask since the deletion: then `recordings` are
+    those that the store had of it, and the spool may hold takes that were never uploaded.
+    """
 
     station: str
     recordings: tuple[str, ...]

@@ -38,7 +38,7 @@ from .served_folder import ServedFolder as ServedFolder
 from .settings import ServiceSettings as ServiceSettings
 from .settings import load_settings as load_settings
 from .settings import service_config as service_config
-from .spans import configure_spans as configure_spans
+from .spans import SPANS as SPANS
 from .state import StateStore as StateStore
 from .state import Versioned as Versioned
 from .state import open_state as open_state

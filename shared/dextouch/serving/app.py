@@ -119,24 +119,13 @@ def create_service_app(  # noqa: PLR0913 - all by name
     if settings.trusted_proxies:
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.trusted_proxies))
     _add_error_handlers(app)
-    app.include_router(_health_router(name, _with_folders(readiness, folders)))
+    app.include_router(_health_router(name, readiness, folders))
     for router in routers:
         app.include_router(router, dependencies=[Depends(folder.required) for folder in folders])
     app.openapi = partial(  # type: ignore[method-assign]
         document_service, app, routers, needs_key=app.state.access.has_keys
     )
     return app
-
-
-def _with_folders(
-    readiness: ReadinessCheck | None, folders: Sequence[ServedFolder]
-) -> ReadinessCheck:
-    async def check() -> Sequence[str]:
-        problems = [folder.problem(writing=True) for folder in folders]
-        waiting = [] if readiness is None else await readiness()
-        return [*(problem for problem in problems if problem is not None), *waiting]
-
-    return check
 
 
 def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Lifespan:
@@ -165,7 +154,9 @@ def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Life
     return around
 
 
-def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
+def _health_router(
+    name: str, readiness: ReadinessCheck | None, folders: Sequence[ServedFolder]
+) -> APIRouter:
     router = APIRouter(tags=["health"])
 
     @router.get("/healthz")
@@ -177,8 +168,10 @@ def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
     async def readyz(request: Request, response: Response) -> Readiness:
         """Readiness probe."""
         waiting = [] if request.app.state.running else ["start"]
-        if not waiting and readiness is not None:
-            waiting = list(await readiness())
+        if not waiting:
+            problems = [folder.problem(writing=True) for folder in folders]
+            waiting = [problem for problem in problems if problem is not None]
+            waiting += [] if readiness is None else await readiness()
         response.status_code = HTTPStatus.SERVICE_UNAVAILABLE if waiting else HTTPStatus.OK
         return Readiness(ready=not waiting, service=name, waiting_for=tuple(waiting))
 

@@ -63,13 +63,6 @@ _EXPECTED: Final = {
 _SECRET: Final = re.compile(r"key|token|secret|password|url", re.IGNORECASE)
 
 
-def told_problems(error: ValidationError) -> str:
-    """The first problems of settings in one line, without values that may be secret."""
-    if error.error_count() > MAX_PROBLEMS:
-        return first_problems(error)
-    return "; ".join(_told(item) for item in error.errors(include_url=False))
-
-
 def _told(item: Mapping[str, Any]) -> str:
     where = ".".join(str(part) for part in item["loc"]) or "settings"
     kind = item["type"]
@@ -165,8 +158,7 @@ def read_configuration(path: Path) -> Mapping[str, Any]:
     """Sections of a configuration file, and its data folder if it names one.
 
     Raises:
-        InvalidInputError: it cannot be read, is no TOML, or has another setting outside of a
-            section.
+        InvalidInputError: it cannot be read, is no TOML, or has a setting outside of a section.
     """
     try:
         return _read(path, path.stat().st_mtime_ns)
@@ -224,8 +216,14 @@ def _parts(text: str) -> list[str]:
 
 
 def explained(error: ValidationError, section: str) -> str:
-    """Problems of settings in one line, with the lines of the configuration file they come from."""
-    text = told_problems(error)
+    """Problems of settings in one line, with the lines of the configuration file they come from.
+
+    Values that may be secret are not among them.
+    """
+    if error.error_count() > MAX_PROBLEMS:
+        text = first_problems(error)
+    else:
+        text = "; ".join(_told(item) for item in error.errors(include_url=False))
     path = configuration_path()
     if path is None:
         return text

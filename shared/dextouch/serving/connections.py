@@ -9,13 +9,14 @@ import re
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from http import HTTPStatus
 from typing import Any
 
 import structlog
+from httptools import HttpParserError
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Metric
 from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
@@ -189,59 +190,47 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._moved_bytes += len(data)
         super().data_received(data)
         # The parser keeps a header to itself until its end.
-        if self._is_receiving:
-            self._check_headers(self._received_bytes)
+        if self._is_receiving and not self._is_refused:
+            with suppress(HttpParserError):
+                self._check_headers(self._received_bytes)
 
-    def _check_headers(self, num_bytes: int) -> bool:
-        """Whether a request may go on; if it has too many bytes beside its body, it is refused."""
-        if num_bytes > MAX_HEADER_BYTES and not self._is_refused:
+    def _check_headers(self, num_bytes: int) -> None:
+        """Refuse a request with too many bytes beside its body; the error ends its parsing."""
+        if num_bytes > MAX_HEADER_BYTES:
             text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
             self._refuse(431, InvalidInputError(text))
-        return not self._is_refused
-
-    # The parser calls these for all that it has got, also after a refusal.
+            raise HttpParserError(text)
 
     def on_message_begin(self) -> None:
-        if self._is_refused:
-            return
         super().on_message_begin()
         self._is_receiving, self._has_begun = True, True
         self._received_bytes = self._header_bytes = 0
 
     def on_url(self, url: bytes) -> None:
         self._header_bytes += len(url)
-        if self._check_headers(self._header_bytes):
-            super().on_url(url)
+        self._check_headers(self._header_bytes)
+        super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         self._header_bytes += len(name) + len(value) + NUM_SEPARATORS
-        if self._check_headers(self._header_bytes):
-            super().on_header(name, value)
+        self._check_headers(self._header_bytes)
+        super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        if self._is_refused:
-            return
         self._limits.idle.pop(self, None)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        if self._is_refused:
-            return
         super().on_body(body)
         # The bytes around the pieces of a body may be as many as the body.
         self._received_bytes = max(0, self._received_bytes - 2 * len(body))
 
     def on_message_complete(self) -> None:
-        if self._is_refused:
-            return
         super().on_message_complete()
         self._is_receiving = False
 
-    def handle_websocket_upgrade(self) -> None:
-        if not self._is_refused:
-            super().handle_websocket_upgrade()
-
     def send_400_response(self, msg: str) -> None:
+        # Also called where `_check_headers` has answered.
         if self._is_refused:
             return
         self._note_refusal(400, "no valid HTTP")

@@ -338,8 +338,7 @@ MAX_INLINE_BYTES = 64 * KIB
 class JsonBody(Generic[ModelT]):
     """Route dependency for a body of more than 64 KiB: `Depends(JsonBody(RecordingAttributes))`.
 
-    FastAPI by itself decodes on the event loop and describes every mistake, of which 1 MiB has room
-    for 100,000.
+    FastAPI decodes on the event loop and describes every mistake, of which 1 MiB can hold 100,000.
     """
 
     model: type[ModelT]

@@ -111,8 +111,8 @@ class WrongKeys:
     So a valid key is accepted from every address, whatever else is sent from there.
     """
 
-    def __init__(self, limit: RateLimit | None = None) -> None:
-        self._limit = RateLimit() if limit is None else limit
+    def __init__(self) -> None:
+        self._limit = RateLimit()
 
     def count(self, connection: HTTPConnection, *, what: str = "key") -> None:
         """Count a wrong key.

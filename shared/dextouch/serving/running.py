@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import ServiceSettings, load_settings
-from dextouch.serving.spans import configure_spans
+from dextouch.serving.spans import SPANS
 
 # Address that a service listens on, checked before anything is loaded or started.
 
@@ -32,8 +32,7 @@ def bound_socket(what: str, host: str, port: int, *, advice: str) -> socket.sock
         InvalidInputError: the host is not of this machine, or the port needs rights.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # The protocol is explicit so that asyncio sets TCP_NODELAY; otherwise every response takes 40
-    # ms.
+    # With the protocol asyncio sets TCP_NODELAY; otherwise every response takes 40 ms.
     bound = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -169,6 +168,6 @@ def serve(
     settings = load_settings(kind, list(arguments))
     check_address(service, settings)
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
-    configure_spans(service)
+    SPANS.configure(service)
     run(create_app(settings), settings)
     return 0

@@ -34,7 +34,7 @@ class Spans:
     provider: "TracerProvider | None" = None
 
     def configure(self, service: str) -> None:
-        """Export spans if an endpoint is set and the SDK is installed."""
+        """Export spans of this process if an endpoint is set and the SDK is installed."""
         if not any(os.environ.get(name) for name in ENDPOINTS):
             return
         try:
@@ -91,11 +91,6 @@ class Spans:
 
 
 SPANS = Spans()
-
-
-def configure_spans(service: str) -> None:
-    """Export spans of this process's requests if OpenTelemetry is installed and configured."""
-    SPANS.configure(service)
 
 
 @contextmanager

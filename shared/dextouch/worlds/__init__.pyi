@@ -5,7 +5,6 @@ from .baseline import CopyFirstWorld as CopyFirstWorld
 from .fixed_batch import FixedBatchWorld as FixedBatchWorld
 from .settings import WorldServiceSettings as WorldServiceSettings
 from .world import BatchWorld as BatchWorld
-from .world import QuickWorld as QuickWorld
 from .world import ReconstructingWorld as ReconstructingWorld
 from .world import StartedRollout as StartedRollout
 from .world import State as State

@@ -11,9 +11,9 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from dextouch.serving import (
+    SPANS,
     check_address,
     configure_logging,
-    configure_spans,
     create_service_app,
     open_state,
     run,
@@ -146,5 +146,5 @@ def create_serving_app(
 ) -> FastAPI:
     """The application of one of several processes, which computes a first chunk in each world."""
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    configure_spans(name)
+    SPANS.configure(name)
     return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)

@@ -38,7 +38,7 @@ class CopyFirstWorld:
         model_rate_hz: float = 15.0,
     ) -> None:
         shape = (tasks, cameras, image_height_px, image_width_px, model_rate_hz)
-        self._description = WorldDescription(
+        self.description = WorldDescription(
             name="copy-first",
             kind="baseline",
             digest=hashlib.sha256(f"copy-first/1 {shape}".encode()).hexdigest(),
@@ -58,14 +58,9 @@ class CopyFirstWorld:
         return CopyFirstWorld(**other.model_dump(include={"tasks", "cameras"} | size))
 
     @property
-    def description(self) -> WorldDescription:
-        """See World."""
-        return self._description
-
-    @property
     def is_quick(self) -> bool:
-        """See QuickWorld; a longest chunk of small images is copied in a tenth of a millisecond."""
-        shape = self._description
+        """See World; a longest chunk of small images is copied in a tenth of a millisecond."""
+        shape = self.description
         num_px = len(shape.cameras) * shape.image_height_px * shape.image_width_px
         return shape.max_chunk_steps * num_px * 3 <= MAX_QUICK_BYTES
 

@@ -14,7 +14,7 @@ from prometheus_client import Histogram
 
 from dextouch.errors import LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
-from dextouch.worlds.world import BatchWorld, QuickWorld, State, SteppedRollout, World
+from dextouch.worlds.world import BatchWorld, State, SteppedRollout, World
 
 ResultT = TypeVar("ResultT")
 # Start time and duration of a batch, and of each entry the step and its snapshot.
@@ -53,7 +53,7 @@ def batch_histogram() -> Histogram:
 
 
 class WorldWorker(Generic[State]):
-    """One world, one thread, one queue; a `QuickWorld` needs neither thread nor queue.
+    """One world, one thread, one queue; a quick world needs neither thread nor queue.
 
     A world with `step_batch` gets all pending chunks of one length at once, without waiting for
     more; other worlds get them one by one. Bound to the event loop that first uses it.
@@ -75,7 +75,7 @@ class WorldWorker(Generic[State]):
         # Of a failed batch; they run one by one, so that only the faulty rollout fails.
         self._apart: deque[StepJob[State]] = deque()
         self._is_stepping = False
-        self._is_quick = isinstance(world, QuickWorld) and world.is_quick
+        self._is_quick = bool(getattr(world, "is_quick", False))
         self._executor = ThreadPoolExecutor(
             max_workers=1, thread_name_prefix=f"world-{world.description.name}"
         )

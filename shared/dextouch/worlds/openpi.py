@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 from fastapi import APIRouter
-from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dextouch.errors import DexTouchError, InvalidInputError
@@ -25,8 +24,8 @@ from dextouch.schemas import (
     EVERYTHING,
     ReturnSelector,
     StartRequest,
-    first_problems,
     start_from,
+    validate_fields,
 )
 from dextouch.serving import MAX_WEBSOCKET_BYTES
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
@@ -92,7 +91,7 @@ class _Session:
             )
         before = self._selector
         if "return" in message:
-            self._selector = _validated(ReturnSelector, message["return"], "return")
+            self._selector = validate_fields(ReturnSelector, message["return"], where="return")
         try:
             return await getattr(self, f"_{given[0]}")(message)
         except DexTouchError:
@@ -100,7 +99,7 @@ class _Session:
             raise
 
     async def _start(self, message: dict[str, Any]) -> bytes:
-        request = _validated(StartRequest, message["start"], "start")
+        request = validate_fields(StartRequest, message["start"], where="start")
         answer = await self._service.start(
             request.world, start_from(request), self._selector, owner=self._owner, client=CLIENT
         )
@@ -143,10 +142,3 @@ class _Session:
         info = fields["rollout"]
         self._rollout_id, self._next_chunk = info["id"], info["next_chunk"]
         return pack_openpi({**fields, **arrays, "replayed": answer.replayed})
-
-
-def _validated(model: type[Any], value: object, where: str) -> Any:  # noqa: ANN401 - of the model
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

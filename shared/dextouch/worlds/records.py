@@ -64,15 +64,8 @@ class WatchNote:
     def to_bytes(self, info: Mapping[str, Any]) -> bytes:
         """Serialize the note with the progress of its rollout and the time of this write."""
         uncertainty = None if self.uncertainty is None else self.uncertainty.model_dump()
-        known = (
-            self.client,
-            self.key,
-            self.begun_host_ns,
-            uncertainty,
-            self.success,
-            self.trace_id,
-        )
-        return msgpack.packb((info, time.time_ns(), known))
+        known = vars(self) | {"uncertainty": uncertainty}
+        return msgpack.packb((info, time.time_ns(), tuple(known.values())))
 
     @staticmethod
     def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":

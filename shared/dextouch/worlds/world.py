@@ -25,11 +25,12 @@ from dextouch.errors import (
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import (
     EVERYTHING,
+    OBSERVED_ARRAYS,
     Observation,
     ReturnSelector,
     RolloutStart,
     WorldDescription,
-    check_observation,
+    check_observation_arrays,
 )
 
 State = TypeVar("State")
@@ -56,7 +57,11 @@ class SteppedRollout(Generic[State]):
 
 @runtime_checkable
 class World(Protocol[State]):
-    """A world. Implementations need not be thread-safe."""
+    """A world. Implementations need not be thread-safe.
+
+    Each call of one with an attribute `is_quick` that is true takes well below a millisecond. It is
+    then made in the event loop itself: changing to another thread and back would take longer.
+    """
 
     @property
     def description(self) -> WorldDescription:
@@ -93,8 +98,7 @@ class World(Protocol[State]):
                 not depend on it.
 
         Raises:
-            InvalidInputError: wrong shape, NaN, infinity, or what this world cannot reach; nothing
-                has changed.
+            InvalidInputError: wrong shape, NaN, infinity, or out of reach; nothing has changed.
             EndedError: the world cannot continue from this state, for the given reason; the state
                 remains valid for `snapshot`.
         """
@@ -150,20 +154,6 @@ class ReconstructingWorld(World[State], Protocol[State]):
         Returns:
             Images and touch of the steps after the first.
         """
-        ...
-
-
-@runtime_checkable
-class QuickWorld(World[State], Protocol[State]):
-    """A world that may say that each of its calls takes well below a millisecond.
-
-    Its calls are then made in the event loop itself: changing to another thread and back takes
-    longer, and nobody else is kept waiting for long.
-    """
-
-    @property
-    def is_quick(self) -> bool:
-        """Whether calls take well below a millisecond."""
         ...
 
 
@@ -259,7 +249,8 @@ def _check_fits(
     *,
     where: str,
 ) -> None:
-    check_observation(observation, where=where)
+    arrays = {name: getattr(observation, name) for name in OBSERVED_ARRAYS}
+    check_observation_arrays(**arrays, where=where)
     if set(observation.images) != set(cameras):
         raise ShapeError(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"

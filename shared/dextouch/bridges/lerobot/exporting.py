@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dextouch.bridges.exporting import BLOCK_IMAGES
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import (
     EpisodeFrames,
@@ -26,7 +27,6 @@ from dextouch.bridges.lerobot.layout import (
     value_statistics,
 )
 from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
-from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
@@ -34,7 +34,9 @@ from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 ROWS_AT_ONCE: Final = 100
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
+# Of video that has to be encoded.
 VIDEO = VideoSettings(crf=23, preset="veryfast")
+GROUP_IMAGES: Final = 2
 
 
 @dataclass(frozen=True)
@@ -43,14 +45,11 @@ class ExportOptions:
 
     `fps`: frames a second, a whole number; without it the model rate of the first episode.
     `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
-    own rate; without it all image streams of the first episode, the head's first. `video`, `group`:
-    encoder settings and distance of IDR pictures of video that has to be encoded.
+    own rate; without it all image streams of the first episode, the head's first.
     """
 
     fps: int | None = None
     cameras: tuple[str, ...] | None = None
-    video: VideoSettings = VIDEO
-    group: int = 2
 
 
 DEFAULTS = ExportOptions()
@@ -163,7 +162,7 @@ class _Dataset:
         self.fps = round(rate_hz) if options.fps is None else options.fps
         if not 1 <= self.fps <= 1000:
             raise InvalidInputError(f"fps: got {self.fps}, expected 1 … 1000")
-        self._folder, self._options = folder, options
+        self._folder = folder
         names = [name for name, stream in streams.items() if stream.kind == "image"]
         heads_first = sorted(names, key=lambda name: (name != "camera_head", name))
         self._cameras = options.cameras or tuple(heads_first)
@@ -243,8 +242,7 @@ class _Dataset:
             return units, "remuxed"
         blocks = np.split(indices, range(BLOCK_IMAGES, len(indices), BLOCK_IMAGES))
         images = (image for block in blocks for image in reader.images_at(camera, block))
-        options = self._options
-        return encode_images(images, self.fps, options.video, options.group), "encoded"
+        return encode_images(images, self.fps, VIDEO, GROUP_IMAGES), "encoded"
 
     def _columns(self, frames: EpisodeFrames, task_index: int) -> dict[str, np.ndarray]:
         frame_index = np.arange(len(frames), dtype=np.int64)

@@ -4,26 +4,20 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from pydantic import ValidationError
 
+from dextouch.bridges.exporting import BLOCK_IMAGES
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import WORLD
 from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
-from dextouch.bridges.lerobot.video import read_images, read_units
-from dextouch.bridges.model_grid import (
-    GridEpisode,
-    GridImages,
-    GridNumbers,
-    ImageUnit,
-    store_episode,
-    tactile_numbers,
-)
-from dextouch.episodes import EpisodeStore, disk_errors
+from dextouch.bridges.lerobot.video import VideoSpan, read_images, read_units
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, EpisodeWriter, disk_errors, is_keyframe
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import (
@@ -34,8 +28,10 @@ from dextouch.schemas import (
     StoredAnchor,
     first_problems,
 )
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
+from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
+ImageUnit = Literal["h264", "jpeg", "rgb8"]
 HEAD = "camera_head"
 _CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
 # Usual feature of a role, and the shape of its rows.
@@ -100,7 +96,7 @@ def import_lerobot(
     ids: list[str] = []
     for entry in source.episodes:
         sidecar = source.sidecar(entry)
-        episode, anchor = _content(source, entry, features, sidecar)
+        content, anchor = _content(source, entry, features, sidecar)
         if sidecar is None:
             changes = _foreign_attributes(source, entry, anchor, features, options)
         else:
@@ -116,7 +112,7 @@ def import_lerobot(
                 f"episode {attributes.episode_id!r} exists already; give another "
                 "id_prefix (`dextouch import --id-prefix`)"
             )
-        store_episode(store, attributes, episode, options.images)
+        _store(store, attributes, content, options.images)
         ids.append(attributes.episode_id)
     return ids
 
@@ -174,12 +170,25 @@ def _describe(feature: FeatureInfo) -> str:
     return f"{feature.dtype} {list(feature.shape)}"
 
 
+@dataclass(frozen=True)
+class _Content:
+    """Streams of an episode with one row per step.
+
+    `numbers` has the kind, unit and values of each, and which steps have one; `cameras` where the
+    images are, and their stamps. A stamp that comes twice is one image, the nearest to two steps.
+    """
+
+    t_ref_ns: Int64[np.ndarray, " n"]
+    numbers: dict[str, tuple[StreamKind, str, np.ndarray, Bool[np.ndarray, " n"]]]
+    cameras: dict[str, tuple[VideoSpan, Int64[np.ndarray, " n"]]]
+
+
 def _content(
     source: LeRobotFolder,
     entry: EpisodeEntry,
     features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
-) -> tuple[GridEpisode, AnchorPoses | None]:
+) -> tuple[_Content, AnchorPoses | None]:
     """An episode's numbers and where its videos are.
 
     Actions are relative to the measured poses of the first frame; these are returned where they are
@@ -194,23 +203,63 @@ def _content(
     if (np.diff(t_ns) <= 0).any():
         raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
     measured, commanded, anchor = _actions(columns, features, sidecar, where)
-    numbers = {"action": GridNumbers("robot_state", "action", measured)}
-    if commanded is not None:
-        numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
+    content = _Content(t_ns, {}, {})
     if "tactile" in features:
-        valid = columns.get(layout.VALID, np.ones((entry.length, 2), dtype=bool))
+        valid = columns.get(layout.VALID, np.ones((entry.length, 2))).astype(bool)
         kpa = columns[features["tactile"]].astype(np.float32)
-        numbers = tactile_numbers(kpa, valid.astype(bool)) | numbers
-    cameras = {}
+        for hand, side in enumerate(SIDES):
+            # Of the hands that were sensed at any step.
+            if (keep := valid[:, hand]).any():
+                content.numbers[f"tactile_{side}"] = ("tactile", "kPa", kpa[:, hand], keep)
+    everywhere = np.ones(entry.length, dtype=bool)
+    for name, actions in (("action", measured), ("action_commanded", commanded)):
+        if actions is not None:
+            content.numbers[name] = ("robot_state", "action", actions, everywhere)
     for camera, key in features.items():
         if camera in _ROLES:
             continue
         span = source.span(entry, key)
         stamps = _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where)
-        cameras[camera] = GridImages(
-            span.shape, stamps, partial(read_images, span), partial(read_units, span)
-        )
-    return GridEpisode(t_ns, numbers, cameras), anchor
+        content.cameras[camera] = (span, stamps)
+    return content, anchor
+
+
+def _store(
+    store: EpisodeStore, attributes: EpisodeAttributes, content: _Content, images: ImageUnit
+) -> None:
+    """Write an episode into the store, atomically; `images` is the unit of the cameras."""
+    with store.writer(attributes=attributes) as writer:
+
+        def add(name: str, **properties: object) -> None:
+            known = {"name": name, "nominal_rate_hz": attributes.model_rate_hz, **properties}
+            writer.add_stream(StreamDescriptor.model_validate(known))
+
+        for name, (kind, unit, values, keep) in content.numbers.items():
+            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit)
+            writer.append(name, values=values[keep], t_ref_ns=content.t_ref_ns[keep])
+        for name, (span, stamps_ns) in content.cameras.items():
+            add(name, kind="image", shape=span.shape, dtype="uint8", unit=images)
+            _store_images(writer, name, span, stamps_ns, images)
+
+
+def _store_images(
+    writer: EpisodeWriter, name: str, span: VideoSpan, stamps_ns: np.ndarray, unit: ImageUnit
+) -> None:
+    """Copy video that is H.264 in the store's groups already; encode everything else again."""
+    fresh = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) > 0
+    units = read_units(span) if unit == "h264" and fresh.all() else None
+    # The store's video is in closed groups of pictures.
+    if units and all(is_keyframe(u) == (k % GOP_IMAGES == 0) for k, u in enumerate(units)):
+        writer.append(name, values=encoded_values(units), t_ref_ns=stamps_ns)
+        return
+    images = (image for image, wanted in zip(read_images(span), fresh, strict=True) if wanted)
+    stamps_ns = stamps_ns[fresh]
+    for start in range(0, len(stamps_ns), BLOCK_IMAGES):
+        block = np.stack(list(islice(images, BLOCK_IMAGES)))
+        writer.append(name, values=block, t_ref_ns=stamps_ns[start : start + BLOCK_IMAGES])
+    # Exhausts the reader, so that a file that is too short is refused.
+    for _ in images:
+        pass
 
 
 def _columns(

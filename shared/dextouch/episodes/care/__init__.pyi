@@ -4,7 +4,6 @@ from .deletion import plan_deletion as plan_deletion
 from .deletion import reviews_by as reviews_by
 from .deletion_records import Covered as Covered
 from .deletion_records import DeletionRecords as DeletionRecords
-from .deletion_records import Outstanding as Outstanding
 from .deletion_records import TakeFacts as TakeFacts
 from .deletion_records import take_start as take_start
 from .repair import LEFT as LEFT

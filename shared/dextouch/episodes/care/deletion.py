@@ -10,26 +10,24 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.care.deletion_records import (
-    DeletionRecords,
-    Outstanding,
-    TakeFacts,
-    take_start,
-)
+from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, take_start
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
 from dextouch.episodes.spool_log import RECORDING_FILE
 from dextouch.episodes.trash import HOMES, REVIEW_FILE, TRASH, put_into_trash, remove_for_good
 from dextouch.episodes.writer import STAGING
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+from dextouch.free_text import texts_in
+from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import OutstandingTakes
 
 RECEIPT_VERSION = 1
 INTENTS = ".deletions"
@@ -163,7 +161,7 @@ class IdentifierSearch:
     def found_in(self, data: bytes) -> list[str]:
         """Identifiers in bytes of JSON or text."""
         try:
-            texts = "\0".join(_strings(json.loads(data)))
+            texts = "\0".join(texts_in(json.loads(data)))
         except (ValueError, RecursionError):
             text = data.decode(errors="replace")
             escaped = {word for word in self._words if json.dumps(word)[1:-1] in text}
@@ -173,18 +171,6 @@ class IdentifierSearch:
     def in_text(self, text: str) -> list[str]:
         """Identifiers in a text."""
         return sorted(set(self._pattern.findall(text)))
-
-
-def _strings(value: object) -> Iterator[str]:
-    waiting = [value]
-    while waiting:
-        item = waiting.pop()
-        if isinstance(item, str):
-            yield item
-        elif isinstance(item, dict):
-            waiting += [*item.keys(), *item.values()]
-        elif isinstance(item, list):
-            waiting += item
 
 
 @dataclass(frozen=True)
@@ -249,8 +235,7 @@ class Reference:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class DeletionReceipt:
+class DeletionReceipt(FrozenModel):
     """Record of a deletion: deleted items, time, and files searched afterwards; saved as JSON.
 
     `unnamed_reviews` are places of other people's items whose review lost its reviewer's name.
@@ -268,9 +253,9 @@ class DeletionReceipt:
     unreadable: tuple[str, ...]
     num_files_searched: int
     unnamed_reviews: tuple[str, ...] = ()
-    outstanding: tuple[Outstanding, ...] = ()
+    outstanding: tuple[OutstandingTakes, ...] = ()
     receipt_version: int = RECEIPT_VERSION
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, int] = Field(default={})
 
     @property
     def complete(self) -> bool:
@@ -436,7 +421,9 @@ def delete_for_good(
         counts={p: sum(v.place == p for v in deleted) for p in PLACES},
     )
     with disk_errors(f"write {receipt_path}"):
-        replace_file(receipt_path, json.dumps(asdict(receipt), indent=2).encode() + b"\n")
+        replace_file(
+            receipt_path, json.dumps(receipt.model_dump(mode="json"), indent=2).encode() + b"\n"
+        )
         if len(deleted) == len(known):
             path.unlink()
             with suppress(OSError):

@@ -23,7 +23,7 @@ from dextouch.episodes.files import disk_errors, replace_file, write_file
 from dextouch.episodes.format import sha256_hex
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import RecordingAttributes
+from dextouch.schemas import OutstandingTakes, RecordingAttributes
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -85,19 +85,6 @@ class StationState(FrozenModel):
     station: str
     confirmed: dict[str, AwareDatetime] = Field(default={})
     held: dict[str, tuple[str, ...]] = Field(default={})
-
-
-@dataclass(frozen=True)
-class Outstanding:
-    """Takes of a deletion that a station still holds, or has not yet said that it does not.
-
-    `has_answered` is False where the station did not ask since the deletion: then `recordings` are
-    those that the store had of it, and the spool may hold takes that were never uploaded.
-    """
-
-    station: str
-    recordings: tuple[str, ...]
-    has_answered: bool
 
 
 @dataclass(frozen=True)
@@ -247,7 +234,7 @@ class DeletionRecords:
             if not path.is_file() or _read(path, StationState) != state:
                 replace_file(path, state.model_dump_json(indent=1).encode())
 
-    def outstanding(self, key: str) -> tuple[Outstanding, ...]:
+    def outstanding(self, key: str) -> tuple[OutstandingTakes, ...]:
         """What stations still have to remove of a deletion, by station."""
         record = self.read().get(key)
         if record is None:
@@ -262,10 +249,12 @@ class DeletionRecords:
             state = states.get(station)
             if state is not None and state.confirmed.get(key) == record.deleted_at:
                 if ids := state.held.get(key, ()):
-                    found.append(Outstanding(station, ids, has_answered=True))
+                    found.append(
+                        OutstandingTakes(station=station, recordings=ids, has_answered=True)
+                    )
                 continue
             ids = tuple(take.id for take in record.takes if take.station == station)
-            found.append(Outstanding(station, ids, has_answered=False))
+            found.append(OutstandingTakes(station=station, recordings=ids, has_answered=False))
         return tuple(found)
 
     def _make_salt(self) -> bytes:

@@ -40,7 +40,6 @@ from dextouch.episodes.format import (
 from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
-from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
 from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage, unheld_folders
 from dextouch.errors import (
@@ -338,7 +337,6 @@ def _write_salvaged(
         stage=new_stage(root, kind, free),
         target=root / f"{kind}s" / free,
         attributes=attributes.model_copy(update=update | _counted(attributes, lost)),
-        options=WriteOptions(),
     ) as writer:
         for stream in streams:
             for values, stamps in stream.blocks():

@@ -113,7 +113,19 @@ def group_streams(
         path = folder / name / shard_path(len(entry.shape))
         return _SalvagedArray(path, entry, _salvaged_index(LocalFile(path), entry))
 
-    return _streams(attributes, array)
+    found = []
+    for stream in attributes.streams:
+        values = array(stream.name)
+        names = STAMPS[kind_of(attributes)]
+        stamps = {stamp: array(f"{stream.name}_{stamp}") for stamp in names}
+        count = min(len(part.rows_hold) for part in (values, *stamps.values()))
+        kept = values.rows_hold[:count].copy()
+        for part in stamps.values():
+            kept &= part.rows_hold[:count]
+        columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
+        read = partial(_read_rows, values, columns)
+        found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))
+    return found
 
 
 def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
@@ -137,24 +149,6 @@ def _sealed_samples(spool: Path) -> dict[str, int]:
     with suppress(FileNotFoundError, CorruptDataError):
         seal = read_seal(spool)
     return {} if seal is None else seal.num_samples
-
-
-def _streams(
-    attributes: Attributes, array: Callable[[str], _SalvagedArray]
-) -> list[SalvagedStream]:
-    kind = kind_of(attributes)
-    found = []
-    for stream in attributes.streams:
-        values = array(stream.name)
-        stamps = {stamp: array(f"{stream.name}_{stamp}") for stamp in STAMPS[kind]}
-        count = min(len(part.rows_hold) for part in (values, *stamps.values()))
-        kept = values.rows_hold[:count].copy()
-        for part in stamps.values():
-            kept &= part.rows_hold[:count]
-        columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
-        read = partial(_read_rows, values, columns)
-        found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))
-    return found
 
 
 def _read_rows(

@@ -217,8 +217,7 @@ def _fixed_links(
     model: ModelFile, wrist: str, T_ours_wrist: Float64[np.ndarray, "4 4"]
 ) -> dict[str, np.ndarray]:
     """T_ours_link [4, 4] of the wrist link and of all ancestors rigidly attached to it."""
-    # Some models attach the wrist to the palm like another fingertip; fingers then start at a
-    # common ancestor.
+    # Some models attach the wrist to the palm as a fingertip; fingers start at a common ancestor.
     T_ours_link = T_ours_wrist
     links: dict[str, np.ndarray] = {}
     link: str | None = wrist
