@@ -9,13 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 from torch.nn import functional
 
 from dextouch.errors import EndedError, InvalidInputError, UnavailableError
-from dextouch.hands.actions import (
-    JOINTS_LEFT,
-    JOINTS_RIGHT,
-    AnchorPoses,
-    check_actions,
-    poses_from_actions,
-)
+from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
     EVERYTHING,
     ActionKind,
@@ -56,7 +50,7 @@ from services.world_model.network.inputs import (
     build_inputs,
     check_reach,
 )
-from services.world_model.rendering.rasters import SceneState
+from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 from services.world_model.starts import (
     ObservedStart,
@@ -362,15 +356,14 @@ class StateWorld:
         poses: Float32[np.ndarray, "n objects 7"],
     ) -> Drawing:
         """Steps of a rollout to draw, with hands and objects at the given poses."""
-        start, *states = _scene_states(
-            np.concatenate([state.first_reached[None], actions]),
-            state.anchor,
-            np.concatenate([self._poses(mean_start(state.memory), state.task), poses]),
-        )
+        actions = np.concatenate([state.first_reached[None], actions])
+        poses = np.concatenate([self._poses(mean_start(state.memory), state.task), poses])
+        present = poses[..., 2] > ABSENT_POSE[2]
+        states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
         size = mean_size(state.memory)[0, : len(boxes_m)].double().numpy()
         boxes_m = boxes_m * size[:, BOX_AXES]
-        return Drawing(state.image, state.K_head, start, states, boxes_m)
+        return Drawing(state.image, state.K_head, states, boxes_m)
 
     def _drawn(
         self, answers: Sequence[tuple[SteppedRollout[StateRollout], Drawing | None]]
@@ -452,28 +445,6 @@ class StateWorld:
             InvalidInputError: not a snapshot of this checkpoint.
         """
         return rollout_from_bytes(data, self._metadata, self._digest)
-
-
-def _scene_states(
-    actions: Float64[np.ndarray, "n 67"],
-    anchor: AnchorPoses,
-    poses: Float32[np.ndarray, "n objects 7"],
-) -> list[SceneState]:
-    """Scenes to draw; the actions were validated when they came."""
-    hands = poses_from_actions(actions, anchor, validated=True)
-    Ts_world_wrist = np.stack([hands.Ts_world_wrist_left, hands.Ts_world_wrist_right], axis=1)
-    joints_rad = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
-    there = poses[..., 2] > ABSENT_POSE[2]
-    return [
-        SceneState(
-            hands.Ts_world_camera_head[index],
-            Ts_world_wrist[index],
-            joints_rad[index],
-            poses[index].astype(np.float64),
-            there[index],
-        )
-        for index in range(len(actions))
-    ]
 
 
 def _refuse_non_finite(imagined: ImaginedSteps) -> None:
