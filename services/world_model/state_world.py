@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 from torch.nn import functional
 
-from dextouch.errors import EndedError, InvalidInputError, UnavailableError
+from dextouch.errors import EndedError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
     EVERYTHING,
@@ -21,7 +21,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import StartedRollout, SteppedRollout
-from services.world_model.checkpoints import StateCheckpoint, StateMetadata
+from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
     STEPS_PER_LATENT,
@@ -57,8 +57,10 @@ from services.world_model.starts import (
     check_geometry,
     checked_chunk,
     checked_selectors,
+    foreign_snapshot,
     observed_start,
     opened_snapshot,
+    refuse_non_finite,
 )
 
 MAX_SNAPSHOT_BYTES = 2**20
@@ -89,69 +91,6 @@ class StateRollout:
     memory: SceneMemory
     step: int = 0
     num_moving: int = 0
-
-
-def rollout_bytes(state: StateRollout, digest: str) -> bytes:
-    """Serialize the state together with the digest of its world."""
-    fields = {
-        "digest": digest,
-        "task": state.task,
-        "action_kind": state.action_kind,
-        "step": state.step,
-        "num_moving": state.num_moving,
-    }
-    arrays = {
-        "image": state.image,
-        "anchor": np.stack(state.anchor.as_tuple()),
-        "K_head": state.K_head,
-        "first_reached": state.first_reached,
-    }
-    return pack(fields, {**arrays, **memory_arrays(state.memory)})
-
-
-def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> StateRollout:
-    """Restore the state of a snapshot; validates untrusted bytes.
-
-    Raises:
-        InvalidInputError: not a snapshot of this world.
-        NonFiniteError: NaN or infinity.
-    """
-    fields, arrays = opened_snapshot(data, digest, max_bytes=MAX_SNAPSHOT_BYTES)
-    config, name = metadata.dynamics, fields.get("task")
-    step, moving = fields.get("step"), fields.get("num_moving")
-    size = (config.image_px, config.image_px, 3)
-    shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
-    if (
-        name not in config.tasks
-        or fields.get("action_kind") not in ACTION_KINDS
-        or not isinstance(step, int)
-        or not isinstance(moving, int)
-        or min(step, moving) < 0
-        or arrays.get("image", np.zeros(0)).dtype != np.uint8
-        or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
-    ):
-        raise InvalidInputError(
-            f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
-            "this world's own snapshot writes"
-        )
-    anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-    check_geometry(anchor, K_head)
-    memory = memory_from_arrays(arrays, config, metadata.num_members)
-    if int(memory.start.task[0, 0]) != config.tasks.index(name):
-        raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
-    first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
-    check_reach(first_reached)
-    return StateRollout(
-        task=name,
-        action_kind=fields["action_kind"],
-        image=arrays["image"],
-        anchor=anchor,
-        K_head=K_head,
-        first_reached=first_reached[0],
-        memory=memory,
-        step=step,
-        num_moving=moving,
-    )
 
 
 class StateWorld:
@@ -292,7 +231,12 @@ class StateWorld:
         ]
         memory = batched([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
-        _refuse_non_finite(imagined)
+        checked = {
+            "touch": imagined.tactile_kpa,
+            "objects' place": imagined.poses.position_m,
+            "objects' direction": imagined.poses.axes,
+        }
+        refuse_non_finite("state model", checked)
         answers = [
             self._answer(
                 replace(
@@ -436,24 +380,58 @@ class StateWorld:
 
     def snapshot(self, state: StateRollout) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
-        return rollout_bytes(state, self._digest)
+        fields = {
+            "digest": self._digest,
+            "task": state.task,
+            "action_kind": state.action_kind,
+            "step": state.step,
+            "num_moving": state.num_moving,
+        }
+        arrays = {
+            "image": state.image,
+            "anchor": np.stack(state.anchor.as_tuple()),
+            "K_head": state.K_head,
+            "first_reached": state.first_reached,
+        }
+        return pack(fields, {**arrays, **memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:
-        """Restore the state of a snapshot.
+        """Restore the state of a snapshot; validates untrusted bytes.
 
         Raises:
             InvalidInputError: not a snapshot of this checkpoint.
+            NonFiniteError: NaN or infinity.
         """
-        return rollout_from_bytes(data, self._metadata, self._digest)
-
-
-def _refuse_non_finite(imagined: ImaginedSteps) -> None:
-    for what, values in (
-        ("touch", imagined.tactile_kpa),
-        ("object places", imagined.poses.position_m),
-        ("object axes", imagined.poses.axes),
-    ):
-        if not torch.isfinite(values).all():
-            raise UnavailableError(
-                f"state model: its {what} contain NaN or infinity; the rollout did not advance"
-            )
+        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        config, name = self._metadata.dynamics, fields.get("task")
+        step, moving = fields.get("step"), fields.get("num_moving")
+        size = (config.image_px, config.image_px, 3)
+        shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
+        if (
+            name not in config.tasks
+            or fields.get("action_kind") not in ACTION_KINDS
+            or not isinstance(step, int)
+            or not isinstance(moving, int)
+            or min(step, moving) < 0
+            or arrays.get("image", np.zeros(0)).dtype != np.uint8
+            or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
+        ):
+            raise foreign_snapshot(fields, arrays)
+        anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
+        check_geometry(anchor, K_head)
+        memory = memory_from_arrays(arrays, config, self._metadata.num_members)
+        if int(memory.start.task[0, 0]) != config.tasks.index(name):
+            raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
+        first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
+        check_reach(first_reached)
+        return StateRollout(
+            task=name,
+            action_kind=fields["action_kind"],
+            image=arrays["image"],
+            anchor=anchor,
+            K_head=K_head,
+            first_reached=first_reached[0],
+            memory=memory,
+            step=step,
+            num_moving=moving,
+        )

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions, poses_from_actions, reanchor
 from dextouch.schemas import (
     EVERYTHING,
@@ -29,7 +29,7 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
-from services.world_model.network.model import Prediction, Sampling, stack_noise
+from services.world_model.network.model import Sampling, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
@@ -37,8 +37,10 @@ from services.world_model.starts import (
     SceneReader,
     checked_chunk,
     checked_selectors,
+    foreign_snapshot,
     observed_start,
     opened_snapshot,
+    refuse_non_finite,
 )
 from services.world_model.state_world import StateWorld
 
@@ -188,7 +190,7 @@ class ModelWorld:
         future = self._model.predict(
             inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
         )
-        _refuse_non_finite(future)
+        refuse_non_finite("world model", {"image": future.images, "touch": future.tactile_kpa})
         images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
         return [
             _advance(state, chunk, imagined, selector)
@@ -256,10 +258,7 @@ class ModelWorld:
             or fields.get("action_kind") not in ACTION_KINDS
             or arrays["anchor"].shape != (3, 4, 4)
         ):
-            raise InvalidInputError(
-                f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
-                "this world's own snapshot writes"
-            )
+            raise foreign_snapshot(fields, arrays)
         state = ModelState(
             image=arrays["image"],
             tactile_kpa=arrays["tactile_kpa"],
@@ -374,11 +373,3 @@ def _advance(
         step=state.step + len(chunk),
     )
     return SteppedRollout(following, observation)
-
-
-def _refuse_non_finite(future: Prediction) -> None:
-    for what, values in (("image", future.images), ("touch", future.tactile_kpa)):
-        if not torch.isfinite(values).all():
-            raise UnavailableError(
-                f"world model: its {what} contains NaN or infinity; the rollout did not advance"
-            )
