@@ -11,7 +11,6 @@ from torch.nn import functional
 from dextouch.errors import EndedError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
-    EVERYTHING,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -20,7 +19,7 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
-from dextouch.worlds import StartedRollout, SteppedRollout
+from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -93,8 +92,8 @@ class StateRollout:
     num_moving: int = 0
 
 
-class StateWorld:
-    """Implements `dextouch.worlds.BatchWorld` with a state model.
+class StateWorld(BatchWorld[StateRollout]):
+    """A state model as a world.
 
     Deterministic: the seeds of chunks have no effect.
 
@@ -193,24 +192,6 @@ class StateWorld:
         )
         build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
 
-    def step(
-        self,
-        state: StateRollout,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[StateRollout]:
-        """Predict one action chunk of 4k ≤ 64 steps.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            EndedError: the hands have moved four times as long as any episode of training.
-        """
-        chunks = np.asarray(actions)[None]
-        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
-
     @torch.inference_mode()
     def step_batch(
         self,
@@ -220,11 +201,20 @@ class StateWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[StateRollout]]:
-        """`step` for several rollouts; results differ from single calls by rounding only."""
+        """Predict action chunks of 4k ≤ 64 steps; others of the batch change results by rounding.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: physically impossible actions.
+            EndedError: the hands have moved four times as long as any episode of training.
+            UnavailableError: the model predicts NaN or infinity.
+        """
         requested = checked_selectors(states, actions, seeds, selectors)
         for state in states:
             self._refuse_ended(state)
-        chunks = [self._checked_chunk(chunk) for chunk in actions]
+        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
+        for chunk in chunks:
+            check_reach(chunk)
         motions = [
             hand_motion(chunk, state.anchor, validated=True)
             for chunk, state in zip(chunks, states, strict=True)
@@ -262,11 +252,6 @@ class StateWorld:
                 "was trained on"
             )
             raise EndedError(f"world {self._metadata.name}: {reason}", reason=reason)
-
-    def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
-        chunk = checked_chunk(actions, self._description)
-        check_reach(chunk)
-        return chunk
 
     def _answer(
         self,

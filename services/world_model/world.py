@@ -11,7 +11,6 @@ from jaxtyping import Float32, Float64, UInt8
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions, poses_from_actions, reanchor
 from dextouch.schemas import (
-    EVERYTHING,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -19,7 +18,7 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
-from dextouch.worlds import StartedRollout, SteppedRollout
+from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
 from services.networks.weight_files import on_device
 from services.world_model.checkpoints import (
     Checkpoint,
@@ -63,8 +62,8 @@ class ModelState:
     task: str = ""
 
 
-class ModelWorld:
-    """Implements `dextouch.worlds.BatchWorld` with a trained model.
+class ModelWorld(BatchWorld[ModelState]):
+    """A flow-matching model as a world.
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.
@@ -145,24 +144,6 @@ class ModelWorld:
         build_inputs(self._requests([state], [holding]), self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
-    def step(
-        self,
-        state: ModelState,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[ModelState]:
-        """Predict one action chunk of 4k ≤ 16 steps.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            UnavailableError: the model returned NaN or infinity.
-        """
-        chunks = np.asarray(actions)[None]
-        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
-
     def step_batch(
         self,
         states: Sequence[ModelState],
@@ -171,10 +152,15 @@ class ModelWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[ModelState]]:
-        """`step` for several rollouts; results differ from single calls by rounding only.
+        """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
 
         Images of the last latent are always decoded, since the next chunk starts from the last of
         them; the others only on request.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: physically impossible actions.
+            UnavailableError: the model returned NaN or infinity.
         """
         requested = checked_selectors(states, actions, seeds, selectors)
         chunks = [checked_chunk(chunk, self._description) for chunk in actions]
