@@ -1,6 +1,6 @@
 """Errors of a model on held-out episodes, compared with simple baselines."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.training.dataset import (
     EpisodeArrays,
+    TrainingEpisode,
     Window,
     cut_window,
-    fingerprint,
     stack_windows,
 )
 
@@ -70,7 +70,7 @@ def evaluate_prediction(
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
     """
-    refuse_trained(episodes, train_fingerprints)
+    refuse_trained(episodes, train_fingerprints, "the model")
     places = [
         (episode, start)
         for episode in episodes
@@ -109,14 +109,16 @@ def evaluate_prediction(
     return {**figures, "num_windows": float(len(windows))}
 
 
-def refuse_trained(episodes: Sequence[EpisodeArrays], train_fingerprints: Sequence[str]) -> None:
-    """Raise if any episode was trained on, by the hash of its content."""
+def refuse_trained(
+    episodes: Sequence[TrainingEpisode], train_fingerprints: Collection[str], model: str
+) -> None:
+    """Raise if a model was trained on any of the episodes, by the hash of their content."""
     trained = set(train_fingerprints)
-    seen = [episode.episode_id for episode in episodes if fingerprint(episode) in trained]
+    seen = [episode.episode_id for episode in episodes if episode.fingerprint() in trained]
     if seen:
         raise InvalidInputError(
-            f"evaluation: the model was trained on {len(seen)} of the episodes {seen[:3]}, "
-            "expected held-out ones",
+            f"evaluation: {model} was trained on {len(seen)} of the held-out episodes {seen[:3]}, "
+            "expected others; use a held-out store that it has not seen",
             episodes=seen,
         )
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from pydantic import JsonValue
 from torch import Tensor
 
 from dextouch.episodes import data_hash, split_by_scene
@@ -52,7 +52,7 @@ from services.world_model.training.dataset import (
 )
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
 from services.world_model.training.domains import check_tasks, subset_by_hash, training_sets
-from services.world_model.training.evaluation import evaluate_prediction
+from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import LossOptions, losses, own_context
 from services.world_model.training.tokenizer_trainer import (
     check_unseen,
@@ -100,8 +100,7 @@ class TrainingRun:
         settings: TrainSettings,
         processes: Processes = ALONE,
     ) -> None:
-        processes.check_batch(settings.optimizer.batch)
-        processes.check_device(settings.device)
+        processes.check(settings.optimizer.batch, settings.device)
         self.settings = settings
         self.episodes = episodes
         self.processes = processes
@@ -203,23 +202,24 @@ class TrainingRun:
         share_texts(self.model, model)
         return model
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def state(self, identity: dict[str, JsonValue]) -> TrainingState:
         """Tensors and metadata that the next steps depend on."""
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
         tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
         tensors |= optimizer_tensors(self.loop.optimizer)
         tensors["generator"] = self._generator.get_state()
-        facts = {
-            "step": self.budget.step,
-            "cpu_s": self.budget.cpu_s,
-            "window_numbers": self._window_numbers,
-            "log": tuple(astuple(entry) for entry in self.log),
-        }
-        return tensors, facts
+        facts = RunFacts(
+            identity=identity,
+            step=self.budget.step,
+            cpu_s=self.budget.cpu_s,
+            window_numbers=self._window_numbers,
+            log=tuple(astuple(entry) for entry in self.log),
+        )
+        return TrainingState(tensors, facts)
 
     def like_state(self) -> dict[str, Tensor]:
         """Tensors with the names, shapes and sharding of those of a state after a step."""
-        return {**moments_like(self.loop.optimizer), **self.state()[0]}
+        return {**moments_like(self.loop.optimizer), **self.state({}).tensors}
 
     def restore(self, state: TrainingState) -> None:
         """Continue from `state`."""
@@ -367,7 +367,7 @@ def train_on(
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
         # Episodes that the initial checkpoint was trained on cannot be held out either.
-        check_not_learned(heldout, ancestor)
+        refuse_trained(heldout, ancestor.metadata.train_fingerprints, "the initial checkpoint")
         prints |= set(ancestor.metadata.train_fingerprints)
         names |= set(ancestor.metadata.train_episode_ids)
     run = TrainingRun(trained, settings, processes)
@@ -471,8 +471,7 @@ def _run_or_resume(
     def keep(now: TrainingRun) -> None:
         nonlocal kept_cpu_s
         if now.budget.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
-            tensors, facts = now.state()
-            files.write(TrainingState(tensors, RunFacts(identity=identity, **facts)))
+            files.write(now.state(identity))
             kept_cpu_s = now.budget.cpu_s
 
     return run.run(on_progress, keep)
@@ -530,18 +529,6 @@ def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
         px = settings.network.image_px
         found += read(url, splits=settings.splits, domain="human", image_px=px)
     return subset_by_hash(found, settings.human_episodes, what="human")
-
-
-def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
-    """Raise if the initial checkpoint was trained on a held-out episode."""
-    learned = set(ancestor.metadata.train_fingerprints)
-    both = [episode.episode_id for episode in heldout if episode.fingerprint() in learned]
-    if both:
-        raise InvalidInputError(
-            f"training: the initial checkpoint was trained on {len(both)} of the held-out "
-            f"episodes {both[:3]}; use a held-out store that it has not seen",
-            episodes=both,
-        )
 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
