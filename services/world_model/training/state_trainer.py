@@ -31,12 +31,7 @@ from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
-from services.world_model.settings import (
-    StateAdaptSettings,
-    StateTrainSettings,
-    flags_of,
-    last_name,
-)
+from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training.core_training import (
     CoreData,
     start_steps,
@@ -470,14 +465,8 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """Command that repeats a run; stores and the base are given by their last path component."""
-    left_out = {"output", "episodes", "human", "heldout", "init", "clicks", "jobs", "json_path"}
-    given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
-    flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
-    flags += [f"--human={last_name(url)}" for url in settings.human]
-    if settings.heldout is not None:
-        flags.append(f"--heldout={last_name(settings.heldout)}")
-    files = {"init": settings.init, "clicks": settings.clicks}
-    flags += [f"--{name}={path.name}" for name, path in files.items() if path is not None]
+    """Command that repeats a run, as its checkpoint records it."""
     command = "adapt" if isinstance(settings, StateAdaptSettings) else "world-model"
-    return " ".join([f"dextouch train {command}", *flags, *flags_of(given)])
+    places = ("episodes", "human", "heldout", "init", "clicks")
+    left_out = {"output", "jobs", "json_path"}
+    return recorded_command(settings, f"dextouch train {command}", places, left_out)
