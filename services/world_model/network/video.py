@@ -141,13 +141,14 @@ class VisualCodec(nn.Module):
         self.register_buffer("basis", torch.eye(values, config.codec_channels))
         self.register_buffer("scale", torch.ones(config.codec_channels))
 
-    def fit(self, windows: UInt8[Tensor, "n time px px 3"], *, batch: int = 16) -> None:
+    def fit(self, windows: UInt8[Tensor, "n time px px 3"]) -> None:
         """Fit mean and principal axes to windows of images."""
         size = len(self.mean)
         total = torch.zeros(size, dtype=torch.float64)
         moment = torch.zeros(size, size, dtype=torch.float64)
         count = 0
-        for part in torch.split(windows, batch):
+        # Part by part, which bounds the memory.
+        for part in torch.split(windows, 16):
             patches = self._patches(to_unit(part)).reshape(-1, size)
             total += patches.sum(dim=0, dtype=torch.float64)
             moment += (patches.T @ patches).double()

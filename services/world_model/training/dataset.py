@@ -6,11 +6,10 @@ through the store's reader, which decodes one camera and only the span of the wi
 """
 
 import hashlib
-import multiprocessing
 from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -36,7 +35,6 @@ from services.world_model.network.inputs import ObjectsAtStart, PredictionReques
 CUT: Final = (needs.EVERY_IMAGE,)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
-StartMethod = Literal["fork", "spawn", "forkserver"]
 
 
 @dataclass(frozen=True)
@@ -440,7 +438,6 @@ def read_batches(
     places: Iterable[list[WindowPosition]],
     *,
     num_workers: int = 0,
-    start_method: StartMethod | None = None,
 ) -> Generator[WindowBatch, None, None]:
     """Batches at these places, in order, independent of the number of processes.
 
@@ -448,19 +445,13 @@ def read_batches(
         episodes: episodes that the places refer to.
         places: places of each batch; may be endless and is read ahead.
         num_workers: reader processes, which end with the iterator; 0 reads in this process.
-        start_method: start method of the processes; None for the platform's default.
     """
     loader = DataLoader(
         _Windows(episodes),
         batch_sampler=places,
         collate_fn=stack_windows,
         num_workers=num_workers,
-        multiprocessing_context=_context(start_method) if num_workers else None,
         # Its own generator: otherwise the loader seeds its workers from the global one.
         generator=torch.Generator().manual_seed(0),
     )
     yield from loader
-
-
-def _context(start_method: StartMethod | None) -> multiprocessing.context.BaseContext:
-    return multiprocessing.get_context(start_method)
