@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
-    half_cosine,
+    floored_cosine,
     update_average,
 )
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
@@ -31,7 +30,6 @@ from services.world_model.rendering.network import RendererNetwork, has_fast_bfl
 from services.world_model.rendering.rasters import SceneStates, joined, object_transforms
 
 LOG_EVERY_STEPS = 50
-MIN_LEARNING_RATE_SHARE = 0.01
 _EDGE_WINDOW_PX = 7
 OnProgress = Callable[[float, int, float], None]
 
@@ -95,7 +93,7 @@ def train_renderer(
         weight_decay=settings.weight_decay,
         max_gradient_norm=settings.max_gradient_norm,
         warmup_steps=settings.warmup_steps,
-        schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+        schedule=floored_cosine,
         betas=(0.9, 0.95),
     )
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)

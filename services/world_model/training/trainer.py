@@ -5,7 +5,6 @@ import json
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
-    half_cosine,
+    floored_cosine,
     update_average,
 )
 from services.networks.weight_files import on_device
@@ -42,6 +41,7 @@ from services.world_model.pretrained_video import initial_model, share_texts
 from services.world_model.training.dataset import (
     E,
     EpisodeArrays,
+    StoredEpisode,
     TrainingEpisode,
     WindowBatch,
     WindowPosition,
@@ -71,7 +71,6 @@ from services.world_model.training.training_state import (
 )
 
 LOG_EVERY_STEPS = 20
-MIN_LEARNING_RATE_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ class TrainingRun:
             weight_decay=settings.optimizer.weight_decay,
             max_gradient_norm=settings.optimizer.max_gradient_norm,
             warmup_steps=settings.optimizer.warmup_steps,
-            schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+            schedule=floored_cosine,
             betas=(0.9, 0.95),
         )
         self.loop = OptimizerLoop(self.model, options, self.budget)
@@ -362,7 +361,10 @@ def train_on(
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
-    check_tasks((*trained, *heldout), settings, _known_tasks(ancestor))
+    known_tasks: set[str] = set()
+    if ancestor is not None:
+        known_tasks = {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
+    check_tasks((*trained, *heldout), settings, known_tasks)
     prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
@@ -419,13 +421,6 @@ def train_on(
         metrics=metrics,
         log=log,
     )
-
-
-def _known_tasks(ancestor: Checkpoint | None) -> set[str]:
-    """Tasks that a checkpoint and its ancestors were trained on."""
-    if ancestor is None:
-        return set()
-    return {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
 
 
 def _data_hash(
@@ -501,16 +496,12 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
 def _load_robot(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
     domain: Domain | None = "robot" if settings.human else None
     url, splits, px = settings.episodes, settings.splits, settings.network.image_px
-    if settings.streaming:
-        stored = index_episodes(url, splits=splits, domain=domain, image_px=px)
-        if settings.heldout is not None:
-            return stored, load_episodes(settings.heldout, domain=domain, image_px=px)
-        trained, heldout = _split(stored, settings)
-        return trained, [episode.load() for episode in heldout]
-    episodes = load_episodes(url, splits=splits, domain=domain, image_px=px)
+    read = index_episodes if settings.streaming else load_episodes
+    episodes: Sequence[TrainingEpisode] = read(url, splits=splits, domain=domain, image_px=px)
     if settings.heldout is not None:
         return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
-    return _split(episodes, settings)
+    trained, heldout = _split(episodes, settings)
+    return trained, [one.load() if isinstance(one, StoredEpisode) else one for one in heldout]
 
 
 def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
