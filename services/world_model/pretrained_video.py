@@ -125,12 +125,8 @@ def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | No
         InvalidInputError: a model of the small size, or weights that do not fit its sizes.
         NotFoundError, CorruptDataError, LimitExceededError, NonFiniteError: as `load_weights`.
     """
-    wan, codec, condition, expert = (
-        model.config.wan,
-        model.codec,
-        model.video_condition,
-        model.video,
-    )
+    wan, codec = model.config.wan, model.codec
+    condition, expert = model.video_condition, model.video
     if (
         wan is None
         or not isinstance(codec, WanVideoCodec)

@@ -36,8 +36,8 @@ from services.world_model.dynamics.model import (
     SceneMemory,
     batched,
     first_steps,
+    mean_poses,
     mean_size,
-    mean_start,
     memory_arrays,
     memory_from_arrays,
     memory_of,
@@ -286,7 +286,8 @@ class StateWorld(BatchWorld[StateRollout]):
     ) -> Drawing:
         """Steps of a rollout to draw, with hands and objects at the given poses."""
         actions = np.concatenate([state.first_reached[None], actions])
-        poses = np.concatenate([self._poses(mean_start(state.memory), state.task), poses])
+        first = self._poses(mean_poses(state.memory.start.objects), state.task)
+        poses = np.concatenate([first, poses])
         present = poses[..., 2] > ABSENT_POSE[2]
         states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
