@@ -179,6 +179,8 @@ class AdaptSettings(AdaptationSettings, FromCheckpointSettings):
     episodes may be of the same tasks, but not of those that the checkpoint was trained on.
     """
 
+    init: Path = Field(description="checkpoint to adapt")
+
 
 class DistillSettings(FromCheckpointSettings):
     """Training of a checkpoint to sample in few steps, on its own contexts and samples.

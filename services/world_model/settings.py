@@ -71,7 +71,6 @@ class DataSettings(FrozenModel):
 class AdaptationSettings(FrozenModel):
     """What adaptations of either form to new tasks have in common."""
 
-    init: Path = Field(description="checkpoint to adapt")
     output: Path = Field(
         default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
     )
@@ -200,6 +199,7 @@ class StateAdaptSettings(AdaptationSettings, StateTrainSettings):
     tasks, but not of those that the model was trained on.
     """
 
+    init: Path = Field(description="checkpoint to adapt")
     reader: AdaptReaderSettings = Field(
         default=AdaptReaderSettings(), description="training of start readers"
     )
@@ -342,7 +342,7 @@ def flags_of(
             flags.append(f"--{flag}" if value else f"--no-{flag}")
         else:
             values = value if isinstance(value, list) else [value]
-            flags += [f"--{flag}={shown(one)}" for one in values]
+            flags += [f"--{flag}={shown(str(one))}" for one in values]
     return flags
 
 

@@ -7,6 +7,7 @@ tensors, so that training and serving treat a window identically.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -219,8 +220,10 @@ class ModelInputs:
 
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
-        tensors = {name: one for name, one in vars(self).items() if isinstance(one, Tensor)}
-        return replace(self, **{name: tensor.to(device) for name, tensor in tensors.items()})
+        moved: dict[str, Any] = {
+            name: one.to(device) for name, one in vars(self).items() if isinstance(one, Tensor)
+        }
+        return replace(self, **moved)
 
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
