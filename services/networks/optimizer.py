@@ -12,9 +12,14 @@ from torch import Tensor, nn
 from dextouch.errors import NonFiniteError
 
 
-def half_cosine(share: float, *, least: float = 0.0) -> float:
-    """Half a cosine from 1 at the start of a run to 0 at its end, but at least `least`."""
-    return max(0.5 * (1.0 + math.cos(math.pi * min(share, 1.0))), least)
+def half_cosine(share: float) -> float:
+    """Half a cosine from 1 at the start of a run to 0 at its end."""
+    return 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
+
+
+def floored_cosine(share: float) -> float:
+    """`half_cosine`, but at least 0.01."""
+    return max(half_cosine(share), 0.01)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from services.world_model.network.configuration import (
     WanFiles,
 )
 from services.world_model.presets import PRESETS, PresetSource
-from services.world_model.settings import DataSettings, flags_of, last_name
+from services.world_model.settings import AdaptationSettings, DataSettings, recorded_command
 
 
 class OptimizerSettings(FrozenModel):
@@ -141,28 +141,19 @@ class TrainSettings(RunSettings):
 
 
 def command_line(settings: TrainSettings) -> str:
-    """Command that repeats a run: every setting that differs from its default.
-
-    Stores are given by their last path component, since folders differ between machines.
-    """
-    given = settings.model_dump(
-        mode="json",
-        exclude_defaults=True,
-        exclude={
-            "output", "json_path", "episodes", "human", "heldout", "init", "tokenizer", "resume",
-            "state_every_cpu_s", "device", "wan", "plan", "preset",
-        },
-    )  # fmt: skip
-    flags = [f"--episodes={last_name(settings.episodes)}"]
-    flags += [f"--human={last_name(url)}" for url in settings.human]
-    if settings.heldout is not None:
-        flags.append(f"--heldout={last_name(settings.heldout)}")
-    if settings.init is not None:
-        flags.append(f"--init={settings.init.name}")
-    if settings.tokenizer is not None:
-        flags.append(f"--tokenizer={settings.tokenizer.name}")
-    form = f"--preset={settings.preset}"
-    return " ".join(["dextouch train world-model", form, *flags, *flags_of(given)])
+    """Command that repeats a run, as its checkpoint records it."""
+    places = ("episodes", "human", "heldout", "init", "tokenizer")
+    local = (
+        "output",
+        "json_path",
+        "resume",
+        "state_every_cpu_s",
+        "device",
+        "wan",
+        "plan",
+    )
+    command = f"dextouch train world-model --preset={settings.preset}"
+    return recorded_command(settings, command, places, {*local, "preset"})
 
 
 class FromCheckpointSettings(RunSettings):
@@ -181,7 +172,7 @@ class FromCheckpointSettings(RunSettings):
         return TrainSettings(**given, init=self.init, network=network)
 
 
-class AdaptSettings(FromCheckpointSettings):
+class AdaptSettings(AdaptationSettings, FromCheckpointSettings):
     """Adaptation of a trained model to new tasks.
 
     The network, its codecs and its normalizers are those of the checkpoint; human and robot
@@ -189,16 +180,6 @@ class AdaptSettings(FromCheckpointSettings):
     """
 
     init: Path = Field(description="checkpoint to adapt")
-    output: Path = Field(
-        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
-    )
-    name: str = Field(default="adapted", description="model name in the checkpoint")
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse tasks that the initial checkpoint was trained on"
-    )
 
 
 class DistillSettings(FromCheckpointSettings):
@@ -277,13 +258,9 @@ class TrainTokenizerSettings(FrozenModel):
         )
 
     def command(self) -> str:
-        """Command that repeats the run: every setting that differs from its default."""
-        given = self.model_dump(
-            mode="json", exclude_defaults=True, include=set(TrainTokenizerSettings.model_fields)
-        )
-        stores = [f"--episodes={last_name(url)}" for url in given.pop("episodes")]
-        given.pop("output", None)
-        return " ".join(["dextouch train tokenizer", *stores, *flags_of(given)])
+        """Command that repeats the run, as the tokenizer's file records it."""
+        left_out = {"output", "picture", "beside", "json_path"}
+        return recorded_command(self, "dextouch train tokenizer", ("episodes",), left_out)
 
 
 class TrainCommand(CommandSettings, TrainSettings):

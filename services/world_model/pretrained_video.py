@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final
 
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
@@ -28,9 +28,8 @@ from services.world_model.network.video import (
 )
 
 # Names of a tensor, original and in diffusers; `#` stands for a number and `*` for the last part of
-# a name. Every tensor has exactly one rule, so that the same table works both ways.
+# a name. Every tensor has exactly one rule.
 Rules = tuple[tuple[str, str], ...]
-Layout = Literal["original", "diffusers"]
 _STEM = "diffusion_pytorch_model"
 _ORIGINAL_AUTOENCODER = "Wan2.2_VAE"
 _INDEX_SUFFIX: Final = ".safetensors.index.json"
@@ -126,12 +125,8 @@ def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | No
         InvalidInputError: a model of the small size, or weights that do not fit its sizes.
         NotFoundError, CorruptDataError, LimitExceededError, NonFiniteError: as `load_weights`.
     """
-    wan, codec, condition, expert = (
-        model.config.wan,
-        model.codec,
-        model.video_condition,
-        model.video,
-    )
+    wan, codec = model.config.wan, model.codec
+    condition, expert = model.video_condition, model.video
     if (
         wan is None
         or not isinstance(codec, WanVideoCodec)
@@ -143,21 +138,18 @@ def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | No
         )
     blocks = [layer.video for layer in model.layers if isinstance(layer.video, WanBlock)]
     transformer = _Transformer(expert, condition, blocks)
-    where = "Wan2.2 transformer"
-    inner = folder / "transformer"
-    stored = find_weights(inner if inner.is_dir() else folder, stem=_STEM, where=where)
-    load_weights(transformer, stored, TRANSFORMER_RULES, where=where, max_bytes=max_bytes)
+    for network, rules, where, inner, original_stem in (
+        (transformer, TRANSFORMER_RULES, "Wan2.2 transformer", folder / "transformer", _STEM),
+        (
+            codec.autoencoder, autoencoder_rules(wan.vae_blocks), "Wan2.2 autoencoder",
+            folder / "vae", _ORIGINAL_AUTOENCODER,
+        ),
+    ):  # fmt: skip
+        place, stem = (inner, _STEM) if inner.is_dir() else (folder, original_stem)
+        stored = find_weights(place, stem=stem, where=where)
+        load_weights(network, stored, rules, where=where, max_bytes=max_bytes)
     # The only tensor that belongs to no module of its own.
     expert.scale_shift_table = transformer.scale_shift_table
-    where = "Wan2.2 autoencoder"
-    inner = folder / "vae"
-    stored = (
-        find_weights(inner, stem=_STEM, where=where)
-        if inner.is_dir()
-        else find_weights(folder, stem=_ORIGINAL_AUTOENCODER, where=where)
-    )
-    rules = autoencoder_rules(wan.vae_blocks)
-    load_weights(codec.autoencoder, stored, rules, where=where, max_bytes=max_bytes)
     condition.text_features.use(folder)
 
 
@@ -287,8 +279,10 @@ def _checked_names(
 ) -> dict[str, str]:
     """Name in the network of each stored tensor, after all were compared."""
     names = {name: name for name in expected}
-    if layout_of(stored, expected, rules) == "original":
-        names = {theirs: ours for ours, theirs in renamed(expected, rules, to="original").items()}
+    original = {theirs: ours for ours, theirs in original_names(expected, rules).items()}
+    # The layout that shares more names with the files.
+    if len(original.keys() & stored.shapes.keys()) > len(names.keys() & stored.shapes.keys()):
+        names = original
     missing = sorted(names.keys() - stored.shapes.keys())
     foreign = sorted(stored.shapes.keys() - names.keys())
     if missing or foreign:
@@ -304,13 +298,6 @@ def _checked_names(
                 "of another size"
             )
     return names
-
-
-def layout_of(stored: StoredWeights, expected: Mapping[str, Any], rules: Rules) -> Layout:
-    """Layout that shares more names with the files."""
-    original = set(renamed(expected, rules, to="original").values())
-    more = len(original & stored.shapes.keys()) > len(expected.keys() & stored.shapes.keys())
-    return "original" if more else "diffusers"
 
 
 def autoencoder_rules(num_blocks: int) -> Rules:
@@ -350,24 +337,13 @@ def _coder_rules(coder: str, names: tuple[str, str, str], num_blocks: int) -> Ru
     return tuple((f"{coder}.{old}", f"{coder}.{new}") for old, new in parts)
 
 
-def renamed(names: Iterable[str], rules: Rules, *, to: Layout) -> dict[str, str]:
-    """Names of the other layout, by the given names.
-
-    Raises:
-        InvalidInputError: a name without a rule.
-    """
-    source, target = (0, 1) if to == "diffusers" else (1, 0)
-    compiled = [(_pattern(rule[source]), _template(rule[target])) for rule in rules]
+def original_names(names: Iterable[str], rules: Rules) -> dict[str, str]:
+    """Names of tensors in the original layout, by those of diffusers."""
+    compiled = [(_pattern(ours), _template(theirs)) for theirs, ours in rules]
     found: dict[str, str] = {}
     for name in names:
         matches = ((pattern.fullmatch(name), template) for pattern, template in compiled)
-        match, template = next(((m, t) for m, t in matches if m is not None), (None, ""))
-        if match is None:
-            raise InvalidInputError(
-                f"tensor {name!r}: has no name in the {to} layout; expected the tensors of "
-                "Wan2.2-TI2V-5B"
-            )
-        found[name] = match.expand(template)
+        found[name] = next(m.expand(template) for m, template in matches if m is not None)
     return found
 
 

@@ -1,6 +1,6 @@
 """Settings of the state model and of serving, from flags and environment variables."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -66,6 +66,21 @@ class DataSettings(FrozenModel):
     def share_of_human(self) -> float | None:
         """Share of examples from human episodes; None where domains are not told apart."""
         return self.human_share if self.human else None
+
+
+class AdaptationSettings(FrozenModel):
+    """What adaptations of either form to new tasks have in common."""
+
+    output: Path = Field(
+        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="adapted", description="model name in the checkpoint")
+    disjoint_tasks: CliImplicitFlag[bool] = Field(
+        default=False, description="refuse human episodes of tasks that robots have, too"
+    )
+    new_tasks: CliImplicitFlag[bool] = Field(
+        default=True, description="refuse tasks that the initial checkpoint was trained on"
+    )
 
 
 class ReaderSettings(FrozenModel):
@@ -177,7 +192,7 @@ class AdaptCoreSettings(CoreSettings):
     learning_rate: LearningRate = 1e-3
 
 
-class StateAdaptSettings(StateTrainSettings):
+class StateAdaptSettings(AdaptationSettings, StateTrainSettings):
     """Adaptation of a state model to new tasks, from robot and human episodes.
 
     Its touch codec is kept, all else is trained on; human and robot episodes may be of the same
@@ -185,16 +200,6 @@ class StateAdaptSettings(StateTrainSettings):
     """
 
     init: Path = Field(description="checkpoint to adapt")
-    output: Path = Field(
-        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
-    )
-    name: str = Field(default="adapted", description="model name in the checkpoint")
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse tasks that the initial checkpoint was trained on"
-    )
     reader: AdaptReaderSettings = Field(
         default=AdaptReaderSettings(), description="training of start readers"
     )
@@ -307,18 +312,37 @@ class WorldModelSettings(WorldServiceSettings):
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
 
 
-def flags_of(given: Mapping[str, object], prefix: str = "") -> list[str]:
+def recorded_command(
+    settings: FrozenModel, command: str, places: Sequence[str], left_out: set[str]
+) -> str:
+    """Command that repeats a run: every setting that differs from its default.
+
+    Args:
+        settings: of the run.
+        command: first words.
+        places: settings that name stores and files. Their last path component is given, since
+            folders differ between machines.
+        left_out: settings that do not matter.
+    """
+    given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
+    known = {name: given.pop(name) for name in places if name in given}
+    return " ".join([command, *flags_of(known, last_name), *flags_of(given)])
+
+
+def flags_of(
+    given: Mapping[str, object], shown: Callable[[str], str] = str, prefix: str = ""
+) -> list[str]:
     """Flags of a command for these settings; names of nested ones are joined by dots."""
     flags: list[str] = []
     for name, value in given.items():
         flag = prefix + name.replace("_", "-")
         if isinstance(value, Mapping):
-            flags += flags_of(value, f"{flag}.")
+            flags += flags_of(value, shown, f"{flag}.")
         elif isinstance(value, bool):
             flags.append(f"--{flag}" if value else f"--no-{flag}")
         else:
             values = value if isinstance(value, list) else [value]
-            flags += [f"--{flag}={one}" for one in values]
+            flags += [f"--{flag}={shown(str(one))}" for one in values]
     return flags
 
 

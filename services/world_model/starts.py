@@ -1,14 +1,21 @@
 """Validated rollout starts, action chunks and snapshots, for both kinds of world model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
+from torch import Tensor
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.errors import (
+    InvalidInputError,
+    NonFiniteError,
+    ShapeError,
+    UnavailableError,
+    UnknownNameError,
+)
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
@@ -178,6 +185,25 @@ def opened_snapshot(
     return fields, arrays
 
 
+def foreign_snapshot(
+    fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> InvalidInputError:
+    """The error of a snapshot with other contents than the world writes."""
+    return InvalidInputError(
+        f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that this "
+        "world's own snapshot writes"
+    )
+
+
+def refuse_non_finite(model: str, predicted: Mapping[str, Tensor]) -> None:
+    """Raise UnavailableError if a model predicted NaN or infinity."""
+    for what, values in predicted.items():
+        if not torch.isfinite(values).all():
+            raise UnavailableError(
+                f"{model}: its {what} contains NaN or infinity; the rollout did not advance"
+            )
+
+
 class SceneReader:
     """Finds the objects of requests, for a model that is conditioned on contact geometry.
 
@@ -213,12 +239,9 @@ class SceneReader:
         readings = [reader(first) for reader in self._readers]
         poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))
         size = stacked([one.size for one in readings]).mean(0).double().numpy()
-        return [
-            self._seen(task, *each)
-            for task, each in zip(tasks, zip(poses, size, strict=True), strict=True)
-        ]
-
-    def _seen(self, task: str, poses: np.ndarray, size: np.ndarray) -> ObjectsAtStart:
-        boxes_m = np.array(self._metadata.object_boxes_m[task])
-        count = len(boxes_m)
-        return ObjectsAtStart(poses[:count], boxes_m * size[:count, BOX_AXES])
+        found = []
+        for row, task in enumerate(tasks):
+            boxes_m = np.array(self._metadata.object_boxes_m[task])
+            here = row, slice(len(boxes_m))
+            found.append(ObjectsAtStart(poses[here], boxes_m * size[here][:, BOX_AXES]))
+        return found

@@ -8,16 +8,9 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 from torch.nn import functional
 
-from dextouch.errors import EndedError, InvalidInputError, UnavailableError
-from dextouch.hands.actions import (
-    JOINTS_LEFT,
-    JOINTS_RIGHT,
-    AnchorPoses,
-    check_actions,
-    poses_from_actions,
-)
+from dextouch.errors import EndedError, InvalidInputError
+from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
-    EVERYTHING,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -26,8 +19,8 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
-from dextouch.worlds import StartedRollout, SteppedRollout
-from services.world_model.checkpoints import StateCheckpoint, StateMetadata
+from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
+from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
     STEPS_PER_LATENT,
@@ -43,8 +36,8 @@ from services.world_model.dynamics.model import (
     SceneMemory,
     batched,
     first_steps,
+    mean_poses,
     mean_size,
-    mean_start,
     memory_arrays,
     memory_from_arrays,
     memory_of,
@@ -56,15 +49,17 @@ from services.world_model.network.inputs import (
     build_inputs,
     check_reach,
 )
-from services.world_model.rendering.rasters import SceneState
+from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 from services.world_model.starts import (
     ObservedStart,
     check_geometry,
     checked_chunk,
     checked_selectors,
+    foreign_snapshot,
     observed_start,
     opened_snapshot,
+    refuse_non_finite,
 )
 
 MAX_SNAPSHOT_BYTES = 2**20
@@ -97,71 +92,8 @@ class StateRollout:
     num_moving: int = 0
 
 
-def rollout_bytes(state: StateRollout, digest: str) -> bytes:
-    """Serialize the state together with the digest of its world."""
-    fields = {
-        "digest": digest,
-        "task": state.task,
-        "action_kind": state.action_kind,
-        "step": state.step,
-        "num_moving": state.num_moving,
-    }
-    arrays = {
-        "image": state.image,
-        "anchor": np.stack(state.anchor.as_tuple()),
-        "K_head": state.K_head,
-        "first_reached": state.first_reached,
-    }
-    return pack(fields, {**arrays, **memory_arrays(state.memory)})
-
-
-def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> StateRollout:
-    """Restore the state of a snapshot; validates untrusted bytes.
-
-    Raises:
-        InvalidInputError: not a snapshot of this world.
-        NonFiniteError: NaN or infinity.
-    """
-    fields, arrays = opened_snapshot(data, digest, max_bytes=MAX_SNAPSHOT_BYTES)
-    config, name = metadata.dynamics, fields.get("task")
-    step, moving = fields.get("step"), fields.get("num_moving")
-    size = (config.image_px, config.image_px, 3)
-    shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
-    if (
-        name not in config.tasks
-        or fields.get("action_kind") not in ACTION_KINDS
-        or not isinstance(step, int)
-        or not isinstance(moving, int)
-        or min(step, moving) < 0
-        or arrays.get("image", np.zeros(0)).dtype != np.uint8
-        or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
-    ):
-        raise InvalidInputError(
-            f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
-            "this world's own snapshot writes"
-        )
-    anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-    check_geometry(anchor, K_head)
-    memory = memory_from_arrays(arrays, config, metadata.num_members)
-    if int(memory.start.task[0, 0]) != config.tasks.index(name):
-        raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
-    first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
-    check_reach(first_reached)
-    return StateRollout(
-        task=name,
-        action_kind=fields["action_kind"],
-        image=arrays["image"],
-        anchor=anchor,
-        K_head=K_head,
-        first_reached=first_reached[0],
-        memory=memory,
-        step=step,
-        num_moving=moving,
-    )
-
-
-class StateWorld:
-    """Implements `dextouch.worlds.BatchWorld` with a state model.
+class StateWorld(BatchWorld[StateRollout]):
+    """A state model as a world.
 
     Deterministic: the seeds of chunks have no effect.
 
@@ -260,24 +192,6 @@ class StateWorld:
         )
         build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
 
-    def step(
-        self,
-        state: StateRollout,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[StateRollout]:
-        """Predict one action chunk of 4k ≤ 64 steps.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            EndedError: the hands have moved four times as long as any episode of training.
-        """
-        chunks = np.asarray(actions)[None]
-        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
-
     @torch.inference_mode()
     def step_batch(
         self,
@@ -287,18 +201,32 @@ class StateWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[StateRollout]]:
-        """`step` for several rollouts; results differ from single calls by rounding only."""
+        """Predict action chunks of 4k ≤ 64 steps; others of the batch change results by rounding.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: physically impossible actions.
+            EndedError: the hands have moved four times as long as any episode of training.
+            UnavailableError: the model predicts NaN or infinity.
+        """
         requested = checked_selectors(states, actions, seeds, selectors)
         for state in states:
             self._refuse_ended(state)
-        chunks = [self._checked_chunk(chunk) for chunk in actions]
+        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
+        for chunk in chunks:
+            check_reach(chunk)
         motions = [
             hand_motion(chunk, state.anchor, validated=True)
             for chunk, state in zip(chunks, states, strict=True)
         ]
         memory = batched([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
-        _refuse_non_finite(imagined)
+        checked = {
+            "touch": imagined.tactile_kpa,
+            "objects' place": imagined.poses.position_m,
+            "objects' direction": imagined.poses.axes,
+        }
+        refuse_non_finite("state model", checked)
         answers = [
             self._answer(
                 replace(
@@ -324,11 +252,6 @@ class StateWorld:
                 "was trained on"
             )
             raise EndedError(f"world {self._metadata.name}: {reason}", reason=reason)
-
-    def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
-        chunk = checked_chunk(actions, self._description)
-        check_reach(chunk)
-        return chunk
 
     def _answer(
         self,
@@ -362,15 +285,15 @@ class StateWorld:
         poses: Float32[np.ndarray, "n objects 7"],
     ) -> Drawing:
         """Steps of a rollout to draw, with hands and objects at the given poses."""
-        start, *states = _scene_states(
-            np.concatenate([state.first_reached[None], actions]),
-            state.anchor,
-            np.concatenate([self._poses(mean_start(state.memory), state.task), poses]),
-        )
+        actions = np.concatenate([state.first_reached[None], actions])
+        first = self._poses(mean_poses(state.memory.start.objects), state.task)
+        poses = np.concatenate([first, poses])
+        present = poses[..., 2] > ABSENT_POSE[2]
+        states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
         size = mean_size(state.memory)[0, : len(boxes_m)].double().numpy()
         boxes_m = boxes_m * size[:, BOX_AXES]
-        return Drawing(state.image, state.K_head, start, states, boxes_m)
+        return Drawing(state.image, state.K_head, states, boxes_m)
 
     def _drawn(
         self, answers: Sequence[tuple[SteppedRollout[StateRollout], Drawing | None]]
@@ -443,46 +366,58 @@ class StateWorld:
 
     def snapshot(self, state: StateRollout) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
-        return rollout_bytes(state, self._digest)
+        fields = {
+            "digest": self._digest,
+            "task": state.task,
+            "action_kind": state.action_kind,
+            "step": state.step,
+            "num_moving": state.num_moving,
+        }
+        arrays = {
+            "image": state.image,
+            "anchor": np.stack(state.anchor.as_tuple()),
+            "K_head": state.K_head,
+            "first_reached": state.first_reached,
+        }
+        return pack(fields, {**arrays, **memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:
-        """Restore the state of a snapshot.
+        """Restore the state of a snapshot; validates untrusted bytes.
 
         Raises:
             InvalidInputError: not a snapshot of this checkpoint.
+            NonFiniteError: NaN or infinity.
         """
-        return rollout_from_bytes(data, self._metadata, self._digest)
-
-
-def _scene_states(
-    actions: Float64[np.ndarray, "n 67"],
-    anchor: AnchorPoses,
-    poses: Float32[np.ndarray, "n objects 7"],
-) -> list[SceneState]:
-    """Scenes to draw; the actions were validated when they came."""
-    hands = poses_from_actions(actions, anchor, validated=True)
-    Ts_world_wrist = np.stack([hands.Ts_world_wrist_left, hands.Ts_world_wrist_right], axis=1)
-    joints_rad = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
-    there = poses[..., 2] > ABSENT_POSE[2]
-    return [
-        SceneState(
-            hands.Ts_world_camera_head[index],
-            Ts_world_wrist[index],
-            joints_rad[index],
-            poses[index].astype(np.float64),
-            there[index],
+        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        config, name = self._metadata.dynamics, fields.get("task")
+        step, moving = fields.get("step"), fields.get("num_moving")
+        size = (config.image_px, config.image_px, 3)
+        shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
+        if (
+            name not in config.tasks
+            or fields.get("action_kind") not in ACTION_KINDS
+            or not isinstance(step, int)
+            or not isinstance(moving, int)
+            or min(step, moving) < 0
+            or arrays.get("image", np.zeros(0)).dtype != np.uint8
+            or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
+        ):
+            raise foreign_snapshot(fields, arrays)
+        anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
+        check_geometry(anchor, K_head)
+        memory = memory_from_arrays(arrays, config, self._metadata.num_members)
+        if int(memory.start.task[0, 0]) != config.tasks.index(name):
+            raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
+        first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
+        check_reach(first_reached)
+        return StateRollout(
+            task=name,
+            action_kind=fields["action_kind"],
+            image=arrays["image"],
+            anchor=anchor,
+            K_head=K_head,
+            first_reached=first_reached[0],
+            memory=memory,
+            step=step,
+            num_moving=moving,
         )
-        for index in range(len(actions))
-    ]
-
-
-def _refuse_non_finite(imagined: ImaginedSteps) -> None:
-    for what, values in (
-        ("touch", imagined.tactile_kpa),
-        ("object places", imagined.poses.position_m),
-        ("object axes", imagined.poses.axes),
-    ):
-        if not torch.isfinite(values).all():
-            raise UnavailableError(
-                f"state model: its {what} contain NaN or infinity; the rollout did not advance"
-            )

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions, poses_from_actions, reanchor
 from dextouch.schemas import (
-    EVERYTHING,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -19,7 +18,7 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
-from dextouch.worlds import StartedRollout, SteppedRollout
+from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
 from services.networks.weight_files import on_device
 from services.world_model.checkpoints import (
     Checkpoint,
@@ -29,7 +28,7 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
-from services.world_model.network.model import Prediction, Sampling, stack_noise
+from services.world_model.network.model import Sampling, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
@@ -37,8 +36,10 @@ from services.world_model.starts import (
     SceneReader,
     checked_chunk,
     checked_selectors,
+    foreign_snapshot,
     observed_start,
     opened_snapshot,
+    refuse_non_finite,
 )
 from services.world_model.state_world import StateWorld
 
@@ -61,8 +62,8 @@ class ModelState:
     task: str = ""
 
 
-class ModelWorld:
-    """Implements `dextouch.worlds.BatchWorld` with a trained model.
+class ModelWorld(BatchWorld[ModelState]):
+    """A flow-matching model as a world.
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.
@@ -143,24 +144,6 @@ class ModelWorld:
         build_inputs(self._requests([state], [holding]), self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
-    def step(
-        self,
-        state: ModelState,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[ModelState]:
-        """Predict one action chunk of 4k ≤ 16 steps.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            UnavailableError: the model returned NaN or infinity.
-        """
-        chunks = np.asarray(actions)[None]
-        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
-
     def step_batch(
         self,
         states: Sequence[ModelState],
@@ -169,10 +152,15 @@ class ModelWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[ModelState]]:
-        """`step` for several rollouts; results differ from single calls by rounding only.
+        """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
 
         Images of the last latent are always decoded, since the next chunk starts from the last of
         them; the others only on request.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: physically impossible actions.
+            UnavailableError: the model returned NaN or infinity.
         """
         requested = checked_selectors(states, actions, seeds, selectors)
         chunks = [checked_chunk(chunk, self._description) for chunk in actions]
@@ -188,7 +176,7 @@ class ModelWorld:
         future = self._model.predict(
             inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
         )
-        _refuse_non_finite(future)
+        refuse_non_finite("world model", {"image": future.images, "touch": future.tactile_kpa})
         images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
         return [
             _advance(state, chunk, imagined, selector)
@@ -256,10 +244,7 @@ class ModelWorld:
             or fields.get("action_kind") not in ACTION_KINDS
             or arrays["anchor"].shape != (3, 4, 4)
         ):
-            raise InvalidInputError(
-                f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
-                "this world's own snapshot writes"
-            )
+            raise foreign_snapshot(fields, arrays)
         state = ModelState(
             image=arrays["image"],
             tactile_kpa=arrays["tactile_kpa"],
@@ -374,11 +359,3 @@ def _advance(
         step=state.step + len(chunk),
     )
     return SteppedRollout(following, observation)
-
-
-def _refuse_non_finite(future: Prediction) -> None:
-    for what, values in (("image", future.images), ("touch", future.tactile_kpa)):
-        if not torch.isfinite(values).all():
-            raise UnavailableError(
-                f"world model: its {what} contains NaN or infinity; the rollout did not advance"
-            )

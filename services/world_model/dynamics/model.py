@@ -356,11 +356,6 @@ def mean_poses(poses: ObjectPoses) -> ObjectPoses:
     )
 
 
-def mean_start(memory: SceneMemory) -> ObjectPoses:
-    """Object poses at the start, averaged over members."""
-    return mean_poses(memory.start.objects)
-
-
 def mean_size(memory: SceneMemory) -> Float32[Tensor, "batch objects 2"]:
     """Width and height of the objects as factors of the usual ones, averaged over members."""
     return memory.start.size.mean(0)

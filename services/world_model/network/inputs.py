@@ -5,7 +5,7 @@ tensors, so that training and serving treat a window identically.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -221,10 +221,9 @@ class ModelInputs:
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
         moved: dict[str, Any] = {
-            name: value.to(device) if isinstance(value, Tensor) else value
-            for name, value in vars(self).items()
+            name: one.to(device) for name, one in vars(self).items() if isinstance(one, Tensor)
         }
-        return ModelInputs(**moved)
+        return replace(self, **moved)
 
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
@@ -239,7 +238,13 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
     """
     if not requests:
         raise InvalidInputError("model input: got no request, expected at least one")
-    actions = np.stack(_same_length([_checked_actions(r, config) for r in requests]))
+    checked = [_checked_actions(r, config) for r in requests]
+    lengths = {len(rows) for rows in checked}
+    if len(lengths) != 1:
+        raise ShapeError(
+            f"model input: got windows of {sorted(lengths)} steps in one batch, expected one length"
+        )
+    actions = np.stack(checked)
     anchors = np.stack([_checked_anchor(r.anchor) for r in requests])
     K_head = np.stack([_checked_camera(r.K_head) for r in requests])
     raster = pose_raster(
@@ -254,7 +259,7 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         raster=torch.from_numpy(raster),
         geometry=torch.from_numpy(_geometry(requests, actions, config)),
         commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
-        words=torch.stack([_instruction_ids(r.instruction, config) for r in requests]),
+        words=torch.stack([instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
     )
 
@@ -269,12 +274,6 @@ def _geometry(
     return np.stack([contact_geometry(rows, one.anchor, one.objects) for one, rows in each])
 
 
-def _instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:
-    return instruction_ids(
-        instruction, config.instruction_encoder, num_buckets=config.num_word_buckets
-    )
-
-
 def _float_tensor(values: np.ndarray) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
@@ -285,15 +284,6 @@ def _hand_layout(anchors: np.ndarray) -> Float64[np.ndarray, "batch 2 9"]:
     poses = pose_to_9d(Ts_camera_wrist)
     left = mirror_pose_9d(poses[:, 0], mirror_to=MIRROR_CAMERA, mirror_from=MIRROR_WRIST)
     return np.stack([left, poses[:, 1]], axis=1)
-
-
-def _same_length(actions: list[np.ndarray]) -> list[np.ndarray]:
-    lengths = {len(rows) for rows in actions}
-    if len(lengths) != 1:
-        raise ShapeError(
-            f"model input: got windows of {sorted(lengths)} steps in one batch, expected one length"
-        )
-    return actions
 
 
 def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.ndarray:

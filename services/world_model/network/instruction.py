@@ -11,7 +11,7 @@ import html
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float, Float32, Int64
@@ -20,9 +20,8 @@ from torch import Tensor, nn
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks.subwords import MAX_SUBWORDS, WORD, subwords
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.network.configuration import WanConfig
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 
-InstructionKind = Literal["hashed_words", "subwords"]
 MAX_WORDS = 16
 NO_WORD = 0
 NUM_SUBWORD_BUCKETS = 4096
@@ -33,12 +32,10 @@ _KEY: Final = "features"
 _MAX_TEXTS: Final = 1024
 
 
-def instruction_ids(
-    instruction: str, kind: InstructionKind, *, num_buckets: int
-) -> Int64[Tensor, " ids"]:
+def instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:
     """Buckets of an instruction's words or subwords, padded with `NO_WORD` to a fixed length."""
-    if kind == "hashed_words":
-        return hash_words(instruction, num_buckets)
+    if config.instruction_encoder == "hashed_words":
+        return hash_words(instruction, config.num_word_buckets)
     return hash_subwords(instruction)
 
 

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float32, UInt8
@@ -17,6 +17,7 @@ from services.world_model.network.conditioning import (
     Condition,
     Constants,
     TactileCondition,
+    VideoCondition,
 )
 from services.world_model.network.configuration import (
     FLOAT32_PARTS,
@@ -29,7 +30,16 @@ from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import TextFeatures
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
-from services.world_model.network.video import WanVideoCondition, to_unit, video_side
+from services.world_model.network.video import (
+    VideoExpert,
+    VisualCodec,
+    WanBlock,
+    WanVideoCodec,
+    WanVideoCondition,
+    WanVideoExpert,
+    empty_transformer,
+    to_unit,
+)
 
 _EXACT_PARTS = (
     "codec.", "tokenizer.", "normalizer.", "video_condition.", "tactile_condition.",
@@ -72,15 +82,6 @@ class Context:
     clean: CleanTokens | None = None
 
 
-class PreparedContext(NamedTuple):
-    """Both streams before the first layer, with their conditions."""
-
-    video: Stream
-    tactile: Stream | None
-    of_video: Any
-    of_tactile: Condition | None
-
-
 @dataclass(frozen=True)
 class Sampling:
     """How futures are sampled.
@@ -111,15 +112,35 @@ class JointWorldModel(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        side = video_side(config)
-        self.codec = side.codec()
+        # Small parts and those of Wan2.2 have the same methods. The latter are on the meta device
+        # until their weights are loaded.
+        wan = config.wan
+        transformer: Any = (
+            None
+            if wan is None
+            else empty_transformer(
+                wan,
+                num_layers=config.num_layers,
+                num_heads=config.num_heads,
+                head_width=config.head_width,
+            )
+        )
+        self.codec: VisualCodec | WanVideoCodec = (
+            VisualCodec(config) if wan is None else WanVideoCodec(wan)
+        )
         self.tokenizer = build_tokenizer(config).requires_grad_(requires_grad=False)
         self.normalizer = ActionNormalizer()
         self.register_buffer("video_residual_std", torch.ones(()))
         self.register_buffer("tactile_residual_std", torch.ones(()))
-        self.video_condition = side.condition()
+        self.video_condition: VideoCondition | WanVideoCondition = (
+            VideoCondition(config)
+            if wan is None
+            else WanVideoCondition(config, wan, transformer.condition_embedder)
+        )
         self.tactile_condition = TactileCondition(config) if config.use_touch else None
-        self.video = side.expert()
+        self.video: VideoExpert | WanVideoExpert = (
+            VideoExpert(config) if wan is None else WanVideoExpert(config, transformer)
+        )
         self.tactile: TactileExpert | None = None
         if config.use_touch:
             self.tactile = TactileExpert(
@@ -127,7 +148,9 @@ class JointWorldModel(nn.Module):
             )
         self.layers = nn.ModuleList(
             JointLayer(
-                side.block(index),
+                ExpertBlock(config, config.video_width)
+                if wan is None
+                else WanBlock(transformer.blocks[index]),
                 ExpertBlock(config, config.tactile_width) if config.use_touch else None,
             )
             for index in range(config.num_layers)
@@ -209,8 +232,9 @@ class JointWorldModel(nn.Module):
 
     def with_clean_tokens(self, context: Context, noisy: JointLatents) -> Context:
         """The context with its clean tokens, which no value of `noisy` changes."""
-        begun = self._begin(context, noisy, torch.ones(len(noisy.video), device=noisy.video.device))
-        video, tactile = begun.video.split(self.config.tokens_per_latent)[0], begun.tactile
+        t = torch.ones(len(noisy.video), device=noisy.video.device)
+        video, tactile, _, _ = self._begin(context, noisy, t)
+        video = video.split(self.config.tokens_per_latent)[0]
         if tactile is not None:
             tactile = tactile.split(2 * self.tokenizer.num_tokens)[0]
         return replace(context, clean=CleanTokens.through(self._joint_layers(), video, tactile))
@@ -219,31 +243,33 @@ class JointWorldModel(nn.Module):
         self, context: Context, noisy: JointLatents, t: Float32[Tensor, " batch"]
     ) -> JointLatents:
         """`forward` with a context, which several times may share."""
-        begun = self._begin(context, noisy, t)
-        video, tactile = begun.video, begun.tactile
+        video, tactile, of_video, of_tactile = self._begin(context, noisy, t)
         if context.clean is None:
             mask = self.attention_mask(context.raster.shape[1]).to(t.device)
             for layer in self.layers:
                 video, tactile = layer(video, tactile, mask)
         else:
             video, tactile = context.clean.update(self._joint_layers(), video, tactile)
-        latents = self.video.finish(video, begun.of_video)
-        if self.tactile is None or tactile is None or begun.of_tactile is None:
+        latents = self.video.finish(video, of_video)
+        if self.tactile is None or tactile is None or of_tactile is None:
             return JointLatents(latents, self.with_clean_first(noisy, context.first).tactile)
-        return JointLatents(latents, self.tactile.finish(tactile, begun.of_tactile))
+        return JointLatents(latents, self.tactile.finish(tactile, of_tactile))
 
     def _joint_layers(self) -> list[JointLayer]:
         return [layer for layer in self.layers if isinstance(layer, JointLayer)]
 
-    def _begin(self, context: Context, noisy: JointLatents, t: Tensor) -> PreparedContext:
+    def _begin(
+        self, context: Context, noisy: JointLatents, t: Tensor
+    ) -> tuple[Stream, Stream | None, Any, Condition | None]:
+        """Both streams before the first layer, then their conditions."""
         noisy = self.with_clean_first(noisy, context.first)
         of_video: Any = self.video_condition.at(context.video, _time_of_each(t, noisy.video))
         video = self.video.start(noisy.video, context.first.video, of_video, context.raster)
         if self.tactile is None or self.tactile_condition is None or context.tactile is None:
-            return PreparedContext(video, None, of_video, None)
+            return video, None, of_video, None
         of_tactile = self.tactile_condition.at(context.tactile, _time_of_each(t, noisy.tactile))
         tactile = self.tactile.start(noisy.tactile, context.first.tactile, of_tactile)
-        return PreparedContext(video, tactile, of_video, of_tactile)
+        return video, tactile, of_video, of_tactile
 
     def with_clean_first(self, noisy: JointLatents, first: FirstLatents) -> JointLatents:
         """Latents whose first ones are clean: zero for residuals, `first` for plain ones."""

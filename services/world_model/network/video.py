@@ -1,9 +1,7 @@
 """The video side of the joint model: codec and expert, small ones or Wan2.2's."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,7 +13,6 @@ from services.networks.principal_axes import principal_axes, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Block,
-    ExpertBlock,
     Heads,
     KeysValues,
     Stream,
@@ -32,7 +29,6 @@ from services.world_model.network.conditioning import (
     TIME_RANGE,
     ActionFeatures,
     Condition,
-    VideoCondition,
     after_first,
     two_layers,
 )
@@ -141,13 +137,14 @@ class VisualCodec(nn.Module):
         self.register_buffer("basis", torch.eye(values, config.codec_channels))
         self.register_buffer("scale", torch.ones(config.codec_channels))
 
-    def fit(self, windows: UInt8[Tensor, "n time px px 3"], *, batch: int = 16) -> None:
+    def fit(self, windows: UInt8[Tensor, "n time px px 3"]) -> None:
         """Fit mean and principal axes to windows of images."""
         size = len(self.mean)
         total = torch.zeros(size, dtype=torch.float64)
         moment = torch.zeros(size, size, dtype=torch.float64)
         count = 0
-        for part in torch.split(windows, batch):
+        # Part by part, which bounds the memory.
+        for part in torch.split(windows, 16):
             patches = self._patches(to_unit(part)).reshape(-1, size)
             total += patches.sum(dim=0, dtype=torch.float64)
             moment += (patches.T @ patches).double()
@@ -457,43 +454,6 @@ class WanVideoExpert(nn.Module):
         normed = self.norm_out(tokens.float()) * (1.0 + scale) + shift
         predicted: Tensor = self.proj_out(normed.to(tokens.dtype)).float()
         return predicted
-
-
-@dataclass(frozen=True)
-class VideoSide:
-    """Makes the parts of the video side, each when it is called; `block` takes the layer's number.
-
-    Small parts and those of Wan2.2 have the same methods, so that the joint model and its training
-    know only one. Those of Wan2.2 are on the meta device until their weights are loaded.
-    """
-
-    codec: Callable[[], VisualCodec | WanVideoCodec]
-    condition: Callable[[], VideoCondition | WanVideoCondition]
-    expert: Callable[[], VideoExpert | WanVideoExpert]
-    block: Callable[[int], Block]
-
-
-def video_side(config: NetworkConfig) -> VideoSide:
-    """The video side that the configuration names."""
-    if config.wan is None:
-        return VideoSide(
-            partial(VisualCodec, config),
-            partial(VideoCondition, config),
-            partial(VideoExpert, config),
-            lambda _: ExpertBlock(config, config.video_width),
-        )
-    transformer = empty_transformer(
-        config.wan,
-        num_layers=config.num_layers,
-        num_heads=config.num_heads,
-        head_width=config.head_width,
-    )
-    return VideoSide(
-        partial(WanVideoCodec, config.wan),
-        partial(WanVideoCondition, config, config.wan, transformer.condition_embedder),
-        partial(WanVideoExpert, config, transformer),
-        lambda index: WanBlock(transformer.blocks[index]),
-    )
 
 
 def empty_transformer(

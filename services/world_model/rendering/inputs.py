@@ -6,7 +6,6 @@ and the camera stood still. Pixels of the table plane (z = 0 in the world) move 
 rays that meet the plane beyond `FAR_M`, or never, move as if they came from infinity.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,7 +26,6 @@ from services.world_model.rendering.rasters import (
     cast_boxes,
     colours_at,
     colours_at_positions,
-    joined,
     object_transforms,
     positions_at_start,
     project_hands,
@@ -210,11 +208,6 @@ class PreparedScenes:
         before = Bodies.seen(scenes.states, scenes.boxes_m, scenes.K_head)
         return cls(scenes, before, _start(scenes, before))
 
-    @classmethod
-    def joined(cls, parts: "Sequence[PreparedScenes]") -> "PreparedScenes":
-        """All scenes of the parts, with equal image sizes and numbers of object slots."""
-        return parts[0] if len(parts) == 1 else joined(parts)
-
 
 @dataclass(frozen=True)
 class _ObjectPixels:
@@ -226,19 +219,12 @@ class _ObjectPixels:
 
 
 def drawing_inputs(
-    scenes: Scenes, states: SceneStates, owner: Int64[np.ndarray, " n"], config: RendererConfig
-) -> DrawingInputs:
-    """Inputs for drawing each state from the scene with the index in `owner`."""
-    return drawing_inputs_from(PreparedScenes.of(scenes), states, owner, config)
-
-
-def drawing_inputs_from(
-    prepared: "PreparedScenes",
+    prepared: PreparedScenes,
     states: SceneStates,
     owner: Int64[np.ndarray, " n"],
     config: RendererConfig,
 ) -> DrawingInputs:
-    """`drawing_inputs` for prepared scenes."""
+    """Inputs for drawing each state from the scene with the index in `owner`."""
     scenes, before, start = prepared.scenes, prepared.before, prepared.start
     shape_px = scenes.images.shape[1], scenes.images.shape[2]
     K, boxes_m = scenes.K_head[owner], scenes.boxes_m[owner]
@@ -262,8 +248,12 @@ def drawing_inputs_from(
         moved = motion_shares(before, now, owner, motion)
         moved[:, 2:] *= present
         shown = _plane(hits, moved[hits.image, 2 + hits.slot][:, None], (len(owner), *shape_px))
-        stirred = _Stirred(start, owner[rows], positions[rows], moved[rows])
-        body = _body_change(stirred, hands.coverage[rows], shown[rows], outside[rows])
+        covered = (hands.coverage[rows] > _COVERED) * moved[rows, :2, None, None]
+        body = np.maximum(covered.max(axis=1, keepdims=True), shown[rows])
+        at_first = _moved_at_start(start, owner[rows], positions[rows], moved[rows])
+        body = np.maximum(body, np.maximum(at_first, outside[rows]))
+        # Around moved bodies at the start and now, and pixels outside the view.
+        body = grown(body.astype(np.float32), _REACH_PX)
         change[rows] = np.maximum(body, change[rows]) if config.redraws_table else body
     return DrawingInputs(
         torch.from_numpy(np.concatenate(fine, axis=1)),
@@ -347,35 +337,18 @@ def _coarse(
     return planes
 
 
-@dataclass(frozen=True)
-class _Stirred:
-    """Moved bodies at their positions in the start image."""
-
-    start: _Start
-    owner: Int64[np.ndarray, " n"]
-    positions: Float32[np.ndarray, "n h w 2"]
-    moved: Float64[np.ndarray, "n bodies"]
-
-    def warped(self) -> Float32[np.ndarray, "n 1 h w"]:
-        """Motion share of the body shown at each pixel, warped by the camera motion."""
-        table = np.concatenate([np.zeros((len(self.owner), 1)), self.moved[:, 2:]], axis=1)
-        boxes = table[np.arange(len(self.owner))[:, None, None], self.start.shown[self.owner]]
-        hands = (self.start.hands[self.owner] > _COVERED) * self.moved[:, :2, None, None]
-        stirred = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
-        sampled = sample_images(
-            torch.from_numpy(stirred), torch.from_numpy(self.positions), interpolation="bilinear"
-        )
-        return np.asarray(sampled.numpy())
-
-
-def _body_change(
-    stirred: _Stirred, cover: np.ndarray, objects: np.ndarray, outside: np.ndarray
+def _moved_at_start(
+    start: _Start, owner: np.ndarray, positions: np.ndarray, moved: np.ndarray
 ) -> Float32[np.ndarray, "n 1 h w"]:
-    """Change mask: around moved bodies at the start and now, and pixels outside the view."""
-    moved = stirred.moved
-    hands = ((cover > _COVERED) * moved[:, :2, None, None]).max(axis=1, keepdims=True)
-    change = np.maximum(np.maximum(hands, objects), np.maximum(stirred.warped(), outside))
-    return grown(change.astype(np.float32), _REACH_PX)
+    """Motion share of the body shown at each pixel of the start, warped by the camera motion."""
+    table = np.concatenate([np.zeros((len(owner), 1)), moved[:, 2:]], axis=1)
+    boxes = table[np.arange(len(owner))[:, None, None], start.shown[owner]]
+    hands = (start.hands[owner] > _COVERED) * moved[:, :2, None, None]
+    shares = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
+    sampled = sample_images(
+        torch.from_numpy(shares), torch.from_numpy(positions), interpolation="bilinear"
+    )
+    return np.asarray(sampled.numpy())
 
 
 def grown(

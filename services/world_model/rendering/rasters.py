@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from dextouch.errors import NonFiniteError, ShapeError
 from dextouch.geometry import apply, invert, transform_from_pose
+from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
 
 Arrays = TypeVar("Arrays")
@@ -40,19 +41,11 @@ _KNUCKLES = (5, 9, 13, 17)
 
 
 @dataclass(frozen=True)
-class SceneState:
-    """Poses at one step; slots of absent objects hold arbitrary finite numbers."""
-
-    T_world_camera: Float64[np.ndarray, "4 4"]
-    Ts_world_wrist: Float64[np.ndarray, "2 4 4"]
-    joints_rad: Float64[np.ndarray, "2 20"]
-    object_poses: Float64[np.ndarray, "k 7"]
-    object_present: Bool[np.ndarray, " k"]
-
-
-@dataclass(frozen=True)
 class SceneStates:
-    """Many states as arrays; poses are x y z (m), then the quaternion w x y z, in the world."""
+    """Scenes at several steps; poses are x y z (m), then the quaternion w x y z, in the world.
+
+    Slots of absent objects hold arbitrary finite numbers.
+    """
 
     Ts_world_camera: Float64[np.ndarray, "n 4 4"]
     Ts_world_wrist: Float64[np.ndarray, "n 2 4 4"]
@@ -61,31 +54,24 @@ class SceneStates:
     object_present: Bool[np.ndarray, "n k"]
 
     @classmethod
-    def stack(cls, states: Sequence[SceneState]) -> "SceneStates":
-        """Stack states with the same number of object slots.
-
-        Raises:
-            ShapeError: no state, arrays of another shape, or more than four slots.
-            NonFiniteError: NaN or infinity.
-        """
-        if not states:
-            raise ShapeError("scene states: got none, expected at least one to draw")
-        shapes = {(np.shape(s.object_poses), np.shape(s.object_present)) for s in states}
-        num_slots = len(states[0].object_present)
-        if shapes != {((num_slots, 7), (num_slots,))} or num_slots > MAX_DRAWN_OBJECTS:
-            raise ShapeError(
-                f"scene states: got object poses and presences of shapes {sorted(shapes)}, "
-                f"expected [K, 7] and [K] with one K ≤ {MAX_DRAWN_OBJECTS} in all of them"
-            )
-        made = cls(
-            np.stack([np.asarray(s.T_world_camera, dtype=np.float64) for s in states]),
-            np.stack([np.asarray(s.Ts_world_wrist, dtype=np.float64) for s in states]),
-            np.stack([np.asarray(s.joints_rad, dtype=np.float64) for s in states]),
-            np.stack([np.asarray(s.object_poses, dtype=np.float64) for s in states]),
-            np.stack([np.asarray(s.object_present, dtype=np.bool_) for s in states]),
+    def of_actions(
+        cls,
+        actions: Float64[np.ndarray, "n 67"],
+        anchor: AnchorPoses,
+        poses: np.ndarray,
+        present: Bool[np.ndarray, "n k"],
+        *,
+        validated: bool = False,
+    ) -> "SceneStates":
+        """States with camera and hands where actions say, which may be validated already."""
+        hands = poses_from_actions(actions, anchor, validated=validated)
+        return cls(
+            hands.Ts_world_camera_head,
+            np.stack([hands.Ts_world_wrist_left, hands.Ts_world_wrist_right], axis=1),
+            np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1),
+            poses.astype(np.float64),
+            present,
         )
-        made._check()
-        return made
 
     def __len__(self) -> int:
         return len(self.Ts_world_camera)
@@ -100,20 +86,31 @@ class SceneStates:
         present[:, :count] = self.object_present
         return replace(self, object_poses=poses, object_present=present)
 
-    def take(self, rows: Int64[np.ndarray, " m"]) -> "SceneStates":
+    def take(self, rows: Int64[np.ndarray, " m"] | slice) -> "SceneStates":
         """Select states, in the order of `rows`."""
         return SceneStates(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def _check(self) -> None:
+    def check(self, num_slots: int) -> None:
+        """Refuse states that cannot be drawn.
+
+        Raises:
+            ShapeError: arrays of another shape, or another number of object slots.
+            NonFiniteError: NaN or infinity.
+        """
         expected = {
-            "T_world_camera": (self.Ts_world_camera, (4, 4)),
-            "Ts_world_wrist": (self.Ts_world_wrist, (2, 4, 4)),
-            "joints_rad": (self.joints_rad, (2, 20)),
-            "object_poses": (self.object_poses, self.object_poses.shape[1:]),
+            "Ts_world_camera": (4, 4),
+            "Ts_world_wrist": (2, 4, 4),
+            "joints_rad": (2, 20),
+            "object_poses": (num_slots, 7),
+            "object_present": (num_slots,),
         }
-        for name, (array, shape) in expected.items():
+        for name, shape in expected.items():
+            array = getattr(self, name)
             if array.shape[1:] != shape:
-                raise ShapeError(f"scene state: {name} is {array.shape[1:]}, expected {shape}")
+                raise ShapeError(
+                    f"scene states: {name} is {array.shape[1:]}, expected {shape} for {num_slots} "
+                    "boxes"
+                )
             bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
             if len(bad):
                 raise NonFiniteError(
@@ -124,8 +121,10 @@ class SceneStates:
 def joined(parts: Sequence[Arrays]) -> Arrays:
     """One array, or dataclass of arrays, from several of a kind: their first axes concatenated."""
     first: Any = parts[0]
-    if isinstance(first, np.ndarray):
-        together: Any = np.concatenate(list[Any](parts))
+    if len(parts) == 1:
+        together = first
+    elif isinstance(first, np.ndarray):
+        together = np.concatenate(list[Any](parts))
     else:
         names = [field.name for field in fields(first)]
         together = type(first)(*[joined([getattr(part, name) for part in parts]) for name in names])

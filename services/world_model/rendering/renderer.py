@@ -19,13 +19,12 @@ from services.world_model.rendering.inputs import (
     DrawingInputs,
     PreparedScenes,
     Scenes,
-    drawing_inputs_from,
+    drawing_inputs,
 )
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.network import uses_bfloat16 as uses_bfloat16_here
 from services.world_model.rendering.rasters import (
     MAX_DRAWN_OBJECTS,
-    SceneState,
     SceneStates,
     joined,
 )
@@ -38,21 +37,19 @@ _KEPT_STARTS: Final = 64
 
 @dataclass(frozen=True)
 class Drawing:
-    """States of one rollout to draw, at least one, and its start; checked as it is drawn.
+    """States of one rollout to draw; checked as it is drawn.
 
     Attributes:
         start_image: uint8 [h, w, 3], the head camera image at the start.
         K_head: intrinsics [3, 3] in pixels; lens distortion is not modelled.
-        start: state at the start.
-        states: states to draw, which follow the start, or precede it.
+        states: the state at the start, then at least one to draw, of a later or earlier step.
         boxes_m: [k, 6], centre and half sizes (x y z, x y z) of the bounding box of each object
             slot, in the object frame.
     """
 
     start_image: np.ndarray
     K_head: np.ndarray
-    start: SceneState
-    states: Sequence[SceneState]
+    states: SceneStates
     boxes_m: np.ndarray
 
 
@@ -85,19 +82,8 @@ class Renderer:
         """Shape of the network."""
         return self._network.config
 
-    def draw(
-        self,
-        start_image: np.ndarray,
-        K_head: np.ndarray,
-        start: SceneState,
-        states: Sequence[SceneState],
-        boxes_m: np.ndarray,
-    ) -> UInt8[np.ndarray, "n h w 3"]:
-        """`draw_all` for one rollout."""
-        return self.draw_all([Drawing(start_image, K_head, start, states, boxes_m)])[0]
-
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
-        """Draw images of any number of rollouts; equal to those of `draw`, except for rounding.
+        """Draw images of any number of rollouts; together as alone, except for rounding.
 
         If camera, hands and objects are where they were at the start, the image is exactly the
         start image.
@@ -114,9 +100,9 @@ class Renderer:
         if len(sizes) > 1:
             raise ShapeError(f"renderer: got start images {sorted(sizes)}, expected one size")
         starts = [self._prepared(drawing) for drawing in drawings]
-        stacked = [_stacked(drawing) for drawing in drawings]
-        counts = [len(states) for states in stacked]
-        states = joined(stacked)
+        later = [one.states.take(slice(1, None)).padded(MAX_DRAWN_OBJECTS) for one in drawings]
+        counts = [len(states) for states in later]
+        states = joined(later)
         owner = np.repeat(np.arange(len(drawings)), counts)
         blocks = [
             self._drawn_block(starts, states.take(rows), owner[rows])
@@ -130,9 +116,9 @@ class Renderer:
         self, starts: Sequence[PreparedScenes], states: SceneStates, owner: np.ndarray
     ) -> UInt8[np.ndarray, "n h w 3"]:
         used, local = np.unique(owner, return_inverse=True)
-        prepared = PreparedScenes.joined([starts[index] for index in used])
+        prepared = joined([starts[index] for index in used])
         with torch.inference_mode():
-            images = self._drawn(drawing_inputs_from(prepared, states, local, self.config))
+            images = self._drawn(drawing_inputs(prepared, states, local, self.config))
             rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
@@ -167,7 +153,7 @@ class Renderer:
 
     def _scene(self, drawing: Drawing) -> Scenes:
         """The start of a drawing, with empty object slots up to the maximum."""
-        image, start = drawing.start_image, drawing.start
+        image, states = drawing.start_image, drawing.states
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ShapeError(
                 f"renderer: got a start image {image.dtype} {image.shape}, expected uint8 [h, w, 3]"
@@ -180,25 +166,17 @@ class Renderer:
             )
         K = np.asarray(drawing.K_head, dtype=np.float64)
         boxes_m = np.asarray(drawing.boxes_m, dtype=np.float64)
-        if K.shape != (3, 3) or boxes_m.shape != (len(start.object_present), 6):
+        if K.shape != (3, 3) or boxes_m.shape[1:] != (6,) or len(boxes_m) > MAX_DRAWN_OBJECTS:
             raise ShapeError(
-                f"renderer: got K_head {K.shape} and boxes {boxes_m.shape}, expected (3, 3) and "
-                f"({len(start.object_present)}, 6) for the start's object slots"
+                f"renderer: got K_head {K.shape} and boxes {boxes_m.shape}, expected (3, 3) and at "
+                f"most ({MAX_DRAWN_OBJECTS}, 6)"
             )
         if not (np.isfinite(K).all() and np.isfinite(boxes_m).all()):
             raise NonFiniteError("renderer: K_head or boxes contain NaN or infinity")
-        states = SceneStates.stack([start]).padded(MAX_DRAWN_OBJECTS)
+        if len(states) < 2:
+            raise ShapeError("renderer: got none of the states to draw, expected at least one")
+        states.check(len(boxes_m))
+        start = states.take(slice(0, 1)).padded(MAX_DRAWN_OBJECTS)
         padded_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
         padded_m[0, : len(boxes_m)] = boxes_m
-        return Scenes(image[None], K[None], states, padded_m)
-
-
-def _stacked(drawing: Drawing) -> SceneStates:
-    """The states to draw, with empty object slots up to the maximum."""
-    states = SceneStates.stack(drawing.states)
-    if states.object_present.shape[1] != len(drawing.boxes_m):
-        raise ShapeError(
-            f"renderer: states have {states.object_present.shape[1]} object slots but there are "
-            f"{len(drawing.boxes_m)} boxes; expected equal numbers"
-        )
-    return states.padded(MAX_DRAWN_OBJECTS)
+        return Scenes(image[None], K[None], start, padded_m)

@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,16 +16,20 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
-    half_cosine,
+    floored_cosine,
     update_average,
 )
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
-from services.world_model.rendering.inputs import DrawingInputs, Scenes, drawing_inputs
+from services.world_model.rendering.inputs import (
+    DrawingInputs,
+    PreparedScenes,
+    Scenes,
+    drawing_inputs,
+)
 from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
-from services.world_model.rendering.rasters import SceneStates, object_transforms
+from services.world_model.rendering.rasters import SceneStates, joined, object_transforms
 
 LOG_EVERY_STEPS = 50
-MIN_LEARNING_RATE_SHARE = 0.01
 _EDGE_WINDOW_PX = 7
 OnProgress = Callable[[float, int, float], None]
 
@@ -90,7 +93,7 @@ def train_renderer(
         weight_decay=settings.weight_decay,
         max_gradient_norm=settings.max_gradient_norm,
         warmup_steps=settings.warmup_steps,
-        schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+        schedule=floored_cosine,
         betas=(0.9, 0.95),
     )
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
@@ -131,14 +134,13 @@ class RendererRun:
     def batch(self) -> tuple[DrawingInputs, Float32[Tensor, "n 3 h w"]]:
         """Inputs of random pairs and the true later images in 0 … 1."""
         starts, laters = self._pairs()
-        scenes, _ = gather(self._clips, starts)
-        later, images = gather(self._clips, laters)
+        scenes, later = gather(self._clips, starts), gather(self._clips, laters)
         scenes = replace(scenes, states=self._shaken(scenes.states))
         states = self._shaken(later.states)
         owner = np.arange(len(starts))
-        inputs = drawing_inputs(scenes, states, owner, self.network.config)
-        true = torch.from_numpy(np.ascontiguousarray(np.moveaxis(images, -1, 1))).float() / 255.0
-        return inputs, true
+        inputs = drawing_inputs(PreparedScenes.of(scenes), states, owner, self.network.config)
+        true = torch.from_numpy(np.ascontiguousarray(np.moveaxis(later.images, -1, 1)))
+        return inputs, true.float() / 255.0
 
     def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
         starts, laters = [], []
@@ -210,27 +212,13 @@ def check_clips(clips: Sequence[SceneClip], config: RendererConfig) -> None:
         )
 
 
-def gather(
-    clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]
-) -> tuple[Scenes, UInt8[np.ndarray, "b h w 3"]]:
+def gather(clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]) -> Scenes:
     """Images and states at rows (clip, image), as scenes; missing object slots are empty."""
     num_slots = max(len(clips[clip].boxes_m) for clip, _ in rows)
     boxes_m = np.zeros((len(rows), num_slots, 6))
-    poses = np.zeros((len(rows), num_slots, 7))
-    poses[..., 3] = 1.0
-    present = np.zeros((len(rows), num_slots), dtype=np.bool_)
-    for row, (clip, image) in enumerate(rows):
-        known = clips[clip]
-        slots = slice(0, len(known.boxes_m))
-        boxes_m[row, slots] = known.boxes_m
-        poses[row, slots] = known.states.object_poses[image]
-        present[row, slots] = known.states.object_present[image]
-    states = SceneStates(
-        np.stack([clips[c].states.Ts_world_camera[i] for c, i in rows]),
-        np.stack([clips[c].states.Ts_world_wrist[i] for c, i in rows]),
-        np.stack([clips[c].states.joints_rad[i] for c, i in rows]),
-        poses,
-        present,
-    )
-    images = np.stack([clips[c].images[i] for c, i in rows])
-    return Scenes(images, np.stack([clips[c].K_head for c, _ in rows]), states, boxes_m), images
+    for row, (clip, _) in enumerate(rows):
+        boxes_m[row, : len(clips[clip].boxes_m)] = clips[clip].boxes_m
+    images = np.stack([clips[clip].images[image] for clip, image in rows])
+    states = [clips[clip].states.take(slice(i, i + 1)).padded(num_slots) for clip, i in rows]
+    K_head = np.stack([clips[clip].K_head for clip, _ in rows])
+    return Scenes(images, K_head, joined(states), boxes_m)

@@ -6,11 +6,10 @@ through the store's reader, which decodes one camera and only the span of the wi
 """
 
 import hashlib
-import multiprocessing
 from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -31,13 +30,11 @@ from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
-from services.world_model.training.domains import DomainEpisode
 
 # What an episode must have for windows to be cut from it.
 CUT: Final = (needs.EVERY_IMAGE,)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
-StartMethod = Literal["fork", "spawn", "forkserver"]
 
 
 @dataclass(frozen=True)
@@ -52,46 +49,6 @@ class WindowPosition:
     num_steps: int
     action_kind: ActionKind = "measured"
     from_command: bool = False
-
-
-@runtime_checkable
-class TrainingEpisode(DomainEpisode, Protocol):
-    """Episode that windows are cut from, in memory or on disk."""
-
-    @property
-    def episode_id(self) -> str:
-        """Id of the episode in its store."""
-        ...
-
-    @property
-    def scene(self) -> str:
-        """Name of its scene, from `dextouch.episodes.scene_of`."""
-        ...
-
-    @property
-    def model_rate_hz(self) -> float:
-        """Rate of the steps."""
-        ...
-
-    @property
-    def action_kinds(self) -> tuple[ActionKind, ...]:
-        """Available kinds of actions."""
-        ...
-
-    def fingerprint(self) -> str:
-        """`fingerprint` of its arrays."""
-        ...
-
-    def __len__(self) -> int:
-        """Number of steps."""
-        ...
-
-    def cut(self, place: WindowPosition) -> "Window":
-        """Cut the window at a place in this episode."""
-        ...
-
-
-E = TypeVar("E", bound=TrainingEpisode)
 
 
 @dataclass(frozen=True)
@@ -240,94 +197,6 @@ def stack_windows(windows: Sequence[Window]) -> WindowBatch:
     )
 
 
-class WindowSampler:
-    """Samples windows uniformly over starts, and over the episodes of each domain.
-
-    Args:
-        episodes: at least one, each at least `max_steps` long.
-        rng: source of all randomness.
-        commanded_fraction: share of commanded windows, from episodes with commanded actions.
-        chained_fraction: share of commanded windows that are anchored like a later chunk.
-        human_share: share of windows from human episodes, if there are human and robot ones; None:
-            every episode is equally likely.
-    """
-
-    def __init__(
-        self,
-        episodes: Sequence[TrainingEpisode],
-        rng: np.random.Generator,
-        *,
-        max_steps: int,
-        commanded_fraction: float = 0.5,
-        chained_fraction: float = 0.3,
-        human_share: float | None = None,
-    ) -> None:
-        short = [e.episode_id for e in episodes if len(e) < max_steps]
-        if not episodes or short:
-            raise InvalidInputError(
-                f"training episodes: got {len(episodes)}, of which {len(short)} are shorter than "
-                f"{max_steps} steps {short[:3]}; expected at least one and none too short"
-            )
-        self._episodes = list(episodes)
-        self._rng = rng
-        self._commanded_fraction = commanded_fraction
-        self._chained_fraction = chained_fraction
-        of: dict[Domain, list[int]] = {"human": [], "robot": []}
-        for index, episode in enumerate(episodes):
-            of[episode.domain].append(index)
-        self._human, self._robot = of["human"], of["robot"]
-        self._human_share = human_share if self._human and self._robot else None
-
-    def draw(self, batch: int, num_steps: int) -> WindowBatch:
-        """A batch of random windows."""
-        return self.cut(self.places(batch, num_steps))
-
-    def places(self, batch: int, num_steps: int) -> list[WindowPosition]:
-        """Places of the windows of the next batch."""
-        return [self._place(num_steps) for _ in range(batch)]
-
-    def cut(self, places: Sequence[WindowPosition]) -> WindowBatch:
-        """The windows at these places."""
-        return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
-
-    def _episode_index(self) -> int:
-        if self._human_share is None:
-            return int(self._rng.integers(len(self._episodes)))
-        is_human = self._rng.random() < self._human_share
-        chosen = self._human if is_human else self._robot
-        return chosen[int(self._rng.integers(len(chosen)))]
-
-    def _place(self, num_steps: int) -> WindowPosition:
-        index = self._episode_index()
-        episode = self._episodes[index]
-        start = int(self._rng.integers(len(episode) - num_steps + 1))
-        is_commanded = self._rng.random() < self._commanded_fraction
-        is_chained = bool(self._rng.random() < self._chained_fraction)
-        if not is_commanded or "commanded" not in episode.action_kinds:
-            return WindowPosition(index, start, num_steps)
-        return WindowPosition(
-            index, start, num_steps, action_kind="commanded", from_command=is_chained
-        )
-
-
-def load_episodes(
-    url: str,
-    *,
-    splits: Collection[Split] = (),
-    domain: Domain | None = None,
-    image_px: int | None = None,
-) -> list[EpisodeArrays]:
-    """Episodes of a store, read once into memory: those of the given splits and domain.
-
-    The middle square of images that are larger than `image_px` is scaled to it.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
-    """
-    readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
-    return [read_episode(reader, image_px=image_px) for reader in readers]
-
-
 def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> EpisodeArrays:
     """Read a whole episode.
 
@@ -429,6 +298,99 @@ class StoredEpisode:
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
 
 
+# An episode that windows are cut from.
+TrainingEpisode: TypeAlias = EpisodeArrays | StoredEpisode
+E = TypeVar("E", bound=TrainingEpisode)
+
+
+class WindowSampler:
+    """Samples windows uniformly over starts, and over the episodes of each domain.
+
+    Args:
+        episodes: at least one, each at least `max_steps` long.
+        rng: source of all randomness.
+        commanded_fraction: share of commanded windows, from episodes with commanded actions.
+        chained_fraction: share of commanded windows that are anchored like a later chunk.
+        human_share: share of windows from human episodes, if there are human and robot ones; None:
+            every episode is equally likely.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[TrainingEpisode],
+        rng: np.random.Generator,
+        *,
+        max_steps: int,
+        commanded_fraction: float = 0.5,
+        chained_fraction: float = 0.3,
+        human_share: float | None = None,
+    ) -> None:
+        short = [e.episode_id for e in episodes if len(e) < max_steps]
+        if not episodes or short:
+            raise InvalidInputError(
+                f"training episodes: got {len(episodes)}, of which {len(short)} are shorter than "
+                f"{max_steps} steps {short[:3]}; expected at least one and none too short"
+            )
+        self._episodes = list(episodes)
+        self._rng = rng
+        self._commanded_fraction = commanded_fraction
+        self._chained_fraction = chained_fraction
+        of: dict[Domain, list[int]] = {"human": [], "robot": []}
+        for index, episode in enumerate(episodes):
+            of[episode.domain].append(index)
+        self._human, self._robot = of["human"], of["robot"]
+        self._human_share = human_share if self._human and self._robot else None
+
+    def draw(self, batch: int, num_steps: int) -> WindowBatch:
+        """A batch of random windows."""
+        return self.cut(self.places(batch, num_steps))
+
+    def places(self, batch: int, num_steps: int) -> list[WindowPosition]:
+        """Places of the windows of the next batch."""
+        return [self._place(num_steps) for _ in range(batch)]
+
+    def cut(self, places: Sequence[WindowPosition]) -> WindowBatch:
+        """The windows at these places."""
+        return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
+
+    def _episode_index(self) -> int:
+        if self._human_share is None:
+            return int(self._rng.integers(len(self._episodes)))
+        is_human = self._rng.random() < self._human_share
+        chosen = self._human if is_human else self._robot
+        return chosen[int(self._rng.integers(len(chosen)))]
+
+    def _place(self, num_steps: int) -> WindowPosition:
+        index = self._episode_index()
+        episode = self._episodes[index]
+        start = int(self._rng.integers(len(episode) - num_steps + 1))
+        is_commanded = self._rng.random() < self._commanded_fraction
+        is_chained = bool(self._rng.random() < self._chained_fraction)
+        if not is_commanded or "commanded" not in episode.action_kinds:
+            return WindowPosition(index, start, num_steps)
+        return WindowPosition(
+            index, start, num_steps, action_kind="commanded", from_command=is_chained
+        )
+
+
+def load_episodes(
+    url: str,
+    *,
+    splits: Collection[Split] = (),
+    domain: Domain | None = None,
+    image_px: int | None = None,
+) -> list[EpisodeArrays]:
+    """Episodes of a store, read once into memory: those of the given splits and domain.
+
+    The middle square of images that are larger than `image_px` is scaled to it.
+
+    Raises:
+        NotFoundError, ConflictError: as `select_episodes`.
+    """
+    readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
+    return [read_episode(reader, image_px=image_px) for reader in readers]
+
+
 def index_episodes(
     url: str,
     *,
@@ -476,7 +438,6 @@ def read_batches(
     places: Iterable[list[WindowPosition]],
     *,
     num_workers: int = 0,
-    start_method: StartMethod | None = None,
 ) -> Generator[WindowBatch, None, None]:
     """Batches at these places, in order, independent of the number of processes.
 
@@ -484,19 +445,13 @@ def read_batches(
         episodes: episodes that the places refer to.
         places: places of each batch; may be endless and is read ahead.
         num_workers: reader processes, which end with the iterator; 0 reads in this process.
-        start_method: start method of the processes; None for the platform's default.
     """
     loader = DataLoader(
         _Windows(episodes),
         batch_sampler=places,
         collate_fn=stack_windows,
         num_workers=num_workers,
-        multiprocessing_context=_context(start_method) if num_workers else None,
         # Its own generator: otherwise the loader seeds its workers from the global one.
         generator=torch.Generator().manual_seed(0),
     )
     yield from loader
-
-
-def _context(start_method: StartMethod | None) -> multiprocessing.context.BaseContext:
-    return multiprocessing.get_context(start_method)

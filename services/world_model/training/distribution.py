@@ -38,24 +38,18 @@ class Processes:
         """Whether this process writes files and reports progress."""
         return self.rank == 0
 
-    def check_batch(self, batch: int) -> None:
-        """Refuse a batch that cannot be divided.
+    def check(self, batch: int, device: str) -> None:
+        """Refuse a batch that cannot be divided, and a device that several cannot share yet.
 
         Raises:
-            InvalidInputError: not a multiple of the number of processes.
+            InvalidInputError: not a multiple of the number of processes, or several processes on
+                another device than the processor.
         """
         if batch % self.count:
             raise InvalidInputError(
                 f"training: got batches of {batch} windows for {self.count} processes, expected a "
                 "multiple; change --optimizer.batch or --nproc-per-node"
             )
-
-    def check_device(self, device: str) -> None:
-        """Refuse a device that several processes cannot share yet.
-
-        Raises:
-            InvalidInputError: several processes on another device than the processor.
-        """
         if self.mesh is not None and device != "cpu":
             raise InvalidInputError(
                 f"training: got {self.count} processes on {device}, expected cpu; several "

@@ -7,35 +7,17 @@ used here.
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TypeAlias, TypeVar
 
-from dextouch.episodes import data_hash
+from dextouch.episodes import EpisodeGrid, data_hash
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import TrainingSet
 from services.world_model.settings import DataSettings
+from services.world_model.training.dataset import TrainingEpisode
 
-
-@runtime_checkable
-class DomainEpisode(Protocol):
-    """An episode of either form of the world model."""
-
-    @property
-    def task(self) -> str:
-        """Name of the task."""
-        ...
-
-    @property
-    def domain(self) -> Domain:
-        """Whose hands act."""
-        ...
-
-    @property
-    def content_sha256(self) -> str:
-        """Digest of all that its store holds of it."""
-        ...
-
-
+# An episode of either form of the world model.
+DomainEpisode: TypeAlias = EpisodeGrid | TrainingEpisode
 E = TypeVar("E", bound=DomainEpisode)
 
 

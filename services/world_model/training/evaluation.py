@@ -1,7 +1,8 @@
 """Errors of a model on held-out episodes, compared with simple baselines."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,13 +19,14 @@ from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.training.dataset import (
     EpisodeArrays,
+    TrainingEpisode,
     Window,
     cut_window,
-    fingerprint,
     stack_windows,
 )
 
 BATCH = 24
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,6 @@ def evaluate_prediction(
     train_fingerprints: Sequence[str],
     stride: int = 8,
     action_kind: ActionKind = "commanded",
-    seed: int = 0,
 ) -> dict[str, float]:
     """Errors over every window that starts at a multiple of `stride`.
 
@@ -52,7 +53,6 @@ def evaluate_prediction(
         train_fingerprints: fingerprints of the training episodes, from the checkpoint.
         stride: steps between window starts.
         action_kind: kind of actions given; episodes without it give their measured ones.
-        seed: seed of the noise.
 
     Returns:
         psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
@@ -70,7 +70,7 @@ def evaluate_prediction(
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
     """
-    refuse_trained(episodes, train_fingerprints)
+    refuse_trained(episodes, train_fingerprints, "the model")
     places = [
         (episode, start)
         for episode in episodes
@@ -84,13 +84,15 @@ def evaluate_prediction(
     windows = [
         _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
     ]
-    truth = _truth(windows)
+    truth = Futures(
+        np.stack([w.images[1:] for w in windows]), np.stack([w.tactile_kpa[1:] for w in windows])
+    )
     first = Futures(
         np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
         np.stack([w.tactile_kpa[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
     )
     requests = [window.request for window in windows]
-    figures = _figures(predict_all(model, requests, seed=seed), truth, "")
+    figures = _figures(predict_all(model, requests), truth, "")
     figures |= _figures(first, truth, "_copy")
     figures |= _figures(_through_codec(model, windows), truth, "_codec")
     figures["tactile_mse_zero"] = tactile_metrics.mse(
@@ -99,50 +101,59 @@ def evaluate_prediction(
     others = _actions_of_other_takes(places, requests, action_kind)
     if others:
         kept = [index for index, _ in others]
-        wrong = predict_all(model, [request for _, request in others], seed=seed)
-        figures |= _figures(wrong, _at(truth, kept), "_other_take")
+        wrong = predict_all(model, [request for _, request in others])
+        right = Futures(truth.images[kept], truth.tactile_kpa[kept])
+        figures |= _figures(wrong, right, "_other_take")
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
         still = [_standing_still(request, head_moves=head_moves) for request in requests]
-        figures |= _figures(predict_all(model, still, seed=seed), truth, suffix)
+        figures |= _figures(predict_all(model, still), truth, suffix)
     if not model.config.use_touch:
         figures = {name: value for name, value in figures.items() if name.startswith("psnr")}
     return {**figures, "num_windows": float(len(windows))}
 
 
-def refuse_trained(episodes: Sequence[EpisodeArrays], train_fingerprints: Sequence[str]) -> None:
-    """Raise if any episode was trained on, by the hash of its content."""
+def refuse_trained(
+    episodes: Sequence[TrainingEpisode], train_fingerprints: Collection[str], model: str
+) -> None:
+    """Raise if a model was trained on any of the episodes, by the hash of their content."""
     trained = set(train_fingerprints)
-    seen = [episode.episode_id for episode in episodes if fingerprint(episode) in trained]
+    seen = [episode.episode_id for episode in episodes if episode.fingerprint() in trained]
     if seen:
         raise InvalidInputError(
-            f"evaluation: the model was trained on {len(seen)} of the episodes {seen[:3]}, "
-            "expected held-out ones",
+            f"evaluation: {model} was trained on {len(seen)} of the held-out episodes {seen[:3]}, "
+            "expected others; use a held-out store that it has not seen",
             episodes=seen,
         )
 
 
-def predict_all(
-    model: JointWorldModel, requests: Sequence[PredictionRequest], *, seed: int
-) -> Futures:
+def predict_all(model: JointWorldModel, requests: Sequence[PredictionRequest]) -> Futures:
     """One sample per request, in batches; the noise of request i is seeded by i."""
-    images, touches = [], []
-    batch = _batch_of(model)
-    for begin in range(0, len(requests), batch):
-        part = requests[begin : begin + batch]
+
+    def predicted(part: Sequence[PredictionRequest], begin: int) -> tuple[Tensor, Tensor]:
         inputs = build_inputs(part, model.config)
         noises = [
-            model.noise(inputs.num_steps, torch.Generator().manual_seed(seed + begin + index))
+            model.noise(inputs.num_steps, torch.Generator().manual_seed(begin + index))
             for index in range(len(part))
         ]
         future = model.predict(inputs, stack_noise(noises))
-        images.append(to_uint8(future.images).cpu().numpy())
-        touches.append(future.tactile_kpa.cpu().numpy())
-    return Futures(np.concatenate(images), np.concatenate(touches))
+        return future.images, future.tactile_kpa
+
+    return _in_batches(model, requests, predicted)
 
 
-def _batch_of(model: JointWorldModel) -> int:
-    """Windows at a time; the autoencoder of the full size takes gigabytes for each."""
-    return BATCH if model.config.wan is None else 1
+def _in_batches(
+    model: JointWorldModel,
+    items: Sequence[Item],
+    futures_of: Callable[[Sequence[Item], int], tuple[Tensor, Tensor]],
+) -> Futures:
+    """Images and touch of parts of the items, each given with the index that it begins at."""
+    # The autoencoder of the full size takes gigabytes for each window.
+    size = BATCH if model.config.wan is None else 1
+    parts = [futures_of(items[begin : begin + size], begin) for begin in range(0, len(items), size)]
+    return Futures(
+        np.concatenate([to_uint8(images).cpu().numpy() for images, _ in parts]),
+        np.concatenate([tactile_kpa.cpu().numpy() for _, tactile_kpa in parts]),
+    )
 
 
 def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
@@ -150,27 +161,15 @@ def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -
     return cut_window(episode, start, num_steps, action_kind=available)
 
 
-def _truth(windows: Sequence[Window]) -> Futures:
-    return Futures(
-        np.stack([w.images[1:] for w in windows]), np.stack([w.tactile_kpa[1:] for w in windows])
-    )
-
-
-def _at(futures: Futures, kept: list[int]) -> Futures:
-    return Futures(futures.images[kept], futures.tactile_kpa[kept])
-
-
 def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
-    images, touches = [], []
-    size = _batch_of(model)
-    for begin in range(0, len(windows), size):
-        batch = stack_windows(windows[begin : begin + size])
+    def decoded(part: Sequence[Window], _: int) -> tuple[Tensor, Tensor]:
+        batch = stack_windows(part)
         shown, felt = batch.images.to(model.device), batch.tactile_kpa.to(model.device)
-        decoded: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
-        images.append(to_uint8(decoded[:, 1:]).cpu().numpy())
+        images: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
         touch = model.tokenizer.decode(model.tokenizer.encode(felt))
-        touches.append(touch[:, 1:].cpu().numpy())
-    return Futures(np.concatenate(images), np.concatenate(touches))
+        return images[:, 1:], touch[:, 1:]
+
+    return _in_batches(model, windows, decoded)
 
 
 def _actions_of_other_takes(

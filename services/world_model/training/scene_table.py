@@ -11,7 +11,6 @@ from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics.features import (
     FREE_KPA,
@@ -452,19 +451,11 @@ def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
 def _clip(
     episode: EpisodeGrid, steps: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n objects 7"]
 ) -> SceneClip:
-    actions = episode.measured[steps]
-    hands = poses_from_actions(actions, episode.anchor)
-    wrists = (hands.Ts_world_wrist_left, hands.Ts_world_wrist_right)
+    present = np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M
     return SceneClip(
         steps=steps,
         images=episode.images(steps),
-        states=SceneStates(
-            Ts_world_camera=hands.Ts_world_camera_head,
-            Ts_world_wrist=np.stack(wrists, axis=1),
-            joints_rad=np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1),
-            object_poses=poses,
-            object_present=np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M,
-        ),
+        states=SceneStates.of_actions(episode.measured[steps], episode.anchor, poses, present),
         K_head=episode.K_head,
         boxes_m=episode.boxes_m,
     )

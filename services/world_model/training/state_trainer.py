@@ -31,12 +31,7 @@ from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
-from services.world_model.settings import (
-    StateAdaptSettings,
-    StateTrainSettings,
-    flags_of,
-    last_name,
-)
+from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training.core_training import (
     CoreData,
     start_steps,
@@ -129,8 +124,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     is_known = all(bool(table.knows_all(step).all()) for step in start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
-    save_file({**table.tensors(), **_prefixed(codec)}, table_file)
-    horizon_latents = _horizon_latents(table)
+    codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
+    save_file({**table.tensors(), **codec_tensors}, table_file)
+    # Of robots, if there are any.
+    own = table.length[~table.human | table.human.all()]
+    horizon_latents = (int(own.max()) - 1) // STEPS_PER_LATENT
     del table
     work = _Work(settings, config, parts, hashed, reads_starts)
     _train_parts(work)
@@ -193,12 +191,6 @@ def _metadata(
     )
 
 
-def _horizon_latents(table: SceneTable) -> int:
-    """Latent steps of the longest training episode, of robots if there are any."""
-    own = table.length[~table.human | table.human.all()]
-    return (int(own.max()) - 1) // STEPS_PER_LATENT
-
-
 def _unusual_px(settings: StateTrainSettings) -> int | None:
     """Side of the images, for hashes; None if it is the usual one."""
     return None if settings.image_px == USUAL_IMAGE_PX else settings.image_px
@@ -246,15 +238,12 @@ class _Work:
         key = self._key(RENDERER_VERSION, "renderer", "drawing")
         return self.parts / f"renderer-{key}.safetensors"
 
-    @property
-    def _drawn_by(self) -> set[str]:
-        """Settings that decide which episodes are drawn, if people are told from robots."""
-        return {"human_share"} if self.settings.human else set()
-
     def _key(self, version: int, *names: str) -> str:
         """Digest of the data and of the settings that affect the weights."""
+        # Which episodes are drawn depends on the share, if people are told from robots.
+        drawn_by = ["human_share"] if self.settings.human else []
         chosen = self.settings.model_dump_json(
-            include={"seed", "heldout_share", "labelled_share", *names, *self._drawn_by}
+            include={"seed", "heldout_share", "labelled_share", *names, *drawn_by}
         )
         base = "" if self.base is None else f"{self.settings.learn} {self.base.checkpoint.digest}"
         # Which scenes are labelled depends on whether some of them are held out.
@@ -313,10 +302,6 @@ def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> Touc
     else:
         codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())
     return codec
-
-
-def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
-    return {f"codec/{name}": value for name, value in codec.state_dict().items()}
 
 
 def _train_parts(work: _Work) -> None:
@@ -470,14 +455,8 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """Command that repeats a run; stores and the base are given by their last path component."""
-    left_out = {"output", "episodes", "human", "heldout", "init", "clicks", "jobs", "json_path"}
-    given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
-    flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
-    flags += [f"--human={last_name(url)}" for url in settings.human]
-    if settings.heldout is not None:
-        flags.append(f"--heldout={last_name(settings.heldout)}")
-    files = {"init": settings.init, "clicks": settings.clicks}
-    flags += [f"--{name}={path.name}" for name, path in files.items() if path is not None]
+    """Command that repeats a run, as its checkpoint records it."""
     command = "adapt" if isinstance(settings, StateAdaptSettings) else "world-model"
-    return " ".join([f"dextouch train {command}", *flags, *flags_of(given)])
+    places = ("episodes", "human", "heldout", "init", "clicks")
+    left_out = {"output", "jobs", "json_path"}
+    return recorded_command(settings, f"dextouch train {command}", places, left_out)

@@ -5,7 +5,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
-    half_cosine,
+    floored_cosine,
     update_average,
 )
 from services.networks.principal_axes import root_pressure
@@ -44,7 +43,6 @@ from services.world_model.network.tactile import LearnedTokenizer, TactileTokeni
 from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
 
-MIN_LEARNING_RATE_SHARE = 0.01
 _EVALUATION_BATCH = 1000
 _TIMING_ROUNDS = 5
 OnEvaluation = Callable[[float, Reconstruction], None]
@@ -185,7 +183,7 @@ def _learn(
         weight_decay=given.weight_decay,
         max_gradient_norm=given.max_gradient_norm,
         warmup_steps=given.warmup_steps,
-        schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+        schedule=floored_cosine,
     )
 
     def loss() -> Tensor:

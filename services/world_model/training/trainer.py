@@ -5,12 +5,11 @@ import json
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from pydantic import JsonValue
 from torch import Tensor
 
 from dextouch.episodes import data_hash, split_by_scene
@@ -20,7 +19,7 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
-    half_cosine,
+    floored_cosine,
     update_average,
 )
 from services.networks.weight_files import on_device
@@ -42,6 +41,7 @@ from services.world_model.pretrained_video import initial_model, share_texts
 from services.world_model.training.dataset import (
     E,
     EpisodeArrays,
+    StoredEpisode,
     TrainingEpisode,
     WindowBatch,
     WindowPosition,
@@ -52,7 +52,7 @@ from services.world_model.training.dataset import (
 )
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
 from services.world_model.training.domains import check_tasks, subset_by_hash, training_sets
-from services.world_model.training.evaluation import evaluate_prediction
+from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import LossOptions, losses, own_context
 from services.world_model.training.tokenizer_trainer import (
     check_unseen,
@@ -71,7 +71,6 @@ from services.world_model.training.training_state import (
 )
 
 LOG_EVERY_STEPS = 20
-MIN_LEARNING_RATE_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,7 @@ class TrainingRun:
         settings: TrainSettings,
         processes: Processes = ALONE,
     ) -> None:
-        processes.check_batch(settings.optimizer.batch)
-        processes.check_device(settings.device)
+        processes.check(settings.optimizer.batch, settings.device)
         self.settings = settings
         self.episodes = episodes
         self.processes = processes
@@ -134,7 +132,7 @@ class TrainingRun:
             weight_decay=settings.optimizer.weight_decay,
             max_gradient_norm=settings.optimizer.max_gradient_norm,
             warmup_steps=settings.optimizer.warmup_steps,
-            schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+            schedule=floored_cosine,
             betas=(0.9, 0.95),
         )
         self.loop = OptimizerLoop(self.model, options, self.budget)
@@ -203,23 +201,24 @@ class TrainingRun:
         share_texts(self.model, model)
         return model
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def state(self, identity: dict[str, JsonValue]) -> TrainingState:
         """Tensors and metadata that the next steps depend on."""
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
         tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
         tensors |= optimizer_tensors(self.loop.optimizer)
         tensors["generator"] = self._generator.get_state()
-        facts = {
-            "step": self.budget.step,
-            "cpu_s": self.budget.cpu_s,
-            "window_numbers": self._window_numbers,
-            "log": tuple(astuple(entry) for entry in self.log),
-        }
-        return tensors, facts
+        facts = RunFacts(
+            identity=identity,
+            step=self.budget.step,
+            cpu_s=self.budget.cpu_s,
+            window_numbers=self._window_numbers,
+            log=tuple(astuple(entry) for entry in self.log),
+        )
+        return TrainingState(tensors, facts)
 
     def like_state(self) -> dict[str, Tensor]:
         """Tensors with the names, shapes and sharding of those of a state after a step."""
-        return {**moments_like(self.loop.optimizer), **self.state()[0]}
+        return {**moments_like(self.loop.optimizer), **self.state({}).tensors}
 
     def restore(self, state: TrainingState) -> None:
         """Continue from `state`."""
@@ -362,12 +361,15 @@ def train_on(
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
-    check_tasks((*trained, *heldout), settings, _known_tasks(ancestor))
+    known_tasks: set[str] = set()
+    if ancestor is not None:
+        known_tasks = {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
+    check_tasks((*trained, *heldout), settings, known_tasks)
     prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
         # Episodes that the initial checkpoint was trained on cannot be held out either.
-        check_not_learned(heldout, ancestor)
+        refuse_trained(heldout, ancestor.metadata.train_fingerprints, "the initial checkpoint")
         prints |= set(ancestor.metadata.train_fingerprints)
         names |= set(ancestor.metadata.train_episode_ids)
     run = TrainingRun(trained, settings, processes)
@@ -421,13 +423,6 @@ def train_on(
     )
 
 
-def _known_tasks(ancestor: Checkpoint | None) -> set[str]:
-    """Tasks that a checkpoint and its ancestors were trained on."""
-    if ancestor is None:
-        return set()
-    return {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
-
-
 def _data_hash(
     episodes: Sequence[TrainingEpisode], settings: TrainSettings, ancestor: Checkpoint | None
 ) -> str:
@@ -471,8 +466,7 @@ def _run_or_resume(
     def keep(now: TrainingRun) -> None:
         nonlocal kept_cpu_s
         if now.budget.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
-            tensors, facts = now.state()
-            files.write(TrainingState(tensors, RunFacts(identity=identity, **facts)))
+            files.write(now.state(identity))
             kept_cpu_s = now.budget.cpu_s
 
     return run.run(on_progress, keep)
@@ -502,16 +496,12 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
 def _load_robot(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
     domain: Domain | None = "robot" if settings.human else None
     url, splits, px = settings.episodes, settings.splits, settings.network.image_px
-    if settings.streaming:
-        stored = index_episodes(url, splits=splits, domain=domain, image_px=px)
-        if settings.heldout is not None:
-            return stored, load_episodes(settings.heldout, domain=domain, image_px=px)
-        trained, heldout = _split(stored, settings)
-        return trained, [episode.load() for episode in heldout]
-    episodes = load_episodes(url, splits=splits, domain=domain, image_px=px)
+    read = index_episodes if settings.streaming else load_episodes
+    episodes: Sequence[TrainingEpisode] = read(url, splits=splits, domain=domain, image_px=px)
     if settings.heldout is not None:
         return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
-    return _split(episodes, settings)
+    trained, heldout = _split(episodes, settings)
+    return trained, [one.load() if isinstance(one, StoredEpisode) else one for one in heldout]
 
 
 def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
@@ -530,18 +520,6 @@ def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
         px = settings.network.image_px
         found += read(url, splits=settings.splits, domain="human", image_px=px)
     return subset_by_hash(found, settings.human_episodes, what="human")
-
-
-def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
-    """Raise if the initial checkpoint was trained on a held-out episode."""
-    learned = set(ancestor.metadata.train_fingerprints)
-    both = [episode.episode_id for episode in heldout if episode.fingerprint() in learned]
-    if both:
-        raise InvalidInputError(
-            f"training: the initial checkpoint was trained on {len(both)} of the held-out "
-            f"episodes {both[:3]}; use a held-out store that it has not seen",
-            episodes=both,
-        )
 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:

@@ -1,7 +1,7 @@
 """A world that always computes batches of one size, so that results are equal bit for bit."""
 
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,7 +14,7 @@ State = TypeVar("State")
 _NOTHING = ReturnSelector(cameras=(), steps="last")
 
 
-class FixedBatchWorld(Generic[State]):
+class FixedBatchWorld(BatchWorld[State]):
     """Pads the batches of a world to a fixed size.
 
     Matrix products of another batch size round differently, so that a rollout depends on how many
@@ -36,17 +36,6 @@ class FixedBatchWorld(Generic[State]):
     def reset(self, start: RolloutStart) -> StartedRollout[State]:
         """See World."""
         return self._world.reset(start)
-
-    def step(
-        self,
-        state: State,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[State]:
-        """See World."""
-        return self.step_batch([state], actions[None], seeds=[seed], selectors=[selector])[0]
 
     def step_batch(
         self,

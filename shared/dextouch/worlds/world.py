@@ -121,6 +121,18 @@ class World(Protocol[State]):
 class BatchWorld(World[State], Protocol[State]):
     """A world that advances several rollouts together faster than one by one."""
 
+    def step(
+        self,
+        state: State,
+        actions: Float64[np.ndarray, "steps 67"],
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
+    ) -> SteppedRollout[State]:
+        """`step_batch` of one rollout."""
+        chunks = np.asarray(actions)[None]
+        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
+
     def step_batch(
         self,
         states: Sequence[State],

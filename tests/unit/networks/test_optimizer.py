@@ -13,6 +13,7 @@ from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
     OptimizerOptions,
+    floored_cosine,
     half_cosine,
     update_average,
 )
@@ -100,7 +101,7 @@ def test_gradients_that_are_no_numbers_move_no_weight():
 
 def test_a_schedule_falls_from_one_to_its_least():
     assert [half_cosine(share) for share in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([1, 0.5, 0, 0])
-    assert half_cosine(1.0, least=0.01) == 0.01
+    assert [floored_cosine(share) for share in (0.5, 1.0)] == pytest.approx([0.5, 0.01])
     options = OptimizerOptions(0.2, 0.0, warmup_steps=10, schedule=lambda _: 0.5)
     assert [options.rate(step, 0.0) for step in (0, 4, 9, 50)] == pytest.approx(
         [0.01, 0.05, 0.1, 0.1]

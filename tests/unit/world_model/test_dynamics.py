@@ -36,7 +36,7 @@ from services.world_model.dynamics.model import (
     REST_LATENTS,
     DynamicsModel,
     batched,
-    mean_start,
+    mean_poses,
     memory_arrays,
     memory_from_arrays,
     memory_of,
@@ -449,7 +449,7 @@ def test_members_that_see_nothing_have_no_say_about_the_place(model):
     )
     starts = [dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)]
     memory = dataclasses.replace(begun(model), start=stacked(starts))
-    mean = mean_start(memory)
+    mean = mean_poses(memory.start.objects)
     torch.testing.assert_close(mean.position_m, torch.full((1, MAX_OBJECTS, 3), 0.2))
     torch.testing.assert_close(mean.present, torch.full((1, MAX_OBJECTS), 2 / 3))
 

@@ -1,6 +1,7 @@
 """Windows read from the disk are those cut in memory, in the same order, in any process."""
 
 import json
+import multiprocessing
 from itertools import islice
 
 import numpy as np
@@ -89,9 +90,22 @@ def test_an_indexed_episode_says_what_it_is(stored, in_memory):
         assert fingerprint(ours.load()) == ours.fingerprint()
 
 
-@pytest.mark.parametrize(("num_workers", "start_method"), [(0, None), (2, "fork"), (1, "spawn")])
+@pytest.fixture
+def start_method(request):
+    before = multiprocessing.get_start_method()
+    multiprocessing.set_start_method(request.param, force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
+
+
+@pytest.mark.parametrize(
+    ("num_workers", "start_method"),
+    [(0, "fork"), (2, "fork"), (1, "spawn")],
+    indirect=["start_method"],
+)
+@pytest.mark.usefixtures("start_method")
 @pytest.mark.slow
-def test_batches_are_the_same_in_any_process(stored, in_memory, num_workers, start_method):
+def test_batches_are_the_same_in_any_process(stored, in_memory, num_workers):
     def sampler(episodes):
         return WindowSampler(episodes, np.random.default_rng(3), max_steps=17)
 
@@ -99,7 +113,7 @@ def test_batches_are_the_same_in_any_process(stored, in_memory, num_workers, sta
     memory, streamed = sampler(in_memory), sampler(stored)
     expected = [memory.draw(4, n) for n in lengths]
     places = [streamed.places(4, n) for n in lengths]
-    got = read_batches(stored, places, num_workers=num_workers, start_method=start_method)
+    got = read_batches(stored, places, num_workers=num_workers)
     for ours, theirs in zip(got, expected, strict=True):
         assert_same_batch(ours, theirs)
 

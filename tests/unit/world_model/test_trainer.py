@@ -126,9 +126,9 @@ def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
 def test_false_actions_are_of_the_same_moment(tiny_model, heldout, monkeypatch):
     asked = []
 
-    def remember(model, requests, *, seed):
+    def remember(model, requests):
         asked.append(requests)
-        return predict_all(model, requests, seed=seed)
+        return predict_all(model, requests)
 
     monkeypatch.setattr(evaluation, "predict_all", remember)
     evaluate_prediction(tiny_model, heldout, train_fingerprints=(), stride=8)

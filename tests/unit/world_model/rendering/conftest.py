@@ -8,9 +8,15 @@ import pytest
 from dextouch.geometry import transform
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import Scenes
-from services.world_model.rendering.rasters import SceneState, SceneStates
 from services.world_model.rendering.training import SceneClip
-from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted
+from tests.unit.world_model.rendering.scene_by_hand import (
+    BOXES_M,
+    DOWN,
+    K,
+    SceneState,
+    shifted,
+    stacked,
+)
 
 
 @pytest.fixture
@@ -33,7 +39,7 @@ def image() -> np.ndarray:
 
 @pytest.fixture
 def scenes(image, still) -> Scenes:
-    return Scenes(image[None], K[None], SceneStates.stack([still]), BOXES_M[None])
+    return Scenes(image[None], K[None], stacked(still), BOXES_M[None])
 
 
 @pytest.fixture
@@ -58,7 +64,5 @@ def clips(still) -> list[SceneClip]:
             picture[np.outer(rows, columns)] = [200, 30, 30]
             states.append(replace(state, object_present=np.array([True, False])))
             images.append(picture)
-        made.append(
-            SceneClip(np.arange(5) * 4, np.stack(images), SceneStates.stack(states), K, BOXES_M)
-        )
+        made.append(SceneClip(np.arange(5) * 4, np.stack(images), stacked(*states), K, BOXES_M))
     return made

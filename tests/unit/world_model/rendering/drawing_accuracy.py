@@ -16,7 +16,7 @@ from benchmarks.evaluator.measuring import sharpness
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.schemas import CHUNK_STEPS
-from services.world_model.rendering.inputs import Scenes, drawing_inputs
+from services.world_model.rendering.inputs import PreparedScenes, Scenes, drawing_inputs
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.training import SceneClip, gather
@@ -70,7 +70,7 @@ def evaluate_drawing(
     for number, clip in enumerate(clips):
         given = clip.states if states_of is None else states_of(number, clip)
         later = np.arange(1, len(clip))
-        scenes, _ = gather(clips, np.array([[number, 0]]))
+        scenes = gather(clips, np.array([[number, 0]]))
         for rows in np.split(later, range(_BATCH, len(later), _BATCH)):
             sums.num_images += len(rows)
             chunks = (clip.steps[rows] - clip.steps[0] - 1) // chunk_steps
@@ -119,9 +119,10 @@ def _drawn(
     """Warped and drawn images, and the true regions of objects."""
     owner = np.zeros(len(true), dtype=np.int64)
     with torch.inference_mode():
-        inputs = drawing_inputs(scenes, given, owner, network.config)
+        prepared = PreparedScenes.of(scenes)
+        inputs = drawing_inputs(prepared, given, owner, network.config)
         images = {"warp": inputs.fine[:, :3], "drawn": network(inputs)}
-        shown = inputs if given is true else drawing_inputs(scenes, true, owner, network.config)
+        shown = inputs if given is true else drawing_inputs(prepared, true, owner, network.config)
     rounded = {
         method: (planes * 255.0).round().clamp(0, 255).permute(0, 2, 3, 1).numpy()
         for method, planes in images.items()

@@ -10,7 +10,6 @@ from services.world_model.rendering.inputs import grown
 from services.world_model.rendering.rasters import (
     BoxHits,
     HandPoints,
-    SceneStates,
     base_points_world,
     cast_boxes,
     colours_at_positions,
@@ -19,7 +18,7 @@ from services.world_model.rendering.rasters import (
     project_hands,
     splat_hands,
 )
-from tests.unit.world_model.rendering.scene_by_hand import K
+from tests.unit.world_model.rendering.scene_by_hand import K, stacked
 
 SHAPE = (64, 64)
 
@@ -127,7 +126,7 @@ def test_the_nearer_splat_gives_the_colour():
 
 
 def test_bones_end_where_the_pinhole_puts_their_joints(still):
-    states = SceneStates.stack([still])
+    states = stacked(still)
     base = base_points_world(states)
     # The camera looks down from 0.6 m: a world point (x, y, z) is at f x / (0.6 - z).
     points = project_hands(base, K[None], states.Ts_world_camera, middle_only=True)
@@ -147,7 +146,7 @@ def test_bones_end_where_the_pinhole_puts_their_joints(still):
 
 
 def test_hands_behind_the_camera_leave_nothing(still):
-    states = SceneStates.stack([still])
+    states = stacked(still)
     up = states.Ts_world_camera @ transform(
         rotation_from_vector(np.array([np.pi, 0, 0])), np.zeros(3)
     )

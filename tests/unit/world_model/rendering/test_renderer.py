@@ -12,14 +12,23 @@ from dextouch.geometry.rotations import rotation_from_vector
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     CameraMotion,
+    PreparedScenes,
     Scenes,
     drawing_inputs,
     sample_images,
 )
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.rasters import SceneState, SceneStates
 from services.world_model.rendering.renderer import Renderer
-from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted, turned
+from tests.unit.world_model.rendering.scene_by_hand import (
+    BOXES_M,
+    DOWN,
+    K,
+    SceneState,
+    draw,
+    shifted,
+    stacked,
+    turned,
+)
 
 
 def network(config: RendererConfig) -> RendererNetwork:
@@ -38,22 +47,22 @@ def renderer(small) -> Renderer:
 
 
 def test_nothing_that_moves_gives_the_start_image(renderer, image, still):
-    drawn = renderer.draw(image, K, still, [still, still], BOXES_M)
+    drawn = draw(renderer, image, K, still, [still, still], BOXES_M)
     assert (drawn == image).all()
 
 
 def test_skipping_the_network_changes_no_bit(small, image, still):
     states = [still, shifted(still, objects_m=(0.03, 0.0, 0.0)), still]
     renderer = Renderer(network(small))
-    skipped = renderer.draw(image, K, still, states, BOXES_M)
+    skipped = draw(renderer, image, K, still, states, BOXES_M)
     renderer._drawn = renderer._network
-    np.testing.assert_array_equal(renderer.draw(image, K, still, states, BOXES_M), skipped)
+    np.testing.assert_array_equal(draw(renderer, image, K, still, states, BOXES_M), skipped)
 
 
 def test_far_from_what_moved_the_image_is_the_start(renderer, image, still):
     poses = still.object_poses.copy()
     poses[0, 0] += 0.03
-    drawn = renderer.draw(image, K, still, [replace(still, object_poses=poses)], BOXES_M)[0]
+    drawn = draw(renderer, image, K, still, [replace(still, object_poses=poses)], BOXES_M)[0]
     changed = np.argwhere((drawn != image).any(axis=-1))
     # The box lies at x 2 … 11 cm and y 6 … 10 cm, 58 cm away, before or after; 4 px around it.
     focal = K[0, 0] / 0.58
@@ -70,7 +79,7 @@ def test_without_redrawing_the_table_only_bodies_change_under_a_moving_camera(im
     hidden = transform(DOWN, np.array([0.0, 0.0, 5.0]))
     bare = replace(bare, Ts_world_wrist=np.stack([hidden, hidden]))
     moved = shifted(bare, camera_m=(0.004, 0.0, 0.0))
-    drawn = Renderer(network(config)).draw(image, K, bare, [moved], BOXES_M)[0]
+    drawn = draw(Renderer(network(config)), image, K, bare, [moved], BOXES_M)[0]
     positions = CameraMotion.between(
         K[None], bare.T_world_camera[None], moved.T_world_camera[None]
     ).image_positions((64, 64))
@@ -92,8 +101,10 @@ def test_an_object_is_drawn_that_was_there_at_the_start_and_still_is(
     first, then = (
         replace(still, object_present=np.array([present, False])) for present in (at_start, now)
     )
-    scenes = Scenes(image[None], K[None], SceneStates.stack([first]), BOXES_M[None])
-    drawn = drawing_inputs(scenes, SceneStates.stack([then]), np.zeros(1, dtype=np.int64), small)
+    scenes = Scenes(image[None], K[None], stacked(first), BOXES_M[None])
+    drawn = drawing_inputs(
+        PreparedScenes.of(scenes), stacked(then), np.zeros(1, dtype=np.int64), small
+    )
     # Three channels of the warped start image, then those of the objects.
     assert bool(drawn.fine[:, 3:6].any()) == is_drawn
 
@@ -103,9 +114,9 @@ def test_the_table_is_redrawn_as_the_camera_moves_if_it_may_be(image, still, red
     """By 1 mm of 60 cm: a tenth of a pixel or so. The box moves, too."""
     config = RendererConfig(widths=(8, 16), depths=(1, 1), redraws_table=redraws_table)
     moved = shifted(still, camera_m=(0.001, 0.0, 0.0), objects_m=(0.03, 0.0, 0.0))
-    scenes = Scenes(image[None], K[None], SceneStates.stack([still]), BOXES_M[None])
-    states, owner = SceneStates.stack([moved]), np.zeros(1, dtype=np.int64)
-    change = drawing_inputs(scenes, states, owner, config).change[0, 0]
+    scenes = Scenes(image[None], K[None], stacked(still), BOXES_M[None])
+    states, owner = stacked(moved), np.zeros(1, dtype=np.int64)
+    change = drawing_inputs(PreparedScenes.of(scenes), states, owner, config).change[0, 0]
     # A shift of focal length / 600, of a quarter of a pixel that counts as all.
     share = K[0, 0] / 600 / 0.25
     assert change.max() == 1.0
@@ -122,10 +133,10 @@ def test_alone_or_in_company_an_image_is_the_same(small, image, still, uses_bflo
         for _ in range(9)
     ]
     renderer = Renderer(network(small), uses_bfloat16=uses_bfloat16)
-    together = renderer.draw(image, K, still, states, BOXES_M).astype(int)
-    alone = [renderer.draw(image, K, still, [state], BOXES_M)[0] for state in states]
+    together = draw(renderer, image, K, still, states, BOXES_M).astype(int)
+    alone = [draw(renderer, image, K, still, [state], BOXES_M)[0] for state in states]
     assert np.abs(together - np.stack(alone)).max() <= 1
-    again = renderer.draw(image, K, still, states, BOXES_M)
+    again = draw(renderer, image, K, still, states, BOXES_M)
     np.testing.assert_array_equal(again, together)
 
 
@@ -139,8 +150,8 @@ def test_a_trace_of_single_images_gives_the_same_bytes(small, image, still, uses
         # The first calls of a renderer are not traced.
         expected = Renderer(network(small), uses_bfloat16=uses_bfloat16)
         np.testing.assert_array_equal(
-            renderer.draw(image, K, still, [moved], BOXES_M),
-            expected.draw(image, K, still, [moved], BOXES_M),
+            draw(renderer, image, K, still, [moved], BOXES_M),
+            draw(expected, image, K, still, [moved], BOXES_M),
         )
     assert renderer._paint._traces
 
@@ -154,14 +165,14 @@ def test_an_empty_slot_changes_nothing(renderer, image, still):
 
     boxes = np.concatenate([BOXES_M, np.zeros((1, 6))])
     np.testing.assert_array_equal(
-        renderer.draw(image, K, with_slot(still), [with_slot(moved)], boxes),
-        renderer.draw(image, K, still, [moved], BOXES_M),
+        draw(renderer, image, K, with_slot(still), [with_slot(moved)], boxes),
+        draw(renderer, image, K, still, [moved], BOXES_M),
     )
 
 
 def test_a_scene_without_slots_is_drawn(renderer, image, still):
     bare = replace(still, object_poses=np.zeros((0, 7)), object_present=np.zeros(0, dtype=bool))
-    drawn = renderer.draw(image, K, bare, [turned(bare, (0, 0, 0.1))], np.zeros((0, 6)))
+    drawn = draw(renderer, image, K, bare, [turned(bare, (0, 0, 0.1))], np.zeros((0, 6)))
     assert drawn.shape == (1, 64, 64, 3)
 
 
@@ -172,31 +183,28 @@ def test_wherever_the_camera_is_images_are_drawn(renderer, image, still, place, 
     R = rotation_from_vector(np.array([flip, 0.0, 0.0])) @ DOWN
     lost = replace(still, T_world_camera=transform(R, np.array(place, dtype=float)))
     with np.errstate(all="raise", under="ignore"):
-        renderer.draw(image, K, still, [lost, still], BOXES_M)
-        renderer.draw(image, K, lost, [still, lost], BOXES_M)
-    inputs = np.isfinite(renderer.draw(image, K, lost, [still], BOXES_M * 0.0))
+        draw(renderer, image, K, still, [lost, still], BOXES_M)
+        draw(renderer, image, K, lost, [still, lost], BOXES_M)
+    inputs = np.isfinite(draw(renderer, image, K, lost, [still], BOXES_M * 0.0))
     assert inputs.all()
 
 
 def test_what_cannot_be_drawn_is_refused(renderer, image, still):
     with pytest.raises(ShapeError, match="got none"):
-        renderer.draw(image, K, still, [], BOXES_M)
+        draw(renderer, image, K, still, [], BOXES_M)
     with pytest.raises(ShapeError, match="boxes"):
-        renderer.draw(image, K, still, [still], BOXES_M[:1])
+        draw(renderer, image, K, still, [still], BOXES_M[:1])
     with pytest.raises(ShapeError, match="uint8"):
-        renderer.draw(image[..., :2], K, still, [still], BOXES_M)
+        draw(renderer, image[..., :2], K, still, [still], BOXES_M)
     with pytest.raises(InvalidInputError, match="multiples of 4"):
-        renderer.draw(image[:62], K, still, [still], BOXES_M)
+        draw(renderer, image[:62], K, still, [still], BOXES_M)
     lost = replace(still, joints_rad=np.full((2, 20), np.nan))
     with pytest.raises(NonFiniteError, match="joints_rad"):
-        renderer.draw(image, K, still, [lost], BOXES_M)
+        draw(renderer, image, K, still, [lost], BOXES_M)
     with pytest.raises(NonFiniteError, match="boxes"):
-        renderer.draw(image, K, still, [still], np.full((2, 6), np.nan))
-    fewer = replace(still, object_poses=still.object_poses[:1], object_present=np.array([True]))
-    with pytest.raises(ShapeError, match="slots"):
-        renderer.draw(image, K, still, [fewer], BOXES_M)
+        draw(renderer, image, K, still, [still], np.full((2, 6), np.nan))
 
 
 def test_states_are_taken_by_row(still):
-    states = SceneStates.stack([still, shifted(still, objects_m=(1.0, 0, 0))])
+    states = stacked(still, shifted(still, objects_m=(1.0, 0, 0)))
     assert states.take(np.array([1, 0])).object_poses[0, 0, 0] == states.object_poses[1, 0, 0]

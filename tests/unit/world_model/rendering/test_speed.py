@@ -12,9 +12,16 @@ from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import PreparedScenes
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.renderer import Drawing, Renderer
+from services.world_model.rendering.renderer import Renderer
 from services.world_model.shipped_checkpoints import PRETRAINED
-from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, K, shifted, turned
+from tests.unit.world_model.rendering.scene_by_hand import (
+    BOXES_M,
+    K,
+    draw,
+    drawing,
+    shifted,
+    turned,
+)
 
 
 class PlainNetwork(RendererNetwork):
@@ -85,9 +92,9 @@ def test_images_are_those_of_the_plain_formula(image, still, which, uses_bfloat1
     rows = np.linspace(0, 255, 64)
     smooth = (0.5 * rows[:, None, None] + 0.4 * rows[:, None] + 0.1 * image).astype(np.uint8)
     drawn, expected, exact = (
-        Renderer(one, uses_bfloat16=half)
-        .draw(smooth, K, still, moved_states(still), BOXES_M)
-        .astype(int)
+        draw(
+            Renderer(one, uses_bfloat16=half), smooth, K, still, moved_states(still), BOXES_M
+        ).astype(int)
         for one, half in ((network, uses_bfloat16), (plain, uses_bfloat16), (plain, False))
     )
     assert (expected[1:] != smooth).any(axis=(1, 2, 3)).all()
@@ -108,14 +115,14 @@ def test_a_start_that_is_remembered_draws_the_same_bits(small, image, still):
     other = shifted(still, objects_m=(0.0, 0.02, 0.0))
     brighter = image // 2 + 100
     for start_image, start in ((image, still), (image, still), (brighter, still), (image, other)):
-        expected = Renderer(weights_of(small)).draw(start_image, K, start, states, BOXES_M)
-        assert (remembering.draw(start_image, K, start, states, BOXES_M) == expected).all()
+        expected = draw(Renderer(weights_of(small)), start_image, K, start, states, BOXES_M)
+        assert (draw(remembering, start_image, K, start, states, BOXES_M) == expected).all()
     # Arrays of the caller that change afterwards are another start.
     changing = image.copy()
-    remembering.draw(changing, K, still, states, BOXES_M)
+    draw(remembering, changing, K, still, states, BOXES_M)
     changing[:] = 7
-    expected = Renderer(weights_of(small)).draw(changing, K, still, states, BOXES_M)
-    assert (remembering.draw(changing, K, still, states, BOXES_M) == expected).all()
+    expected = draw(Renderer(weights_of(small)), changing, K, still, states, BOXES_M)
+    assert (draw(remembering, changing, K, still, states, BOXES_M) == expected).all()
 
 
 def one_slot(state):
@@ -131,11 +138,11 @@ def drawings_of(image, still):
     states = moved_states(still)
     few = [one_slot(state) for state in states[4:9]]
     return [
-        Drawing(image, K, still, states[1:], BOXES_M),
-        Drawing(dark, lens, one_slot(still), few, BOXES_M[:1]),
-        Drawing(image, K, states[2], states[5:6], BOXES_M),
-        Drawing(dark, K, still, states * 3, BOXES_M),
-        Drawing(image, K, still, states[3:4], BOXES_M),
+        drawing(image, K, still, states[1:], BOXES_M),
+        drawing(dark, lens, one_slot(still), few, BOXES_M[:1]),
+        drawing(image, K, states[2], states[5:6], BOXES_M),
+        drawing(dark, K, still, states * 3, BOXES_M),
+        drawing(image, K, still, states[3:4], BOXES_M),
     ]
 
 
@@ -147,14 +154,14 @@ def test_rollouts_drawn_together_are_drawn_as_one_at_a_time(small, image, still,
     drawings = drawings_of(image, still)
     together = renderer.draw_all(drawings)
     assert [len(images) for images in together] == [15, 5, 1, 48, 1]
-    for drawing, images in zip(drawings, together, strict=True):
-        (alone,) = renderer.draw_all([drawing])
+    for one, images in zip(drawings, together, strict=True):
+        (alone,) = renderer.draw_all([one])
         assert np.abs(images.astype(int) - alone.astype(int)).max() <= 1
     assert renderer.draw_all([]) == []
 
 
 def test_start_images_of_several_sizes_are_refused(small, image, still):
-    drawings = [Drawing(shown, K, still, [still], BOXES_M) for shown in (image, image[:32])]
+    drawings = [drawing(shown, K, still, [still], BOXES_M) for shown in (image, image[:32])]
     with pytest.raises(ShapeError, match="one size"):
         Renderer(weights_of(small)).draw_all(drawings)
 
@@ -166,16 +173,16 @@ def test_starts_of_several_rollouts_are_remembered_up_to_a_limit(small, image, s
     monkeypatch.setattr(PreparedScenes, "of", lambda scenes: prepared.append(1) or original(scenes))
     renderer = Renderer(weights_of(small))
 
-    def draw(level):
-        renderer.draw(np.full_like(image, level), K, still, [still], BOXES_M)
+    def draw_level(level):
+        draw(renderer, np.full_like(image, level), K, still, [still], BOXES_M)
 
     for level in [*range(64), *range(64)]:
-        draw(level)
+        draw_level(level)
     assert len(prepared) == 64
     for level in (0, 200, 0):
-        draw(level)
+        draw_level(level)
     assert len(prepared) == 65
     # The start that was not used for longest has been dropped.
-    draw(1)
+    draw_level(1)
     assert len(prepared) == 66
     assert len(renderer._starts) == 64

@@ -74,10 +74,10 @@ def test_edges_count_wherever_they_are_in_their_window():
 
 def test_clips_of_other_numbers_of_objects_share_a_batch(clips):
     one = replace(clips[0], boxes_m=clips[0].boxes_m[:1], states=_first_object(clips[0].states))
-    scenes, images = gather([one, clips[1]], np.array([[0, 1], [1, 2]]))
+    scenes = gather([one, clips[1]], np.array([[0, 1], [1, 2]]))
     assert scenes.states.object_present.tolist() == [[True, False], [True, False]]
     assert scenes.boxes_m[0, 1].tolist() == [0.0] * 6
-    np.testing.assert_array_equal(images[1], clips[1].images[2])
+    np.testing.assert_array_equal(scenes.images[1], clips[1].images[2])
 
 
 def _first_object(states):

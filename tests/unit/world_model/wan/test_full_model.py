@@ -15,7 +15,7 @@ from services.world_model.pretrained_video import (
     TRANSFORMER_RULES,
     autoencoder_rules,
     load_pretrained,
-    renamed,
+    original_names,
 )
 from services.world_model.training.dataset import cut_window
 from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
@@ -69,7 +69,7 @@ def test_the_original_layout_gives_the_same_model(
         (autoencoder, autoencoder_rules(full_config.wan.vae_blocks), "Wan2.2_VAE"),
     ):
         tensors = network.state_dict()
-        names = renamed(tensors, rules, to="original")
+        names = original_names(tensors, rules)
         save_file({names[n]: t for n, t in tensors.items()}, tmp_path / f"{stem}.safetensors")
     torch.manual_seed(0)
     other = JointWorldModel(full_config).eval()

@@ -21,7 +21,7 @@ from services.world_model.pretrained_video import (
     autoencoder_rules,
     find_weights,
     load_weights,
-    renamed,
+    original_names,
 )
 
 STEM = "diffusion_pytorch_model"
@@ -38,7 +38,7 @@ def empty(wan_config):
 def _store(folder, network, rules=None):
     tensors = network.state_dict()
     if rules is not None:
-        names = renamed(tensors, rules, to="original")
+        names = original_names(tensors, rules)
         tensors = {names[name]: tensor for name, tensor in tensors.items()}
     folder.mkdir(exist_ok=True)
     save_file(tensors, folder / f"{STEM}.safetensors")
