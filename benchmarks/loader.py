@@ -4,13 +4,13 @@ import argparse
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from benchmarks.figures import Figure, Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data
 from services.twin.take_options import MIXES
@@ -23,20 +23,18 @@ PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
 # Default of `dextouch train world-model --streaming`.
 USUAL_WORKERS = 0
-_QUICK = {"episodes": 4, "rounds": 1, "batches": 2, "fit_windows": 8}
-_USUAL = {"episodes": 200, "rounds": 5, "batches": 40, "fit_windows": 256}
+AMOUNTS = Amounts(
+    usual={"episodes": 200, "rounds": 5, "batches": 40, "fit_windows": 256},
+    quick={"episodes": 4, "rounds": 1, "batches": 2, "fit_windows": 8},
+)
 LEARNING = "training, windows in memory"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument("--store", help="read this store instead of recording twin episodes")
-    parser.add_argument(
-        "--episodes", type=int, help=f"twin episodes to record ({_USUAL['episodes']}; quick 4)"
-    )
-    parser.add_argument("--rounds", type=int, help=f"rounds ({_USUAL['rounds']}; quick 1)")
-    parser.add_argument(
-        "--batches", type=int, help=f"batches per round ({_USUAL['batches']}; quick 2)"
+    AMOUNTS.add_options(
+        parser, episodes="twin episodes to record", rounds="rounds", batches="batches per round"
     )
     parser.add_argument(
         "--workers", default="0,1,2", metavar="A,B", help="worker processes (%(default)s)"
@@ -51,7 +49,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """
     from benchmarks.training_pace import TrainingPace
 
-    plan, workers = _plan(options), _workers(options.workers)
+    plan, workers = AMOUNTS.of(options), _workers(options.workers)
     url = options.store or _make_episodes(folder / "episodes", plan["episodes"])
     with bar("reading the store once", 1):
         pace = TrainingPace(url, fit_windows=plan["fit_windows"])
@@ -119,17 +117,6 @@ def _make_episodes(folder: Path, num_episodes: int) -> str:
     seeds = range(-(-num_episodes // len(tasks)))
     make_training_data(str(folder), seeds, MIXES["demonstrations"], scope=Scope(tasks))
     return str(folder)
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    plan: dict[str, Any] = dict(_QUICK if options.quick else _USUAL)
-    for name in ("episodes", "rounds", "batches"):
-        given = getattr(options, name)
-        plan[name] = plan[name] if given is None else given
-        if plan[name] < 1:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
-    return plan
 
 
 def _workers(text: str) -> list[int]:

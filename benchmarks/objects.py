@@ -17,8 +17,7 @@ from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.object_touch import TouchErrors, touch_errors
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
@@ -32,7 +31,8 @@ from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 
 PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
-FIRST_SEED, NUM_TAKES = 46_000, 4
+FIRST_SEED = 46_000
+AMOUNTS: Final = Amounts(usual={"takes": 4}, quick={"takes": 1})
 # Takes without images are cheap: so many for one with them.
 TAKES_OF_TOUCH: Final = 8
 SIDES_PX: Final = (320, 480)
@@ -51,7 +51,7 @@ Poses = dict[int, Float64[np.ndarray, "4 4"]]
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    parser.add_argument("--takes", type=int, help=f"takes per task ({NUM_TAKES}; quick 1)")
+    AMOUNTS.add_options(parser, takes="takes per task")
     tasks = ",".join(EVALUATED)
     parser.add_argument("--tasks", default=tasks, metavar="A,B", help="(%(default)s)")
 
@@ -86,9 +86,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: no such task.
     """
     del folder
-    count = options.takes if options.takes is not None else 1 if options.quick else NUM_TAKES
-    if count < 1:
-        raise InvalidInputError(f"--takes: got {count}, expected at least 1")
+    count = AMOUNTS.of(options)["takes"]
     tasks = named_tasks(options.tasks.split(","))
     sides_px = SIDES_PX[:1] if options.quick else SIDES_PX
     found: dict[tuple[int, str, str], list[_Found]] = {}

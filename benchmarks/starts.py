@@ -15,9 +15,8 @@ from benchmarks.evaluator.playing import play_in_imagination, play_in_twin, star
 from benchmarks.figures import Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.clients import PolicyStart
-from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
@@ -33,7 +32,8 @@ from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
 PACKAGES: Final = ("numpy", "mujoco", "torch")
-FIRST_SEED, NUM_STARTS = 45_000, 20
+FIRST_SEED = 45_000
+AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 STEPS: Final = (32, 64)
 WIDTHS: Final = (0.8, 1.2)
 _LAST = ReturnSelector(steps="last")
@@ -89,7 +89,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     files = {"--world": default_checkpoint(), "--probe": DEFAULT_PROBE}
     for flag, default in files.items():
         parser.add_argument(flag, type=Path, default=default, help="(%(default)s)")
-    parser.add_argument("--starts", type=int, help=f"starts per task ({NUM_STARTS}; quick 2)")
+    AMOUNTS.add_options(parser, starts="starts per task")
     tasks = ",".join(EVALUATED)
     parser.add_argument("--tasks", default=tasks, metavar="A,B", help="(%(default)s)")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="(%(default)s)")
@@ -113,9 +113,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: no such task.
     """
     del folder
-    count = options.starts if options.starts is not None else 2 if options.quick else NUM_STARTS
-    if count < 1:
-        raise InvalidInputError(f"--starts: got {count}, expected at least 1")
+    count = AMOUNTS.of(options)["starts"]
     tasks = named_tasks(options.tasks.split(","))
     judged = _Judged(options.world, SuccessClassifier.load(options.probe))
     found: dict[str, dict[str, list[_Read]]] = {}

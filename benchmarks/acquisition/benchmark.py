@@ -3,7 +3,6 @@
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from benchmarks.acquisition.acceptance import requirements
 from benchmarks.acquisition.drivers import make_talks, measure_drivers
@@ -15,27 +14,27 @@ from benchmarks.acquisition.tables import panels, tables
 from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 
 LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
 PACKAGES = ("numpy", "pyserial")
-_QUICK = {"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5}
-_USUAL = {"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60}
+AMOUNTS = Amounts(
+    usual={"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60},
+    quick={"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5},
+)
 _NUM_PTY_ROUNDS = 3
 _BLOCKS = 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument(
-        "--packets", type=int, help=f"packets per family ({_USUAL['packets']}; quick 2000)"
+    AMOUNTS.add_options(
+        parser,
+        packets="packets per family",
+        rounds="timing rounds",
+        seconds="length of three runs",
+        splits="random splits",
     )
-    parser.add_argument("--rounds", type=int, help=f"timing rounds ({_USUAL['rounds']}; quick 1)")
-    parser.add_argument(
-        "--seconds", type=float, help=f"length of three runs ({_USUAL['seconds']:g}; quick 1)"
-    )
-    parser.add_argument("--splits", type=int, help=f"random splits ({_USUAL['splits']}; quick 5)")
     parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
 
 
@@ -46,7 +45,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: an invalid number.
     """
     del folder
-    plan = _plan(options)
+    plan = AMOUNTS.of(options, packets=5, seconds=1e-3)
     seed = options.seed
     families = make_families()
     with bar("bad line", len(families) * -(-plan["packets"] // _BLOCKS)) as step:
@@ -106,16 +105,3 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "camera times include the quality checks; one in 10 JPEG images is decoded",
         ],
     )
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    plan: dict[str, Any] = {}
-    for name, default in (_QUICK if options.quick else _USUAL).items():
-        given = getattr(options, name)
-        plan[name] = default if given is None else given
-        if plan[name] <= 0:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected more than 0")
-    if plan["packets"] <= 4:
-        raise InvalidInputError(f"--packets: got {plan['packets']}, expected at least 5")
-    return plan

@@ -73,24 +73,18 @@ def tables(
 
 def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:
     """Time against wrong packets, one panel per family."""
-    found = []
+    drawn = []
     for family in dict.fromkeys(judgement.family for judgement in judgements):
         points = [
-            _point(judgement, speeds[family, judgement.way, WHOLE])
-            for judgement in judgements
-            if judgement.family == family
+            Point.of(
+                found.way,
+                speeds[family, found.way, WHOLE],
+                100 * found.wrong_share,
+                is_ours=found.way == OURS,
+            )
+            for found in judgements
+            if found.family == family
         ]
         title = f"Decoding {family}"
-        found.append(Panel(title, "µs a packet", "wrong packets of those delivered (%)", points))
-    return found
-
-
-def _point(judgement: Judgement, time_us: Figure) -> Point:
-    return Point(
-        label=judgement.way,
-        time=time_us.median,
-        time_low=time_us.low,
-        time_high=time_us.high,
-        error=100 * judgement.wrong_share,
-        is_ours=judgement.way == OURS,
-    )
+        drawn.append(Panel(title, "µs a packet", "wrong packets of those delivered (%)", points))
+    return drawn

@@ -57,22 +57,13 @@ def panels(results: Results) -> list[Panel]:
             f"{title}, take of {results[OURS].take_s:g} s",
             "processor seconds of the alignment",
             what,
-            [_point(result, what) for result in results.values()],
+            [
+                Point.of(name, one.alignment_s, one.errors[what], is_ours=name == OURS)
+                for name, one in results.items()
+            ],
         )
         for title, what in CHARTS.items()
     ]
-
-
-def _point(result: MethodResult, what: str) -> Point:
-    spent = result.alignment_s
-    return Point(
-        result.method,
-        spent.median,
-        spent.low,
-        spent.high,
-        result.errors[what],
-        is_ours=result.method == OURS,
-    )
 
 
 def requirements(results: Results) -> list[Requirement]:

@@ -144,16 +144,8 @@ def _points(results: Sequence[Result]) -> list[Point]:
     points = []
     for way in ways:
         mine = [result for result in results if result.way == way]
-        times = [max(result.us_per_sample.median, _TINY_US) for result in mine]
+        times = Figure.of([max(result.us_per_sample.median, _TINY_US) for result in mine])
         error = max(result.rms_ms.median for result in mine)
-        points.append(
-            Point(
-                label=f"{way}: {error:.2g} ms",
-                time=float(np.median(times)),
-                time_low=min(times),
-                time_high=max(times),
-                error=error,
-                is_ours=way in {OURS_ONLINE, OURS_OFFLINE},
-            )
-        )
+        is_ours = way in {OURS_ONLINE, OURS_OFFLINE}
+        points.append(Point.of(f"{way}: {error:.2g} ms", times, error, is_ours=is_ours))
     return points

@@ -28,7 +28,7 @@ from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.bundled_policies import DEFAULT_POLICY
@@ -38,7 +38,7 @@ from services.twin.tasks import EVALUATED
 
 PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
-_USUAL_STARTS, _QUICK_STARTS = 20, 2
+AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 # Titles of the tables, by their names in `evaluator.json`.
 _ROWS: Final[Mapping[str, tuple[str, Callable[[TaskFigures], list[dict[str, Any]]]]]] = {
     "kinds": ("Mistakes by kind, beside the ladder", TaskFigures.kind_rows),
@@ -115,9 +115,7 @@ def _add_rollouts(parser: argparse.ArgumentParser) -> None:
         help="scripts with position errors and all other policies; none: mistakes only (usual)",
     )
     parser.add_argument("--tasks", nargs="+", default=list(EVALUATED), help="(%(default)s)")
-    parser.add_argument(
-        "--starts", type=int, help=f"starts per task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
-    )
+    AMOUNTS.add_options(parser, starts="starts per task")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="%(default)s")
     parser.add_argument(
         "--cloned",
@@ -287,12 +285,9 @@ def _worlds(options: argparse.Namespace) -> Sequence[Path | None]:
 
 
 def _plan(options: argparse.Namespace) -> StudyPlan:
-    default = _QUICK_STARTS if options.quick else _USUAL_STARTS
-    num_starts = default if options.starts is None else options.starts
-    if num_starts < 1 or options.jobs < 1:
-        raise InvalidInputError(
-            f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
-        )
+    num_starts = AMOUNTS.of(options)["starts"]
+    if options.jobs < 1:
+        raise InvalidInputError(f"--jobs: got {options.jobs}, expected at least 1")
     only_mistakes = options.ladder == NONE
     if only_mistakes and (options.cloned or options.policy):
         raise InvalidInputError(

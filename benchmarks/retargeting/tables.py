@@ -62,14 +62,7 @@ def panels(
 
 def _points(speeds: Sequence[Speed], motion: str, errors: Mapping[str, float]) -> list[Point]:
     return [
-        Point(
-            label=speed.method,
-            time=speed.cpu_us.median,
-            time_low=speed.cpu_us.low,
-            time_high=speed.cpu_us.high,
-            error=errors[speed.method],
-            is_ours=speed.method == OURS,
-        )
+        Point.of(speed.method, speed.cpu_us, errors[speed.method], is_ours=speed.method == OURS)
         for speed in speeds
         if speed.motion == motion and speed.method in errors
     ]

@@ -17,7 +17,7 @@ from benchmarks.rollouts.watcher import listing_s, watched
 from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
 from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
 from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import ChildProcess
@@ -47,19 +47,20 @@ DURABLE: Final = Way("HTTP", "last image, in Redis", LAST, server="durable")
 DEVICES: Final = ("device", "batch device")
 NUM_ROLLOUTS: Final = 32
 NUM_LISTINGS: Final = 101
-USUAL: Final = {"rounds": 15, "chunks": 200, "crowd_chunks": 60, "watched_rollouts": 10_000}
-QUICK: Final = {"rounds": 3, "chunks": 20, "crowd_chunks": 3, "watched_rollouts": 100}
+AMOUNTS: Final = Amounts(
+    usual={"rounds": 15, "chunks": 200, "crowd_chunks": 60, "watched_rollouts": 10_000},
+    quick={"rounds": 3, "chunks": 20, "crowd_chunks": 3, "watched_rollouts": 100},
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument("--rounds", type=int, help="rounds (15; quick 3)")
-    parser.add_argument("--chunks", type=int, help="chunks of each way in a round (200; quick 20)")
-    parser.add_argument(
-        "--crowd-chunks", type=int, help=f"chunks of each of {NUM_ROLLOUTS} rollouts (60; quick 3)"
-    )
-    parser.add_argument(
-        "--watched-rollouts", type=int, help="open rollouts of a listing (10000; quick 100)"
+    AMOUNTS.add_options(
+        parser,
+        rounds="rounds",
+        chunks="chunks of each way in a round",
+        crowd_chunks=f"chunks of each of {NUM_ROLLOUTS} rollouts",
+        watched_rollouts="open rollouts of a listing",
     )
 
 
@@ -70,14 +71,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no round, or more chunks than a rollout may have.
     """
     del folder
-    plan = dict(QUICK if options.quick else USUAL)
-    plan |= {name: value for name in plan if (value := getattr(options, name)) is not None}
-    if plan["rounds"] < 1 or not all(
-        1 <= plan[name] <= MAX_CHUNKS for name in ("chunks", "crowd_chunks")
-    ):
+    plan = AMOUNTS.of(options, watched_rollouts=0)
+    if max(plan["chunks"], plan["crowd_chunks"]) > MAX_CHUNKS:
         raise InvalidInputError(
-            f"got {plan['rounds']} rounds of {plan['chunks']} chunks, expected at least one round "
-            f"and 1 … {MAX_CHUNKS} chunks"
+            f"got rollouts of {plan['chunks']} chunks and of {plan['crowd_chunks']} chunks, "
+            f"expected at most {MAX_CHUNKS}"
         )
     child = ChildProcess("benchmarks.rollouts.server")
     try:

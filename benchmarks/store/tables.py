@@ -96,12 +96,10 @@ def panels(results: Mapping[str, DesignResult]) -> list[Panel]:
 
 def _points(results: Mapping[str, DesignResult], times: Mapping[str, Figure]) -> list[Point]:
     return [
-        Point(
-            label=f"{name}, {_megabytes(result)} MB/min",
-            time=times[name].median,
-            time_low=times[name].low,
-            time_high=times[name].high,
-            error=rms_levels(result.mean_psnr_db),
+        Point.of(
+            f"{name}, {_megabytes(result)} MB/min",
+            times[name],
+            rms_levels(result.mean_psnr_db),
             is_ours=name.startswith("ours"),
         )
         for name, result in results.items()

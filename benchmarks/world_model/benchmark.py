@@ -11,7 +11,7 @@ from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from benchmarks.world_model.held_out import HeldOut, held_out
 from benchmarks.world_model.rollouts import (
     Imagined,
@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
-USUAL: Final = {"rounds": 7, "seeds": 6}
-QUICK: Final = {"rounds": 1, "seeds": 1}
+AMOUNTS: Final = Amounts(usual={"rounds": 7, "seeds": 6}, quick={"rounds": 1, "seeds": 1})
 VARIANTS: Final = (
     *(Variant(steps) for steps in (1, 2, 4, 8)),
     *(Variant(steps, recomputed=True) for steps in (2, 4, 8)),
@@ -67,8 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--state-model", type=Path, help="state model to time (default: the package's own)"
     )
-    parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
-    parser.add_argument("--seeds", type=int, help=f"episodes per task ({USUAL['seeds']}; quick 1)")
+    AMOUNTS.add_options(parser, rounds="rounds", seeds="episodes per task")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -83,7 +81,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     from services.world_model.world import ModelWorld
 
     del folder
-    plan = _plan(options)
+    plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
     variants = {
@@ -210,14 +208,3 @@ def _data(
         "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
         "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
     }
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
-    for name in ("rounds", "seeds"):
-        given = getattr(options, name)
-        plan[name] = plan[name] if given is None else given
-        if plan[name] < 1:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
-    return plan

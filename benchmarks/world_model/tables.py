@@ -123,14 +123,7 @@ def panels(
             "processor ms a chunk",
             label,
             [
-                Point(
-                    label=name,
-                    time=times_ms[name].median,
-                    time_low=times_ms[name].low,
-                    time_high=times_ms[name].high,
-                    error=getattr(error, key),
-                    is_ours=name == served,
-                )
+                Point.of(name, times_ms[name], getattr(error, key), is_ours=name == served)
                 for name, error in errors.items()
             ],
         )

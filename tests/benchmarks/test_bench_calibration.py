@@ -44,7 +44,7 @@ def test_every_method_is_measured_on_every_seed(run):
     assert list(figures["hand_eye"]) == NAMES
     for result in figures["hand_eye"].values():
         for key in ("ms", "error_deg", "error_mm"):
-            assert len(result[key]["values"]) == benchmark.QUICK["seeds"]
+            assert len(result[key]["values"]) == benchmark.AMOUNTS.quick["seeds"]
             assert min(result[key]["values"]) > 0
 
 
