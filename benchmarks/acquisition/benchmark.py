@@ -4,13 +4,12 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.acquisition.acceptance import requirements
 from benchmarks.acquisition.drivers import make_talks, measure_drivers
 from benchmarks.acquisition.families import make_families
 from benchmarks.acquisition.noise import Line, count_split_differences, judge
 from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.speed import measure_speed
-from benchmarks.acquisition.tables import panels, tables
+from benchmarks.acquisition.tables import panels, requirements, tables
 from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport

@@ -4,11 +4,10 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.calibration.acceptance import notes, requirements
 from benchmarks.calibration.cameras import measure_cameras
 from benchmarks.calibration.compare import compare
 from benchmarks.calibration.refusals import try_scenes
-from benchmarks.calibration.tables import panels, tables
+from benchmarks.calibration.tables import notes, panels, requirements, tables
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.simulated.board_scenes import Motion, make_scene

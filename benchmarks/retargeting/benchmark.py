@@ -7,7 +7,6 @@ from pathlib import Path
 
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.retargeting.acceptance import requirements
 from benchmarks.retargeting.compare import (
     Effort,
     compare_pinches,
@@ -27,7 +26,7 @@ from benchmarks.retargeting.rivals import (
     missing_modules,
 )
 from benchmarks.retargeting.robustness import try_faults
-from benchmarks.retargeting.tables import panels, tables
+from benchmarks.retargeting.tables import panels, requirements, tables
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 

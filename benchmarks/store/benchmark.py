@@ -8,14 +8,13 @@ from pathlib import Path
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
-from benchmarks.store.acceptance import OURS, requirements
 from benchmarks.store.appends import measure_appends
 from benchmarks.store.compare import DesignResult, Effort, compare
 from benchmarks.store.designs import Design
 from benchmarks.store.live import LiveResult, write_live
 from benchmarks.store.mcap_design import McapDesign
 from benchmarks.store.our_design import OurDesign
-from benchmarks.store.tables import panels, tables
+from benchmarks.store.tables import OURS, panels, requirements, tables
 from benchmarks.store.take import make_take
 from benchmarks.store.workload import CAMERAS, Workload
 from benchmarks.store.zarr_design import ZarrDesign

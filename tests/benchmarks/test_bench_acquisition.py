@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from benchmarks.acquisition import benchmark
-from benchmarks.acquisition.acceptance import requirements
 from benchmarks.acquisition.drivers import DriverSpeed, decode_all, make_talks
 from benchmarks.acquisition.families import make_families
 from benchmarks.acquisition.noise import (
@@ -21,6 +20,7 @@ from benchmarks.acquisition.noise import (
     disturb,
     judge,
 )
+from benchmarks.acquisition.tables import requirements
 from benchmarks.command import stage_parser, usage
 from benchmarks.figures import Figure
 from benchmarks.stages import STAGES

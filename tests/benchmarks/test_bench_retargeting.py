@@ -13,7 +13,6 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.retargeting import benchmark, compare, rival_process, rivals
-from benchmarks.retargeting.acceptance import requirements, velocity_limit_deg, worst_ratio
 from benchmarks.retargeting.compare import (
     PINCH_INPUT,
     ROBOT_INPUT,
@@ -30,7 +29,7 @@ from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import RIVALS
 from benchmarks.retargeting.robustness import faulty_motions, try_faults
 from benchmarks.retargeting.scores import PinchScore, RobotScore, score_robot
-from benchmarks.retargeting.tables import tables
+from benchmarks.retargeting.tables import requirements, tables, velocity_limit_deg, worst_ratio
 from benchmarks.simulated.hand_motions import cold_postures, robot_motion
 from dextouch.errors import (
     InvalidInputError,
