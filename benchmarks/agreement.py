@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
@@ -230,18 +230,16 @@ def requirements(
     """Requirements on the intervals of an evaluation."""
     return [
         *(
-            Requirement(
+            at_least(
                 f"{name}: studies whose 95 % interval holds the truth",
                 mean_held(found, OURS, name),
-                "at least",
                 0.92,
             )
             for name in MEASURED
         ),
-        Requirement(
+        at_most(
             "hierarchical bootstrap of the paper's largest study, 10,000 draws",
             times_s["bootstrap"].median,
-            "at most",
             1.0,
             "s",
         ),

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
@@ -90,7 +90,7 @@ def requirement(rates: Mapping[str, Figure]) -> Requirement:
     loader = rates.get(loading(USUAL_WORKERS))
     figure = None if loader is None else loader.over(rates[LEARNING]).median
     what = f"{loading(USUAL_WORKERS)}, times what training consumes"
-    return Requirement(what, figure, "at least", MIN_RATIO)
+    return at_least(what, figure, MIN_RATIO)
 
 
 def _subjects(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.figures import Requirement
+from benchmarks.figures import at_most
 from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.object_touch import TouchErrors, touch_errors
@@ -116,18 +116,15 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[_table(found), _click_table(clicked), _touch_table(touched)],
         panels=[],
         requirements=[
-            Requirement("median error, sharp (mm)", _of(best, "off_mm", 0.5), "at most", 1.0),
-            Requirement("95 % error, sharp (mm)", _of(best, "off_mm", 0.95), "at most", 5.0),
-            Requirement(
-                "median error along the view, sharp (mm)",
-                abs(_of(best, "depth_mm", 0.5)),
-                "at most",
-                0.5,
+            at_most("median error, sharp (mm)", _of(best, "off_mm", 0.5), 1.0),
+            at_most("95 % error, sharp (mm)", _of(best, "off_mm", 0.95), 5.0),
+            at_most(
+                "median error along the view, sharp (mm)", abs(_of(best, "depth_mm", 0.5)), 0.5
             ),
-            Requirement("95 % error of exact clicks (mm)", exact.off(0.95), "at most", 1.0),
-            Requirement("median error of clicks, 3 px of 480 (mm)", usual.off(0.5), "at most", 8.0),
+            at_most("95 % error of exact clicks (mm)", exact.off(0.95), 1.0),
+            at_most("median error of clicks, 3 px of 480 (mm)", usual.off(0.5), 8.0),
             *(
-                Requirement(f"median error of touch, {name} (mm)", value, "at most", 12.0)
+                at_most(f"median error of touch, {name} (mm)", value, 12.0)
                 for name, value in offs.items()
             ),
         ],

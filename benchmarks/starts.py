@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.evaluator.playing import play_in_imagination, play_in_twin, start_in_twin
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
@@ -294,6 +294,6 @@ def _requirements(found: Found) -> list[Requirement]:
     bounds = {"as in the twin": 5.0, "all mild ones together": 5.0}
     bounds |= {f"at step {step}": 6.0 for step in STEPS}
     return [
-        Requirement(f"median error, {kind} (mm)", median_mm(kind), "at most", bound)
+        at_most(f"median error, {kind} (mm)", median_mm(kind), bound)
         for kind, bound in bounds.items()
     ]

@@ -6,7 +6,7 @@ from benchmarks.acquisition.drivers import DriverSpeed
 from benchmarks.acquisition.noise import Judgement, Line
 from benchmarks.acquisition.speed import READ_SIZES, WHOLE
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_most
 from benchmarks.report import ResultTable
 
 OURS = "ours"
@@ -105,40 +105,27 @@ def requirements(
         found = ours.get(name)
         many = "" if found is None else f" of {found.sent}"
         table += [
-            Requirement(
-                f"wrong packets{many}, {name}",
-                None if found is None else float(found.wrong),
-                "at most",
-                0.0,
+            at_most(
+                f"wrong packets{many}, {name}", None if found is None else float(found.wrong), 0.0
             ),
-            Requirement(
+            at_most(
                 f"packets lost untouched{many}, {name}",
                 None if found is None else float(found.collateral),
-                "at most",
                 0.0,
             ),
         ]
     table.append(
-        Requirement(
+        at_most(
             "ways of cutting the stream that change the packets, all families",
             float(sum(split_differences.values())) if split_differences else None,
-            "at most",
             0.0,
         )
     )
     table += [
-        Requirement(
-            f"processor time a packet, {driver.name}",
-            driver.time_us.median,
-            "at most",
-            15.0,
-            "µs",
-        )
+        at_most(f"processor time a packet, {driver.name}", driver.time_us.median, 15.0, "µs")
         for driver in drivers
         if driver.name.startswith(GLOVE)
     ]
     share = None if core_share is None else core_share.median
-    table.append(
-        Requirement("core a stream, 8 gloves at 60 Hz on terminals", share, "at most", 1.0, "%")
-    )
+    table.append(at_most("core a stream, 8 gloves at 60 Hz on terminals", share, 1.0, "%"))
     return table

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from benchmarks.alignment.compare import METHODS, OURS, STEPS, MethodResult
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 
 Results = Mapping[str, MethodResult]
@@ -69,8 +69,8 @@ def panels(results: Results) -> list[Panel]:
 def requirements(results: Results) -> list[Requirement]:
     """Requirements on speed and errors of the alignment service, on one take."""
     ours = results[OURS]
-    speed = Requirement(
-        "stored and aligned, times real time of one core", ours.speed.median, "at least", MIN_SPEED
+    speed = at_least(
+        "stored and aligned, times real time of one core", ours.speed.median, MIN_SPEED
     )
-    errors = [Requirement(what, ours.errors[what], "at most", BOUNDS[what]) for what in BOUNDS]
+    errors = [at_most(what, ours.errors[what], BOUNDS[what]) for what in BOUNDS]
     return [speed, *errors]

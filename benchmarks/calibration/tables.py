@@ -9,7 +9,7 @@ from benchmarks.calibration.compare import MethodResult, Results, not_worse_shar
 from benchmarks.calibration.refusals import RIVALS, SceneResult
 from benchmarks.calibration.rivals import OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement, Sense
+from benchmarks.figures import Figure, Requirement, Sense, at_least, at_most
 from benchmarks.report import ResultTable
 
 PROMISED_VIEWS = 25
@@ -140,11 +140,8 @@ def _against_park(results: Results) -> list[Requirement]:
         results[OURS_SIZE_KNOWN], results[PARK], tolerance_sigmas=TOLERANCE_SIGMAS
     )
     return [
-        Requirement(
-            f"hand-eye, {kind}: seeds not worse than Park by {TOLERANCE_SIGMAS:g} sigma",
-            value,
-            "at least",
-            0.9,
+        at_least(
+            f"hand-eye, {kind}: seeds not worse than Park by {TOLERANCE_SIGMAS:g} sigma", value, 0.9
         )
         for kind, value in zip(("rotation", "translation"), share, strict=True)
     ]
@@ -169,19 +166,9 @@ def _camera(cameras: Sequence[CameraResult]) -> list[Requirement]:
     ratios = list(found[0].sigma_over_spread.values()) if found else []
     what = f"intrinsics, {PROMISED_VIEWS} views"
     return [
-        Requirement(f"{what}: focal error, median", focal, "at most", 0.003),
-        Requirement(
-            f"{what}: sigma over spread, smallest of 9",
-            min(ratios) if ratios else None,
-            "at least",
-            0.5,
-        ),
-        Requirement(
-            f"{what}: sigma over spread, largest of 9",
-            max(ratios) if ratios else None,
-            "at most",
-            2.0,
-        ),
+        at_most(f"{what}: focal error, median", focal, 0.003),
+        at_least(f"{what}: sigma over spread, smallest of 9", min(ratios) if ratios else None, 0.5),
+        at_most(f"{what}: sigma over spread, largest of 9", max(ratios) if ratios else None, 2.0),
     ]
 
 
@@ -191,8 +178,6 @@ def _refused(refusals: Sequence[SceneResult]) -> list[Requirement]:
     named = sum(scene.num_named for scene in bad) / num_bad if num_bad else None
     healthy = [scene.num_refused for scene in refusals if scene.is_healthy]
     return [
-        Requirement("degenerate scenes refused, axes to add named", named, "at least", 1.0),
-        Requirement(
-            "healthy scenes refused", float(sum(healthy)) if healthy else None, "at most", 0.0
-        ),
+        at_least("degenerate scenes refused, axes to add named", named, 1.0),
+        at_most("healthy scenes refused", float(sum(healthy)) if healthy else None, 0.0),
     ]

@@ -8,7 +8,7 @@ from statistics import mean
 from benchmarks.closure.contact_times import timing_errors
 from benchmarks.closure.methods import METHODS, OURS, Method
 from benchmarks.closure.replay import TASKS, ClosureTake, close_take
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_least
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
@@ -87,9 +87,7 @@ def _table(played: Played, num_takes: int) -> ResultTable:
 
 
 def _requirement(played: Played, task: str) -> Requirement:
-    return Requirement(
-        f"{task}: success of {OURS.name}", _rate(played[task, OURS]), "at least", MIN_SUCCESS
-    )
+    return at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
 
 
 def _rate(takes: Sequence[ClosureTake]) -> float:

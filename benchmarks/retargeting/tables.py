@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Requirement, Sense
+from benchmarks.figures import Requirement, Sense, at_least, at_most
 from benchmarks.report import ResultTable
 from benchmarks.retargeting.compare import (
     FULL,
@@ -177,10 +177,9 @@ def velocity_limit_deg() -> float:
 
 def _speed(speeds: Sequence[Speed]) -> list[Requirement]:
     return [
-        Requirement(
+        at_least(
             f"{OURS}: times as fast as {Rival(library, VECTOR).name}",
             worst_ratio(speeds, OURS, Rival(library, VECTOR).name),
-            "at least",
             bound,
         )
         for library, bound in PROMISED_SPEED
@@ -200,10 +199,8 @@ def _noise(scores: Sequence[RobotScore]) -> list[Requirement]:
     tip_mm = max(one.tip_mean_mm for one in scores)
     joint_deg = max(one.joint_mean_deg for one in scores)
     return [
-        Requirement("robot motion, 1 mm noise: tip error, mean", tip_mm, "at most", 1.3, "mm"),
-        Requirement(
-            "robot motion, 1 mm noise: joint error, mean", joint_deg, "at most", 1.7, "deg"
-        ),
+        at_most("robot motion, 1 mm noise: tip error, mean", tip_mm, 1.3, "mm"),
+        at_most("robot motion, 1 mm noise: joint error, mean", joint_deg, 1.7, "deg"),
     ]
 
 
@@ -213,7 +210,7 @@ def _pinches(score: PinchScore) -> list[Requirement]:
         ("gap where the human's is below 3 mm, p95", score.gap_p95_mm, 2.5, "mm"),
         ("off the human joint angles, mean", score.same_angle_deg, 5.0, "deg"),
     )
-    return [Requirement(f"pinches: {row[0]}", row[1], "at most", *row[2:]) for row in rows]
+    return [at_most(f"pinches: {row[0]}", row[1], *row[2:]) for row in rows]
 
 
 def _limits(robot: RobotScores, pinches: PinchScore) -> list[Requirement]:
@@ -222,14 +219,14 @@ def _limits(robot: RobotScores, pinches: PinchScore) -> list[Requirement]:
     outside = sum(score.num_outside for score in scores) + pinches.num_outside
     bound_deg = velocity_limit_deg() + _ROUNDING_DEG
     return [
-        Requirement("all motions: turn of a joint a sample", step_deg, "at most", bound_deg, "deg"),
-        Requirement("all motions: joints beyond limits", float(outside), "at most", 0.0),
+        at_most("all motions: turn of a joint a sample", step_deg, bound_deg, "deg"),
+        at_most("all motions: joints beyond limits", float(outside), 0.0),
     ]
 
 
 def _cold(cold: ColdStart) -> list[Requirement]:
     once, retried = cold.num_found_once / cold.num_fingers, cold.num_found / cold.num_fingers
     return [
-        Requirement("cold start: fingers within 0.1 mm, one start", once, "at least", 0.999),
-        Requirement("cold start: fingers within 0.1 mm, retries", retried, "at least", 1.0),
+        at_least("cold start: fingers within 0.1 mm, one start", once, 0.999),
+        at_least("cold start: fingers within 0.1 mm, retries", retried, 1.0),
     ]

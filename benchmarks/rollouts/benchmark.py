@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
@@ -154,10 +154,9 @@ def _listing_requirements(
     listings_s: Mapping[str, list[float]], num_rollouts: int
 ) -> list[Requirement]:
     return [
-        Requirement(
+        at_most(
             f"GET /v1/watch?limit=1, {num_rollouts} rollouts {where}, with a new connection, p50",
             1e3 * statistics.median(times_s),
-            "at most",
             MAX_LISTING_MS,
             "ms",
         )
@@ -208,10 +207,9 @@ def _requirements(
 ) -> list[Requirement]:
     beside = {"HTTP": "an echo of the same bytes", "WebSocket": "a minimal WebSocket server"}
     found = [
-        Requirement(
+        at_most(
             f"{_name(way)}: a chunk over {beside[way.protocol]}, p50",
             over[way].median,
-            "at most",
             MAX_OVER_ECHO[way.protocol],
         )
         for way in WAYS
@@ -222,29 +220,20 @@ def _requirements(
     alone, batched = (crowds[world] for world in DEVICES)
     return [
         *found,
-        Requirement(
-            "kept in Redis: further time of a chunk, p50",
-            durable_ms,
-            "at most",
-            MAX_DURABLE_MS,
-            "ms",
-        ),
-        Requirement(
+        at_most("kept in Redis: further time of a chunk, p50", durable_ms, MAX_DURABLE_MS, "ms"),
+        at_most(
             "read by a watcher five times a second: a chunk over an unwatched one, p50",
             times_s[_name(WATCHED)].over(unwatched).median,
-            "at most",
             MAX_WATCHED,
         ),
-        Requirement(
+        at_least(
             "32 rollouts on a device of 5 ms: chunks/s, batched over one by one",
             batched.chunks_per_s / alone.chunks_per_s,
-            "at least",
             MIN_BATCHED,
         ),
-        Requirement(
+        at_most(
             "32 rollouts on a device of 5 ms, batched: p99 over p50",
             batched.p99_s / batched.p50_s,
-            "at most",
             MAX_TAIL,
         ),
     ]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 from benchmarks.store.appends import SPOOL, SPOOL_SYNCED, AppendResult
 from benchmarks.store.compare import DesignResult
@@ -130,25 +130,22 @@ def requirements(
     ours, rival = results.get(OURS), results.get(RIVAL)
     return [
         *_against_rival(ours, rival),
-        Requirement(
+        at_most(
             "processor seconds of writing a recorded second",
             None if ours is None else ours.cpu_s.median / ours.seconds,
-            "at most",
             0.35,
             "s",
         ),
-        Requirement(
+        at_most(
             f"rows late or dropped, station live at {SPEED:g} times real time",
             float(max(run.num_untimely for run in live)) if live else None,
-            "at most",
             0.0,
         ),
         _append("numeric append, p99", SPOOL, appends, bound_ms=0.1),
         _append("numeric append on the disk, p99", SPOOL_SYNCED, appends, bound_ms=1.0),
-        Requirement(
+        at_most(
             "34 samples of both gloves at native rate",
             None if ours is None or ours.touch_ms is None else ours.touch_ms.median,
-            "at most",
             0.4,
             "ms",
         ),
@@ -163,10 +160,10 @@ def _against_rival(ours: DesignResult | None, rival: DesignResult | None) -> lis
         decibels = rival.mean_psnr_db - ours.mean_psnr_db
         windows = rival.window_ms.over(ours.window_ms).median
     return [
-        Requirement(f"write speed, times {RIVAL}", write, "at least", 2.0),
-        Requirement(f"bytes, times {RIVAL}", bytes_, "at most", 0.2),
-        Requirement(f"mean PSNR below {RIVAL}", decibels, "at most", 2.0, "dB"),
-        Requirement(f"one-camera windows a second, times {RIVAL}", windows, "at least", 1.8),
+        at_least(f"write speed, times {RIVAL}", write, 2.0),
+        at_most(f"bytes, times {RIVAL}", bytes_, 0.2),
+        at_most(f"mean PSNR below {RIVAL}", decibels, 2.0, "dB"),
+        at_least(f"one-camera windows a second, times {RIVAL}", windows, 1.8),
     ]
 
 
@@ -174,4 +171,4 @@ def _append(
     what: str, way: str, appends: Sequence[AppendResult], *, bound_ms: float
 ) -> Requirement:
     found = [append.p99_ms.median for append in appends if append.name == way]
-    return Requirement(what, found[0] if found else None, "at most", bound_ms, "ms")
+    return at_most(what, found[0] if found else None, bound_ms, "ms")

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
@@ -123,12 +123,11 @@ def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> l
     saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
     share = times_ms[HEAD].median / CHUNK_MS
     return [
-        Requirement(f"{HEAD_LAST}, share of the time of {HEAD}", saved, "at most", 0.9),
-        Requirement(f"{HEAD}, share of real time", share, "at most", 0.5),
-        Requirement(
+        at_most(f"{HEAD_LAST}, share of the time of {HEAD}", saved, 0.9),
+        at_most(f"{HEAD}, share of real time", share, 0.5),
+        at_least(
             "selectors that leave the state after a chunk as it is, share",
             float(states_are_equal),
-            "at least",
             1.0,
         ),
     ]

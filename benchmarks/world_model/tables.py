@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 from benchmarks.world_model.rollouts import RolloutError
 from dextouch.schemas import CHUNK_STEPS
@@ -94,19 +94,15 @@ def state_model_table(costs_ms: Mapping[str, Figure], name: str) -> ResultTable:
 def state_model_requirements(costs_ms: Mapping[str, Figure]) -> list[Requirement]:
     """Requirements on single rollouts, and on batches compared with them."""
     chunks = [
-        Requirement(
-            f"state model, a chunk, {asked}",
-            costs_ms[asked_name(asked, 1)].median,
-            "at most",
-            bound_ms,
-            "ms",
+        at_most(
+            f"state model, a chunk, {asked}", costs_ms[asked_name(asked, 1)].median, bound_ms, "ms"
         )
         for asked, bound_ms in MAX_STATE_CHUNK_MS.items()
     ]
     single, batch = (costs_ms[asked_name("all images", count)] for count in (1, 16))
     speedup = single.over(batch).median
     what = "state model, all images, throughput of a batch of 16 over single rollouts"
-    return [*chunks, Requirement(what, speedup, "at least", MIN_BATCH_SPEEDUP)]
+    return [*chunks, at_least(what, speedup, MIN_BATCH_SPEEDUP)]
 
 
 def panels(
@@ -140,7 +136,7 @@ def requirements(
     ours, copied = errors[served], errors[COPY_FIRST]
     image, touch = ours.image_levels / copied.image_levels, ours.touch_kpa / copied.touch_kpa
     return [
-        Requirement("a chunk, all images", times_ms[served].median, "at most", MAX_CHUNK_MS, "ms"),
-        Requirement("image error, share of copy-first's", image, "at most", 1.0),
-        Requirement("touch error, share of copy-first's", touch, "at most", 1.0),
+        at_most("a chunk, all images", times_ms[served].median, MAX_CHUNK_MS, "ms"),
+        at_most("image error, share of copy-first's", image, 1.0),
+        at_most("touch error, share of copy-first's", touch, 1.0),
     ]
