@@ -11,22 +11,27 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.evaluator.playing import play_in_imagination, play_in_twin, start_in_twin
+from benchmarks.evaluator.playing import (
+    play_in_imagination,
+    play_in_twin,
+    stage_poses,
+    start_amid,
+    start_in_twin,
+)
 from benchmarks.figures import Requirement, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.clients import PolicyStart
-from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.images import decode_jpeg, encode_jpeg
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.scripted_actions import Actions, script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.tasks import EVALUATED, named_tasks
-from services.twin.world import TwinState, TwinWorld
+from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
@@ -159,19 +164,21 @@ class _Judged:
         started, first, start = start_in_twin(twin, task, seed, "")
         actions = scripted_actions(twin.stage(task), seed, script_name(0.0))
         real = play_in_twin(twin, started, actions, start, shows_chunks=False).success
-        truth_m = _true_m(twin, started.state)
+        truth = stage_poses(twin, started.state)
         found = {}
         for name, camera in CAMERAS.items():
             seen = _seen_by(first, camera, np.random.default_rng(seed))
             is_played = name in {"as in the twin", "all mild ones together"}
             verdict = self._verdict(seen, actions, start) if is_played else None
-            found[name] = replace(self._read(seen, truth_m), verdict=verdict, real=real)
+            found[name] = replace(self._read(seen, truth), verdict=verdict, real=real)
         state = started.state
         for before, step in pairwise((0, *STEPS)):
             stepped = twin.step(state, actions[before:step], seed=0, selector=_LAST)
             state = stepped.state
-            later = _amid(first, stepped.observation)
-            found[f"at step {step}"] = self._read(later, _true_m(twin, state))
+            shown = stepped.observation
+            image = shown.images[HEAD_CAMERA][-1]
+            later = start_amid(first, image, shown.tactile_kpa[-1], shown.action_reached[-1])
+            found[f"at step {step}"] = self._read(later, stage_poses(twin, state))
         return found
 
     def played(self, twin: TwinWorld, task: str, seed: int) -> _Read:
@@ -179,27 +186,21 @@ class _Judged:
         started, first, start = start_in_twin(twin, task, seed, "")
         actions = scripted_actions(twin.stage(task), seed, script_name(0.0))
         real = play_in_twin(twin, started, actions, start, shows_chunks=False).success
-        read = self._read(first, _true_m(twin, started.state))
+        read = self._read(first, stage_poses(twin, started.state))
         return replace(read, verdict=self._verdict(first, actions, start), real=real)
 
-    def _read(self, first: RolloutStart, truth_m: np.ndarray) -> _Read:
+    def _read(self, first: RolloutStart, truth: np.ndarray) -> _Read:
         started = self._world.reset(first)
         poses = started.observation.object_poses
         if poses is None:
             raise ValueError("the state model gives object poses with every start")
-        error_mm = 1e3 * np.linalg.norm(poses[0, :, :3] - truth_m, axis=-1)
-        expected = started.state.memory.start.sd_m[:, 0, : len(truth_m)]
+        error_mm = 1e3 * np.linalg.norm(poses[0, :, :3] - truth[:, :3], axis=-1)
+        expected = started.state.memory.start.sd_m[:, 0, : len(truth)]
         return _Read(error_mm, float(1e3 * expected.mean()))
 
     def _verdict(self, first: RolloutStart, actions: Actions, start: PolicyStart) -> str:
         imagined = play_in_imagination(self._world, first, actions, start, shows_chunks=False)
         return self._probe.verdict(imagined.ending(first.task)).decision
-
-
-def _true_m(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 3"]:
-    simulation = twin.stage(state.task).simulation
-    simulation.set_state(state.physics, step_index=0)
-    return simulation.object_poses()[:, :3]
 
 
 def _seen_by(first: RolloutStart, camera: Camera, draw: np.random.Generator) -> RolloutStart:
@@ -219,22 +220,6 @@ def shifted(image: Image, shift_px: tuple[int, int]) -> Image:
     padded = np.pad(image, ((most, most), (most, most), (0, 0)), mode="edge")
     (height, width), (top, left) = image.shape[:2], (most - down, most - right)
     return np.ascontiguousarray(padded[top : top + height, left : left + width])
-
-
-def _amid(first: RolloutStart, seen: Observation) -> RolloutStart:
-    """A start from a later observation, at which the hands are."""
-    if first.anchor is None:
-        raise ValueError("the twin gives an anchor with every start")
-    reached = seen.action_reached[-1:]
-    here = Observation(
-        first_step=0,
-        images={HEAD_CAMERA: seen.images[HEAD_CAMERA][-1:]},
-        tactile_kpa=seen.tactile_kpa[-1:],
-        action_reached=reanchor(reached, 0),
-        reached_is_measured=True,
-    )
-    anchor = poses_from_actions(reached, first.anchor).anchor(0)
-    return replace(first, observation=here, anchor=anchor)
 
 
 def _pixels(image: np.ndarray) -> Image:

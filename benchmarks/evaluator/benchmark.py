@@ -14,7 +14,7 @@ from benchmarks.evaluator.keeping import KeptRows, Row
 from benchmarks.evaluator.kind_lines import VERDICTS
 from benchmarks.evaluator.kinds import NONE, STRENGTHS, KindsPlan
 from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.page import cell, write_page
+from benchmarks.evaluator.page import write_page
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
@@ -167,12 +167,15 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     figures, failed = figures_of_tasks(study, kept)
     lines = [line for each in figures for line in each.lines()]
     rows = {name: [row for each in figures for row in of(each)] for name, (_, of) in _ROWS.items()}
-    titled = {title: rows[name] for name, (title, _) in _ROWS.items()}
+    tables = [
+        interval_table(lines),
+        *(row_table(title, rows[name]) for name, (title, _) in _ROWS.items() if rows[name]),
+    ]
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, lines, titled, notes)
+    write_page(plan.keep / "evaluator.html", study.about, tables, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
@@ -190,10 +193,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "policies": plan.policies,
             "kinds": plan.kinds and asdict(plan.kinds),
         },
-        tables=[
-            interval_table(lines),
-            *(row_table(title, each) for title, each in titled.items() if each),
-        ],
+        tables=tables,
         panels=[],
         requirements=[
             *(line.requirement() for line in lines),
@@ -237,7 +237,7 @@ def _rolled(study: Study, kept: KeptRows, about: tuple[str, int, str]) -> list[R
 
 
 def interval_table(lines: Sequence[Line]) -> ResultTable:
-    """Figures with their intervals, and with those of every training seed if there are several."""
+    """Figures with intervals and bounds, and those of every training seed if there are several."""
     several = max((len(line.by_seed) for line in lines), default=1) > 1
     rows = [
         (
@@ -245,11 +245,13 @@ def interval_table(lines: Sequence[Line]) -> ResultTable:
             line.text(line.value),
             "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
             str(line.num),
+            f"{line.sense} {line.bound:g} {line.unit}".rstrip(),
+            line.requirement().verdict(),
             *([", ".join(map(line.text, line.by_seed))] if several else []),
         )
         for line in lines
     ]
-    columns = ["", "figure", "95 % over starts", "rollouts or policies"]
+    columns = ["", "figure", "95 % over starts", "rollouts or policies", "bound", "verdict"]
     columns += ["training seeds"] * several
     return ResultTable("Imagined and real", tuple(columns), rows)
 
@@ -257,7 +259,11 @@ def interval_table(lines: Sequence[Line]) -> ResultTable:
 def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
     """Rows of one kind as a table."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
-    return ResultTable(title, columns, [tuple(cell(row.get(n)) for n in columns) for row in rows])
+    return ResultTable(title, columns, [tuple(_cell(row.get(n)) for n in columns) for row in rows])
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else "" if value is None else str(value)
 
 
 def _results(
