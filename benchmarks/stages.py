@@ -49,7 +49,7 @@ class Amounts:
             flag = f"--{name.replace('_', '-')}"
             parser.add_argument(flag, type=type(usual), help=f"{text} ({usual:g}; quick {quick:g})")
 
-    def of(self, options: argparse.Namespace, **least: float) -> dict[str, Any]:
+    def of(self, options: argparse.Namespace, **least: int | float) -> dict[str, Any]:
         """The amounts of a run, those that options set instead of the default ones.
 
         Args:
@@ -85,7 +85,7 @@ STAGES = {
         "decode glove packets from a noisy line and time every driver",
         "Sends packets of three glove families over a line with bit errors and byte loss, and "
         "counts wrong packets and lost undamaged ones, for our decoders and for simple baselines "
-        "(start mark and length; start mark only). Times every decoder by size of the reads, and "
+        "(start mark and length; end mark only). Times every decoder by size of the reads, and "
         "every driver (gloves, trackers, bridges, robot, cameras), and reads eight gloves at 60 Hz "
         "on pseudo-terminals. Close other programs first: timings on a busy machine are not "
         "meaningful.",

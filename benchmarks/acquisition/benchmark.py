@@ -64,7 +64,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         speeds = measure_speed(families, plan["rounds"], seed=seed, on_step=step)
     talks = make_talks(seed=seed)
     with bar("every driver", plan["rounds"] * len(talks)) as step:
-        drivers = measure_drivers(talks, plan["rounds"], on_step=step)
+        driver_us = measure_drivers(talks, plan["rounds"], on_step=step)
     runs = []
     num_pty_rounds = 1 if options.quick else _NUM_PTY_ROUNDS
     with bar("eight gloves", num_pty_rounds) as step:
@@ -76,9 +76,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         stage="acquisition",
         machine=describe_machine(PACKAGES),
         options={**plan, "seed": seed},
-        tables=tables(judgements, speeds, drivers, line=LINE, core_share=share),
+        tables=tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
         panels=panels(judgements, speeds),
-        requirements=requirements(judgements, drivers, splits, share),
+        requirements=requirements(judgements, driver_us, splits, share),
         data={
             "line": asdict(LINE),
             "judgements": [asdict(found) for found in judgements],
@@ -89,12 +89,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             ],
             "drivers": [
                 {
-                    "driver": driver.name,
-                    "packet_bytes": driver.packet_bytes,
-                    "packet_reads": driver.packet_reads,
-                    "us_a_packet": list(driver.time_us.values),
+                    "driver": talk.name,
+                    "packet_bytes": talk.packet_bytes,
+                    "packet_reads": talk.packet_reads,
+                    "us_a_packet": list(driver_us[talk.name].values),
                 }
-                for driver in drivers
+                for talk in talks
             ],
             "eight_gloves": runs,
         },

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from benchmarks.acquisition.drivers import DriverSpeed
+from benchmarks.acquisition.drivers import DeviceTalk
 from benchmarks.acquisition.noise import Judgement, Line
 from benchmarks.acquisition.speed import READ_SIZES, WHOLE
 from benchmarks.chart import Panel, Point
@@ -18,7 +18,8 @@ Speeds = Mapping[tuple[str, str, int], Figure]
 def tables(
     judgements: Sequence[Judgement],
     speeds: Speeds,
-    drivers: Sequence[DriverSpeed],
+    talks: Sequence[DeviceTalk],
+    driver_us: Mapping[str, Figure],
     *,
     line: Line,
     core_share: Figure,
@@ -57,12 +58,12 @@ def tables(
             ("driver", "bytes a packet", "reads a packet", "a packet (µs)"),
             [
                 (
-                    driver.name,
-                    f"{driver.packet_bytes:.0f}",
-                    f"{driver.packet_reads:g}",
-                    driver.time_us.text(),
+                    talk.name,
+                    f"{talk.packet_bytes:.0f}",
+                    f"{talk.packet_reads:g}",
+                    driver_us[talk.name].text(),
                 )
-                for driver in drivers
+                for talk in talks
             ],
         ),
         ResultTable(
@@ -94,7 +95,7 @@ def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:
 
 def requirements(
     judgements: Sequence[Judgement],
-    drivers: Sequence[DriverSpeed],
+    driver_us: Mapping[str, Figure],
     split_differences: Mapping[str, int],
     core_share: Figure | None,
 ) -> list[Requirement]:
@@ -122,9 +123,9 @@ def requirements(
         )
     )
     table += [
-        at_most(f"processor time a packet, {driver.name}", driver.time_us.median, 15.0, "µs")
-        for driver in drivers
-        if driver.name.startswith(GLOVE)
+        at_most(f"processor time a packet, {name}", time_us.median, 15.0, "µs")
+        for name, time_us in driver_us.items()
+        if name.startswith(GLOVE)
     ]
     share = None if core_share is None else core_share.median
     table.append(at_most("core a stream, 8 gloves at 60 Hz on terminals", share, 1.0, "%"))
