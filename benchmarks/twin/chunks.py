@@ -5,10 +5,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from dextouch.hands.actions import actions_from_poses
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
+from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
 from services.twin.world import TwinState, TwinWorld
 
 # Both scripts have contact in their second chunk.
@@ -35,10 +34,8 @@ class TimedChunk:
 
     def __init__(self, task: str, seed: int) -> None:
         self._world = TwinWorld(TwinSettings())
-        commands = Stage(task, "robot", TwinSettings()).plan(seed).commands
-        started = self._world.reset(RolloutStart(task, seed, ""))
-        rows = actions_from_poses(commands, started.anchor)[1:]
-        state: TwinState = started.state
+        state: TwinState = self._world.reset(RolloutStart(task, seed, "")).state
+        rows = scripted_actions(self._world.stage(task), seed, script_name(0.0))
         for chunk in range(CHUNK):
             before = rows[chunk * CHUNK_STEPS :][:CHUNK_STEPS]
             state = self._world.step(state, before, seed=0).state
