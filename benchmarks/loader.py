@@ -1,23 +1,26 @@
 """Benchmark stage `loader`: whether reading training windows keeps up with training."""
 
 import argparse
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import torch
 
 from benchmarks.figures import Figure, Requirement, at_least
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data
 from services.twin.take_options import MIXES
 from services.twin.tasks import TASK_NAMES
-
-if TYPE_CHECKING:
-    from benchmarks.training_pace import TrainingPace
+from services.world_model.paper_settings import TrainSettings
+from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
+from services.world_model.training.trainer import TrainingRun
 
 PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
@@ -47,8 +50,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no episode, round or batch, or invalid numbers of workers.
     """
-    from benchmarks.training_pace import TrainingPace
-
     plan, workers = AMOUNTS.of(options), _workers(options.workers)
     url = options.store or _make_episodes(folder / "episodes", plan["episodes"])
     with bar("reading the store once", 1):
@@ -93,23 +94,83 @@ def requirement(rates: Mapping[str, Figure]) -> Requirement:
     return at_least(what, figure, MIN_RATIO)
 
 
+class TrainingPace:
+    """Windows per second of the loader and the training step, separately and together.
+
+    All measurements use the same network, the same sampling of windows and one thread, and exclude
+    one-time work: codecs are fitted and worker processes started beforehand.
+
+    Args:
+        url: URL of an episode store.
+        fit_windows: windows the codecs are fitted on.
+    """
+
+    def __init__(self, url: str, *, fit_windows: int = 256) -> None:
+        torch.set_num_threads(1)
+        plain = TrainSettings(episodes=url, streaming=True, loader_workers=0)
+        windows = plain.windows.model_copy(update={"fit_windows": fit_windows})
+        self._settings = plain.model_copy(update={"windows": windows})
+        self._episodes = index_episodes(url)
+        self._run = TrainingRun(self._episodes, self._settings)
+        self._run.fit_codecs()
+        self._run.model.train()
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes in the store."""
+        return len(self._episodes)
+
+    @property
+    def batch(self) -> int:
+        """Windows per step."""
+        return self._settings.optimizer.batch
+
+    def loading(self, num_batches: int, *, num_workers: int) -> float:
+        """Windows per second of the loader alone."""
+        batches = self._batches(num_workers)
+        start_s = time.perf_counter()
+        for _ in islice(batches, num_batches):
+            pass
+        elapsed_s = time.perf_counter() - start_s
+        batches.close()
+        return num_batches * self.batch / elapsed_s
+
+    def learning(self, num_batches: int) -> float:
+        """Windows per second of training on windows in memory."""
+        ready = list(islice(self._batches(0), num_batches))
+        return self._learn(iter(ready), num_batches)
+
+    def both(self, num_batches: int, *, num_workers: int) -> float:
+        """Windows per second of training on windows read from disk."""
+        batches = self._batches(num_workers)
+        rate = self._learn(batches, num_batches)
+        batches.close()
+        return rate
+
+    def _batches(self, num_workers: int) -> Generator[WindowBatch, None, None]:
+        batches = read_batches(self._episodes, self._run.places(), num_workers=num_workers)
+        # Skip what was read ahead while the processes started: two batches each.
+        for _ in islice(batches, 2 * num_workers + 1):
+            pass
+        return batches
+
+    def _learn(self, batches: Iterator[WindowBatch], num_batches: int) -> float:
+        start_s = time.perf_counter()
+        for batch in islice(batches, num_batches):
+            self._run.learn(batch)
+        return num_batches * self.batch / (time.perf_counter() - start_s)
+
+
 def _subjects(
-    pace: "TrainingPace", workers: list[int], num_batches: int
+    pace: TrainingPace, workers: list[int], num_batches: int
 ) -> dict[str, Callable[[int], float]]:
-    subjects: dict[str, Callable[[int], float]] = {LEARNING: lambda _: pace.learning(num_batches)}
+    subjects = {LEARNING: partial(pace.learning, num_batches)}
     for count in workers:
-        subjects[loading(count)] = _ignoring_round(
-            partial(pace.loading, num_batches, num_workers=count)
-        )
+        subjects[loading(count)] = partial(pace.loading, num_batches, num_workers=count)
     for count in workers:
-        subjects[f"training from the disk, {count} worker processes"] = _ignoring_round(
-            partial(pace.both, num_batches, num_workers=count)
-        )
-    return subjects
-
-
-def _ignoring_round(work: Callable[[], float]) -> Callable[[int], float]:
-    return lambda _: work()
+        name = f"training from the disk, {count} worker processes"
+        subjects[name] = partial(pace.both, num_batches, num_workers=count)
+    return {name: every_round(measure) for name, measure in subjects.items()}
 
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:

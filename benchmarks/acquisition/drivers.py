@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.acquisition.families import make_families
 from benchmarks.figures import Figure
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera import (
@@ -85,7 +85,7 @@ def measure_drivers(
     talks: Iterable[DeviceTalk], num_rounds: int, *, on_step: Callable[[str], None]
 ) -> dict[str, Figure]:
     """µs a packet of processor time of each driver's decoder, in turns."""
-    subjects = {talk.name: partial(_once, talk) for talk in talks}
+    subjects = {talk.name: every_round(partial(_once, talk)) for talk in talks}
     found = interleaved(subjects, num_rounds, on_step=on_step)
     return {name: Figure.of(values) for name, values in found.items()}
 
@@ -100,8 +100,7 @@ def decode_all(talk: DeviceTalk, decoder: Decoder) -> int:
     return num_samples
 
 
-def _once(talk: DeviceTalk, round_index: int) -> float:
-    del round_index
+def _once(talk: DeviceTalk) -> float:
     decoder = talk.decoder()
     for read in talk.greeting:
         decoder.decode(read, 0)

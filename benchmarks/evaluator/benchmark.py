@@ -56,32 +56,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--world",
-        action="append",
-        type=Path,
-        help="checkpoint of the world model (committed one); may be repeated for training seeds",
-    )
-    parser.add_argument(
-        "--probe",
-        action="append",
-        type=Path,
-        help="checkpoint of the judge (committed one); once for all worlds, or once for each",
-    )
-    parser.add_argument(
-        "--direct",
-        action="append",
-        type=Path,
-        help="checkpoint of the direct judge, a baseline that imagines nothing (none); once for "
-        "all worlds, or once for each",
-    )
-    parser.add_argument(
-        "--without-touch",
-        action="append",
-        type=Path,
-        help="checkpoint of a world model trained without touch, as a baseline (none); once "
-        "for all worlds, or once for each",
-    )
+    each = "once for all worlds, or once for each"
+    for flag, what in {
+        "--world": "the world model (committed one); may be repeated for training seeds",
+        "--probe": f"the judge (committed one); {each}",
+        "--direct": f"the direct judge, a baseline that imagines nothing (none); {each}",
+        "--without-touch": f"a world model trained without touch, as a baseline (none); {each}",
+    }.items():
+        parser.add_argument(flag, action="append", type=Path, help=f"checkpoint of {what}")
     parser.add_argument(
         "--each-member",
         action="store_true",

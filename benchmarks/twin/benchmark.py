@@ -12,7 +12,7 @@ from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
 from benchmarks.twin.physics import (
@@ -20,8 +20,6 @@ from benchmarks.twin.physics import (
     SOLVERS,
     ContactChunks,
     ContactError,
-    Played,
-    Solver,
     contact_error,
 )
 from services.twin.tasks import TASK_NAMES
@@ -137,8 +135,8 @@ def _solvers(
     task: str, plan: Mapping[str, int], bar: Bar
 ) -> tuple[dict[str, Figure], dict[str, ContactError], int]:
     """Milliseconds of the median chunk by round, and errors, of every solver."""
-    chunks = ContactChunks([task], range(FIRST_SEED, FIRST_SEED + plan["seeds"]))
-    subjects = {name: partial(_played, chunks, solver) for name, solver in SOLVERS.items()}
+    chunks = ContactChunks(task, range(FIRST_SEED, FIRST_SEED + plan["seeds"]))
+    subjects = {name: every_round(partial(chunks.play, solver)) for name, solver in SOLVERS.items()}
     with bar("solvers", plan["solver_rounds"] * len(subjects)) as step:
         found = interleaved(subjects, plan["solver_rounds"], on_step=step)
     times_ms = {
@@ -148,8 +146,3 @@ def _solvers(
     truth = found[AS_SERVED][0]
     errors = {name: contact_error(rounds[-1], truth) for name, rounds in found.items()}
     return times_ms, errors, len(chunks)
-
-
-def _played(chunks: ContactChunks, solver: Solver, round_index: int) -> list[Played]:
-    del round_index
-    return chunks.play(solver)

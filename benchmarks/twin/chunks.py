@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from benchmarks.rounds import every_round
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
 from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
@@ -43,7 +44,10 @@ class TimedChunk:
 
     def subjects(self) -> dict[str, Callable[[int], float]]:
         """Functions that measure processor milliseconds of the chunk with each selector."""
-        return {name: partial(self._timed, selector) for name, selector in SELECTORS.items()}
+        return {
+            name: every_round(partial(self._timed, selector))
+            for name, selector in SELECTORS.items()
+        }
 
     def states_are_equal(self) -> bool:
         """Whether the state after the chunk is bit-identical for every selector."""
@@ -53,8 +57,7 @@ class TimedChunk:
     def _step(self, selector: ReturnSelector) -> TwinState:
         return self._world.step(self._state, self._actions, seed=0, selector=selector).state
 
-    def _timed(self, selector: ReturnSelector, round_index: int) -> float:
-        del round_index
+    def _timed(self, selector: ReturnSelector) -> float:
         begin_s = time.process_time()
         self._step(selector)
         return 1e3 * (time.process_time() - begin_s)

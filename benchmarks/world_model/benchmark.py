@@ -1,20 +1,19 @@
 """Entry point of the benchmark stage `world-model`."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.world_model.held_out import HeldOut, held_out
 from benchmarks.world_model.rollouts import (
-    Imagined,
     RolloutError,
     imagine,
     imagine_together,
@@ -36,9 +35,15 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import EVERYTHING, ReturnSelector
 from dextouch.worlds import BatchWorld, CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
-
-if TYPE_CHECKING:
-    from services.world_model.state_world import StateWorld
+from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
+from services.world_model.network.model import Sampling
+from services.world_model.shipped_checkpoints import (
+    PRETRAINED,
+    STATE_MODEL,
+    paper_form_checkpoint,
+)
+from services.world_model.state_world import StateWorld
+from services.world_model.world import ModelWorld
 
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
@@ -75,11 +80,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
-    from services.world_model.checkpoints import read_checkpoint
-    from services.world_model.network.model import Sampling
-    from services.world_model.shipped_checkpoints import paper_form_checkpoint
-    from services.world_model.world import ModelWorld
-
     del folder
     plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
@@ -138,21 +138,19 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def _times(
     worlds: Mapping[str, World[Any]], episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
 ) -> dict[str, Figure]:
-    subjects = {name: partial(_imagined, world, episodes) for name, world in worlds.items()}
+    subjects = {
+        name: every_round(partial(imagine, world, episodes)) for name, world in worlds.items()
+    }
     with bar("steps and precision", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
 
 
-def _state_world(path: Path | None) -> "StateWorld":
-    from services.world_model.checkpoints import read_state_checkpoint
-    from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL
-    from services.world_model.state_world import StateWorld
-
+def _state_world(path: Path | None) -> StateWorld:
     return StateWorld(read_state_checkpoint(path or PRETRAINED / STATE_MODEL))
 
 
-def _state_costs(world: "StateWorld", num_rounds: int, bar: Bar) -> dict[str, Figure]:
+def _state_costs(world: StateWorld, num_rounds: int, bar: Bar) -> dict[str, Figure]:
     """Milliseconds per chunk of the state model, with one demonstration of each of its tasks."""
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     episodes = held_out(tasks, [FIRST_SEED], world.description.image_height_px)
@@ -170,30 +168,16 @@ def _costs(
     bar: Bar,
 ) -> dict[str, Figure]:
     """Milliseconds per chunk of one rollout, by requested images and batch size."""
-    subjects: dict[str, Callable[[int], Imagined]] = {
-        asked_name(asked, count): partial(_together, world, episodes, count, selector)
+    subjects = {
+        asked_name(asked, count): every_round(
+            partial(imagine_together, world, episodes, count, selector)
+        )
         for count in batches
         for asked, selector in SELECTORS.items()
     }
     with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
-
-
-def _imagined(world: World[Any], episodes: Sequence[HeldOut], round_index: int) -> Imagined:
-    del round_index
-    return imagine(world, episodes)
-
-
-def _together(
-    world: BatchWorld[Any],
-    episodes: Sequence[HeldOut],
-    num_rollouts: int,
-    selector: ReturnSelector,
-    round_index: int,
-) -> Imagined:
-    del round_index
-    return imagine_together(world, episodes, num_rollouts, selector)
 
 
 def _data(

@@ -2,16 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 from benchmarks.world_model.rollouts import RolloutError
 from dextouch.schemas import CHUNK_STEPS
-
-if TYPE_CHECKING:
-    from services.world_model.network.configuration import Precision, Sampler
+from services.world_model.network.configuration import Precision, Sampler
 
 COPY_FIRST: Final = "copy-first"
 MAX_CHUNK_MS: Final = 50.0
@@ -27,8 +25,8 @@ class Variant:
     """A sampling setting; `recomputed`: nothing is shared by its steps."""
 
     steps: int
-    sampler: "Sampler" = "euler"
-    precision: "Precision" = "float32"
+    sampler: Sampler = "euler"
+    precision: Precision = "float32"
     recomputed: bool = False
 
     @property
