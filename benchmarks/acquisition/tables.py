@@ -7,7 +7,7 @@ from benchmarks.acquisition.noise import Judgement, Line
 from benchmarks.acquisition.speed import READ_SIZES, WHOLE
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_most
-from benchmarks.report import ResultTable
+from benchmarks.report import ResultTable, cells
 
 OURS = "ours"
 CHECKED = ("dextouch", "wuji")
@@ -35,12 +35,8 @@ def tables(
             [
                 (
                     f"{found.family}, {found.way}",
-                    str(found.sent),
-                    str(found.touched),
-                    str(found.delivered),
-                    str(found.wrong),
-                    f"{100 * found.wrong_share:.3g}",
-                    str(found.collateral),
+                    *cells(found.sent, found.touched, found.delivered, found.wrong),
+                    *cells(100 * found.wrong_share, found.collateral),
                 )
                 for found in judgements
             ],

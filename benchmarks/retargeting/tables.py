@@ -1,12 +1,13 @@
 """Tables, charts and requirements of the retargeting benchmark."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Requirement, Sense, at_least, at_most
-from benchmarks.report import ResultTable
+from benchmarks.report import ResultTable, cells
 from benchmarks.retargeting.compare import (
     FULL,
     FULL_NOISE,
@@ -108,19 +109,7 @@ def _robot_table(robot: RobotScores, name: str, rivals: Sequence[str]) -> Result
     return ResultTable(
         f"The robot's own hands, {name}: means, joints beyond limits, largest turn a sample",
         ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
-        [
-            (
-                method,
-                f"{score.tip_mean_mm:.3g}",
-                f"{score.tip_p95_mm:.3g}",
-                f"{score.tip_max_mm:.3g}",
-                f"{score.joint_mean_deg:.3g}",
-                f"{score.joint_max_deg:.3g}",
-                str(score.num_outside),
-                f"{score.max_step_deg:.3g}",
-            )
-            for method, score in robot[name].items()
-        ]
+        [(method, *cells(*astuple(score))) for method, score in robot[name].items()]
         + _unfinished(rivals, robot[name], 8),
     )
 
@@ -131,14 +120,8 @@ def _pinch_table(pinches: Mapping[str, PinchScore], rivals: Sequence[str]) -> Re
         f"{velocity_limit_deg():.3g} deg a sample",
         ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
         [
-            (
-                method,
-                f"{score.gap_mean_mm:.3g}",
-                f"{score.gap_p95_mm:.3g}",
-                f"{score.same_angle_deg:.3g}",
-                f"{score.max_step_deg:.3g}",
-                str(score.num_outside),
-            )
+            # All but the number of pinches.
+            (method, *cells(*astuple(score)[:-1]))
             for method, score in pinches.items()
         ]
         + _unfinished(rivals, pinches, 6),

@@ -1,10 +1,11 @@
 """Tables, charts and requirements of the store benchmark."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.report import ResultTable
+from benchmarks.report import ResultTable, cells
 from benchmarks.store.appends import SPOOL, SPOOL_SYNCED, AppendResult
 from benchmarks.store.compare import DesignResult
 from benchmarks.store.live import SPEED, LiveResult
@@ -27,22 +28,12 @@ def tables(
         ResultTable(
             "Appending one glove sample (ms)",
             ("way", "p50", "p99", "appends a round"),
-            [(a.name, a.p50_ms.text(), a.p99_ms.text(), str(a.num_appends)) for a in appends],
+            [(a.name, *cells(a.p50_ms, a.p99_ms, a.num_appends)) for a in appends],
         ),
         ResultTable(
             "Live recording of a full station (late: accepted more than 0.1 s after it was due)",
             ("speed", "rows", "late", "dropped", "worst lag (ms)", "closing (s)"),
-            [
-                (
-                    f"{run.speed:g}",
-                    str(run.num_rows),
-                    str(run.num_late),
-                    str(run.num_dropped),
-                    f"{run.worst_lag_ms:.3g}",
-                    f"{run.finish_s:.3g}",
-                )
-                for run in live
-            ],
+            [cells(*astuple(run)) for run in live],
         ),
     ]
     return [table for table in found if table.rows]
