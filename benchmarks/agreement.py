@@ -7,18 +7,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 from services.evaluation.agreement import CORRELATIONS, FIGURES, figures_of_draws
 from services.evaluation.statistics import (
     MatchedScores,
@@ -43,8 +42,10 @@ SHARED: Final = 0.5
 # The paper's largest table: 4 tasks of 3 policies, 10 starts and 5 raters.
 PAPER: Final = (3, 10, 5)
 PAPER_TASKS: Final = 4
-USUAL: Final = {"studies": 200, "draws": 4000, "rounds": 7}
-QUICK: Final = {"studies": 6, "draws": 500, "rounds": 2}
+AMOUNTS: Final = Amounts(
+    usual={"studies": 200, "draws": 4000, "rounds": 7},
+    quick={"studies": 6, "draws": 500, "rounds": 2},
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Tally:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument("--studies", type=int, help="simulated studies of each kind (200; quick 6)")
+    AMOUNTS.add_options(parser, studies="simulated studies of each kind")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -80,10 +81,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no study.
     """
     del folder
-    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
-    plan["studies"] = plan["studies"] if options.studies is None else options.studies
-    if plan["studies"] < 1:
-        raise InvalidInputError(f"--studies: got {plan['studies']}, expected at least 1")
+    plan = AMOUNTS.of(options)
     kinds = [(p, d) for p in NUM_POLICIES for d in DISAGREEMENTS]
     found: dict[tuple[int, float], dict[tuple[str, str], Tally]] = {}
     with bar("studies", len(kinds)) as step:
@@ -218,14 +216,7 @@ def panel(
 ) -> Panel:
     """Time of a study against the distance of the coverage for Pearson's r from 95 %."""
     points = [
-        Point(
-            label=name,
-            time=figure.median,
-            time_low=figure.low,
-            time_high=figure.high,
-            error=abs(mean_held(found, name, "pearson") - 0.95),
-            is_ours=name == OURS,
-        )
+        Point.of(name, figure, abs(mean_held(found, name, "pearson") - 0.95), is_ours=name == OURS)
         for name, figure in times_s.items()
     ]
     label = "distance from 0.95 of the share that holds the truth"
@@ -239,18 +230,16 @@ def requirements(
     """Requirements on the intervals of an evaluation."""
     return [
         *(
-            Requirement(
+            at_least(
                 f"{name}: studies whose 95 % interval holds the truth",
                 mean_held(found, OURS, name),
-                "at least",
                 0.92,
             )
             for name in MEASURED
         ),
-        Requirement(
+        at_most(
             "hierarchical bootstrap of the paper's largest study, 10,000 draws",
             times_s["bootstrap"].median,
-            "at most",
             1.0,
             "s",
         ),

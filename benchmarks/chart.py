@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from benchmarks.figures import Figure
+
 _WIDTH, _HEIGHT = 460, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 18, 34, 48
 # Approximate mean width of a letter at the chart's font size.
@@ -22,6 +24,11 @@ class Point:
     time_high: float
     error: float
     is_ours: bool
+
+    @classmethod
+    def of(cls, label: str, time: Figure, error: float, *, is_ours: bool) -> "Point":
+        """The point of a design whose time was measured in several rounds."""
+        return cls(label, time.median, time.low, time.high, error, is_ours)
 
 
 @dataclass(frozen=True)

@@ -91,3 +91,13 @@ class Requirement:
     def verdict(self) -> str:
         """One word for the table."""
         return {None: "not measured", True: "pass", False: "FAIL"}[self.is_met]
+
+
+def at_least(what: str, figure: float | None, bound: float, unit: str = "") -> Requirement:
+    """The requirement that a figure is not below a bound."""
+    return Requirement(what, figure, "at least", bound, unit)
+
+
+def at_most(what: str, figure: float | None, bound: float, unit: str = "") -> Requirement:
+    """The requirement that a figure is not above a bound."""
+    return Requirement(what, figure, "at most", bound, unit)

@@ -42,7 +42,7 @@ _SHARE_OUT: Final = 0.8
 
 @dataclass(frozen=True)
 class ClickErrors:
-    """Errors of positions and headings, and the standard deviation that was stated for them.
+    """Errors of positions and headings, and the sd that was stated for each axis of the table.
 
     `refused` is the share of second clicks that were too near the first.
     """
@@ -51,18 +51,6 @@ class ClickErrors:
     turned_deg: Float64[np.ndarray, " m"]
     told_mm: Float64[np.ndarray, " n"]
     refused: float
-
-    def off(self, share: float) -> float:
-        """Quantile of the position error in mm."""
-        return float(np.quantile(self.off_mm, share))
-
-    def turned(self, share: float) -> float:
-        """Quantile of the heading error in degrees."""
-        return float(np.quantile(self.turned_deg, share))
-
-    def told(self, share: float) -> float:
-        """Quantile of the stated standard deviation in mm, on each axis of the table."""
-        return float(np.quantile(self.told_mm, share))
 
 
 @dataclass(frozen=True)

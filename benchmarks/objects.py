@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.figures import Requirement
+from benchmarks.figures import at_most
 from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.object_touch import TouchErrors, touch_errors
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
@@ -32,7 +31,8 @@ from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 
 PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
-FIRST_SEED, NUM_TAKES = 46_000, 4
+FIRST_SEED = 46_000
+AMOUNTS: Final = Amounts(usual={"takes": 4}, quick={"takes": 1})
 # Takes without images are cheap: so many for one with them.
 TAKES_OF_TOUCH: Final = 8
 SIDES_PX: Final = (320, 480)
@@ -51,7 +51,7 @@ Poses = dict[int, Float64[np.ndarray, "4 4"]]
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    parser.add_argument("--takes", type=int, help=f"takes per task ({NUM_TAKES}; quick 1)")
+    AMOUNTS.add_options(parser, takes="takes per task")
     tasks = ",".join(EVALUATED)
     parser.add_argument("--tasks", default=tasks, metavar="A,B", help="(%(default)s)")
 
@@ -86,9 +86,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: no such task.
     """
     del folder
-    count = options.takes if options.takes is not None else 1 if options.quick else NUM_TAKES
-    if count < 1:
-        raise InvalidInputError(f"--takes: got {count}, expected at least 1")
+    count = AMOUNTS.of(options)["takes"]
     tasks = named_tasks(options.tasks.split(","))
     sides_px = SIDES_PX[:1] if options.quick else SIDES_PX
     found: dict[tuple[int, str, str], list[_Found]] = {}
@@ -107,10 +105,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     clicked = click_errors(tasks, range(FIRST_SEED, FIRST_SEED + count))
     touched = touch_errors(tasks, range(FIRST_SEED, FIRST_SEED + TAKES_OF_TOUCH * count))
     best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
-    offs = {
-        f"{task} {name}": float(np.median(one.off_mm)) if len(one.off_mm) else float("nan")
-        for (task, name), one in touched.items()
-    }
     return StageReport(
         stage="objects",
         machine=describe_machine(PACKAGES),
@@ -118,33 +112,32 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[_table(found), _click_table(clicked), _touch_table(touched)],
         panels=[],
         requirements=[
-            Requirement("median error, sharp (mm)", _of(best, "off_mm", 0.5), "at most", 1.0),
-            Requirement("95 % error, sharp (mm)", _of(best, "off_mm", 0.95), "at most", 5.0),
-            Requirement(
+            at_most("median error, sharp (mm)", _quantile(_all(best, "off_mm")), 1.0),
+            at_most("95 % error, sharp (mm)", _quantile(_all(best, "off_mm"), 0.95), 5.0),
+            at_most(
                 "median error along the view, sharp (mm)",
-                abs(_of(best, "depth_mm", 0.5)),
-                "at most",
+                abs(_quantile(_all(best, "depth_mm"))),
                 0.5,
             ),
-            Requirement("95 % error of exact clicks (mm)", exact.off(0.95), "at most", 1.0),
-            Requirement("median error of clicks, 3 px of 480 (mm)", usual.off(0.5), "at most", 8.0),
+            at_most("95 % error of exact clicks (mm)", _quantile(exact.off_mm, 0.95), 1.0),
+            at_most("median error of clicks, 3 px of 480 (mm)", _quantile(usual.off_mm), 8.0),
             *(
-                Requirement(f"median error of touch, {name} (mm)", value, "at most", 12.0)
-                for name, value in offs.items()
+                at_most(f"median error of touch, {task} {name} (mm)", _quantile(one.off_mm), 12.0)
+                for (task, name), one in touched.items()
             ),
         ],
         data={
             f"clicks, {noise_px} px of {side_px}": {
-                "off_mm": one.off(0.5),
-                "off_mm_95": one.off(0.95),
-                "turned_deg": one.turned(0.5),
-                "turned_deg_95": one.turned(0.95),
+                "off_mm": _quantile(one.off_mm),
+                "off_mm_95": _quantile(one.off_mm, 0.95),
+                "turned_deg": _quantile(one.turned_deg),
+                "turned_deg_95": _quantile(one.turned_deg, 0.95),
             }
             for (side_px, noise_px), one in clicked.items()
         }
         | {
             f"{side_px} px, {look}, {design}": {
-                name: _of(each, name, 0.5) for name in ("off_mm", "depth_mm", "turned_deg")
+                name: _quantile(_all(each, name)) for name in ("off_mm", "depth_mm", "turned_deg")
             }
             for (side_px, look, design), each in found.items()
         },
@@ -251,8 +244,12 @@ def _errors(take: _Take, images: Images, track: Design) -> _Found:
     return _Found(np.array(off), np.array(depth), np.array(turned), possible, each_ms)
 
 
-def _of(each: Sequence[_Found], name: str, share: float) -> float:
-    values = np.concatenate([getattr(one, name) for one in each])
+def _all(each: Sequence[_Found], name: str) -> Float64[np.ndarray, " n"]:
+    """Errors of one kind in all takes."""
+    return np.concatenate([getattr(one, name) for one in each])
+
+
+def _quantile(values: Float64[np.ndarray, " n"], share: float = 0.5) -> float:
     return float(np.quantile(values, share)) if len(values) else float("nan")
 
 
@@ -265,9 +262,9 @@ def _table(found: Mapping[tuple[int, str, str], list[_Found]]) -> ResultTable:
                 f"{side_px} px, {look}",
                 design,
                 f"{share:.2f}",
-                f"{_of(each, 'off_mm', 0.5):.1f} / {_of(each, 'off_mm', 0.95):.1f}",
-                f"{_of(each, 'depth_mm', 0.5):+.1f}",
-                f"{_of(each, 'turned_deg', 0.5):.1f} / {_of(each, 'turned_deg', 0.95):.1f}",
+                _middle_and_most(_all(each, "off_mm")),
+                f"{_quantile(_all(each, 'depth_mm')):+.1f}",
+                _middle_and_most(_all(each, "turned_deg")),
                 f"{np.median([one.each_ms for one in each]):.1f}",
             )
         )
@@ -281,9 +278,9 @@ def _click_table(clicked: Mapping[tuple[int, int], ClickErrors]) -> ResultTable:
         (
             f"{side_px} px",
             f"{noise_px} px",
-            f"{one.off(0.5):.1f} / {one.off(0.95):.1f}",
-            f"{one.turned(0.5):.1f} / {one.turned(0.95):.1f}",
-            f"{one.told(0.5):.1f}",
+            _middle_and_most(one.off_mm),
+            _middle_and_most(one.turned_deg),
+            f"{_quantile(one.told_mm):.1f}",
             f"{one.refused:.1%}",
         )
         for (side_px, noise_px), one in clicked.items()
@@ -321,4 +318,4 @@ def _touch_table(touched: Mapping[tuple[str, str], TouchErrors]) -> ResultTable:
 def _middle_and_most(values: Float64[np.ndarray, " n"]) -> str:
     if not len(values):
         return "none"
-    return f"{np.quantile(values, 0.5):.1f} / {np.quantile(values, 0.95):.1f}"
+    return f"{_quantile(values):.1f} / {_quantile(values, 0.95):.1f}"

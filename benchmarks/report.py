@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.chart import Panel
-from benchmarks.figures import Requirement
+from benchmarks.figures import Figure, Requirement
 from dextouch.command_line import write_json_text
 
 
@@ -25,6 +25,15 @@ class ResultTable:
     columns: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     num_text_columns: int = 1
+
+
+def cells(*values: Figure | float) -> tuple[str, ...]:
+    """Texts of values: whole numbers, three digits of others, and the spread of figures."""
+    return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
+
+
+def _digits(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.3g}"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,11 @@ from dextouch.errors import InvalidInputError
 T = TypeVar("T")
 
 
+def every_round(measure: Callable[[], T]) -> Callable[[int], T]:
+    """A subject of `interleaved` that is measured in the same way in every round."""
+    return lambda _: measure()
+
+
 def interleaved(
     subjects: Mapping[str, Callable[[int], T]],
     num_rounds: int,

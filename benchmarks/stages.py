@@ -5,10 +5,10 @@ import importlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 from benchmarks.report import StageReport
-from dextouch.errors import UnknownNameError
+from dextouch.errors import InvalidInputError, UnknownNameError
 
 # Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
@@ -31,6 +31,46 @@ class Stage(Protocol):
         """
 
 
+class Amounts:
+    """Amounts that a stage measures: their usual values, those of --quick, and options for some.
+
+    Args:
+        usual: values by name.
+        quick: likewise, with --quick.
+    """
+
+    def __init__(self, usual: dict[str, Any], quick: dict[str, Any]) -> None:
+        self.usual, self.quick = usual, quick
+
+    def add_options(self, parser: argparse.ArgumentParser, **what: str) -> None:
+        """Add an option for each of these amounts; the texts say of what."""
+        for name, text in what.items():
+            usual, quick = self.usual[name], self.quick[name]
+            flag = f"--{name.replace('_', '-')}"
+            parser.add_argument(flag, type=type(usual), help=f"{text} ({usual:g}; quick {quick:g})")
+
+    def of(self, options: argparse.Namespace, **least: int | float) -> dict[str, Any]:
+        """The amounts of a run, those that options set instead of the default ones.
+
+        Args:
+            options: parsed command line.
+            least: smallest amounts other than 1.
+
+        Raises:
+            InvalidInputError: an option that is too small.
+        """
+        plan = {}
+        for name, default in (self.quick if options.quick else self.usual).items():
+            given = getattr(options, name, None)
+            plan[name] = default if given is None else given
+            if not plan[name] >= (bound := least.get(name, 1)):
+                flag = name.replace("_", "-")
+                raise InvalidInputError(
+                    f"--{flag}: got {plan[name]:g}, expected at least {bound:g}"
+                )
+        return plan
+
+
 class StageEntry(NamedTuple):
     """Module, summary and help text of a stage."""
 
@@ -45,7 +85,7 @@ STAGES = {
         "decode glove packets from a noisy line and time every driver",
         "Sends packets of three glove families over a line with bit errors and byte loss, and "
         "counts wrong packets and lost undamaged ones, for our decoders and for simple baselines "
-        "(start mark and length; start mark only). Times every decoder by size of the reads, and "
+        "(start mark and length; end mark only). Times every decoder by size of the reads, and "
         "every driver (gloves, trackers, bridges, robot, cameras), and reads eight gloves at 60 Hz "
         "on pseudo-terminals. Close other programs first: timings on a busy machine are not "
         "meaningful.",

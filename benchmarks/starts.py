@@ -11,29 +11,34 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.evaluator.playing import play_in_imagination, play_in_twin, start_in_twin
-from benchmarks.figures import Requirement
+from benchmarks.evaluator.playing import (
+    play_in_imagination,
+    play_in_twin,
+    stage_poses,
+    start_amid,
+    start_in_twin,
+)
+from benchmarks.figures import Requirement, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.clients import PolicyStart
-from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.images import decode_jpeg, encode_jpeg
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.scripted_actions import Actions, script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.tasks import EVALUATED, named_tasks
-from services.twin.world import TwinState, TwinWorld
+from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
 PACKAGES: Final = ("numpy", "mujoco", "torch")
-FIRST_SEED, NUM_STARTS = 45_000, 20
+FIRST_SEED = 45_000
+AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 STEPS: Final = (32, 64)
 WIDTHS: Final = (0.8, 1.2)
 _LAST = ReturnSelector(steps="last")
@@ -89,7 +94,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     files = {"--world": default_checkpoint(), "--probe": DEFAULT_PROBE}
     for flag, default in files.items():
         parser.add_argument(flag, type=Path, default=default, help="(%(default)s)")
-    parser.add_argument("--starts", type=int, help=f"starts per task ({NUM_STARTS}; quick 2)")
+    AMOUNTS.add_options(parser, starts="starts per task")
     tasks = ",".join(EVALUATED)
     parser.add_argument("--tasks", default=tasks, metavar="A,B", help="(%(default)s)")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="(%(default)s)")
@@ -113,9 +118,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: no such task.
     """
     del folder
-    count = options.starts if options.starts is not None else 2 if options.quick else NUM_STARTS
-    if count < 1:
-        raise InvalidInputError(f"--starts: got {count}, expected at least 1")
+    count = AMOUNTS.of(options)["starts"]
     tasks = named_tasks(options.tasks.split(","))
     judged = _Judged(options.world, SuccessClassifier.load(options.probe))
     found: dict[str, dict[str, list[_Read]]] = {}
@@ -161,19 +164,21 @@ class _Judged:
         started, first, start = start_in_twin(twin, task, seed, "")
         actions = scripted_actions(twin.stage(task), seed, script_name(0.0))
         real = play_in_twin(twin, started, actions, start, shows_chunks=False).success
-        truth_m = _true_m(twin, started.state)
+        truth = stage_poses(twin, started.state)
         found = {}
         for name, camera in CAMERAS.items():
             seen = _seen_by(first, camera, np.random.default_rng(seed))
             is_played = name in {"as in the twin", "all mild ones together"}
             verdict = self._verdict(seen, actions, start) if is_played else None
-            found[name] = replace(self._read(seen, truth_m), verdict=verdict, real=real)
+            found[name] = replace(self._read(seen, truth), verdict=verdict, real=real)
         state = started.state
         for before, step in pairwise((0, *STEPS)):
             stepped = twin.step(state, actions[before:step], seed=0, selector=_LAST)
             state = stepped.state
-            later = _amid(first, stepped.observation)
-            found[f"at step {step}"] = self._read(later, _true_m(twin, state))
+            shown = stepped.observation
+            image = shown.images[HEAD_CAMERA][-1]
+            later = start_amid(first, image, shown.tactile_kpa[-1], shown.action_reached[-1])
+            found[f"at step {step}"] = self._read(later, stage_poses(twin, state))
         return found
 
     def played(self, twin: TwinWorld, task: str, seed: int) -> _Read:
@@ -181,27 +186,21 @@ class _Judged:
         started, first, start = start_in_twin(twin, task, seed, "")
         actions = scripted_actions(twin.stage(task), seed, script_name(0.0))
         real = play_in_twin(twin, started, actions, start, shows_chunks=False).success
-        read = self._read(first, _true_m(twin, started.state))
+        read = self._read(first, stage_poses(twin, started.state))
         return replace(read, verdict=self._verdict(first, actions, start), real=real)
 
-    def _read(self, first: RolloutStart, truth_m: np.ndarray) -> _Read:
+    def _read(self, first: RolloutStart, truth: np.ndarray) -> _Read:
         started = self._world.reset(first)
         poses = started.observation.object_poses
         if poses is None:
             raise ValueError("the state model gives object poses with every start")
-        error_mm = 1e3 * np.linalg.norm(poses[0, :, :3] - truth_m, axis=-1)
-        expected = started.state.memory.start.sd_m[:, 0, : len(truth_m)]
+        error_mm = 1e3 * np.linalg.norm(poses[0, :, :3] - truth[:, :3], axis=-1)
+        expected = started.state.memory.start.sd_m[:, 0, : len(truth)]
         return _Read(error_mm, float(1e3 * expected.mean()))
 
     def _verdict(self, first: RolloutStart, actions: Actions, start: PolicyStart) -> str:
         imagined = play_in_imagination(self._world, first, actions, start, shows_chunks=False)
         return self._probe.verdict(imagined.ending(first.task)).decision
-
-
-def _true_m(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 3"]:
-    simulation = twin.stage(state.task).simulation
-    simulation.set_state(state.physics, step_index=0)
-    return simulation.object_poses()[:, :3]
 
 
 def _seen_by(first: RolloutStart, camera: Camera, draw: np.random.Generator) -> RolloutStart:
@@ -221,22 +220,6 @@ def shifted(image: Image, shift_px: tuple[int, int]) -> Image:
     padded = np.pad(image, ((most, most), (most, most), (0, 0)), mode="edge")
     (height, width), (top, left) = image.shape[:2], (most - down, most - right)
     return np.ascontiguousarray(padded[top : top + height, left : left + width])
-
-
-def _amid(first: RolloutStart, seen: Observation) -> RolloutStart:
-    """A start from a later observation, at which the hands are."""
-    if first.anchor is None:
-        raise ValueError("the twin gives an anchor with every start")
-    reached = seen.action_reached[-1:]
-    here = Observation(
-        first_step=0,
-        images={HEAD_CAMERA: seen.images[HEAD_CAMERA][-1:]},
-        tactile_kpa=seen.tactile_kpa[-1:],
-        action_reached=reanchor(reached, 0),
-        reached_is_measured=True,
-    )
-    anchor = poses_from_actions(reached, first.anchor).anchor(0)
-    return replace(first, observation=here, anchor=anchor)
 
 
 def _pixels(image: np.ndarray) -> Image:
@@ -296,6 +279,6 @@ def _requirements(found: Found) -> list[Requirement]:
     bounds = {"as in the twin": 5.0, "all mild ones together": 5.0}
     bounds |= {f"at step {step}": 6.0 for step in STEPS}
     return [
-        Requirement(f"median error, {kind} (mm)", median_mm(kind), "at most", bound)
+        at_most(f"median error, {kind} (mm)", median_mm(kind), bound)
         for kind, bound in bounds.items()
     ]

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.figures import Requirement
+from benchmarks.figures import at_least
 from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import clicked_image
 from benchmarks.object_touch import GRIPS, described_objects
@@ -73,7 +73,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[_table(trust)],
         panels=[],
         requirements=[
-            Requirement(f"AUC, {task}", float(one.get("auc") or "nan"), "at least", 0.80)
+            at_least(f"AUC, {task}", float(one.get("auc") or "nan"), 0.80)
             for task, one in trust.items()
         ],
         data={"trust": trust},

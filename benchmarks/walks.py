@@ -52,29 +52,30 @@ class Walk:
     """Files and functions that a piece of data passed through.
 
     Attributes:
-        calls: number of calls by (file, function).
-        per_thread: the same by thread.
+        calls: number of calls by (thread, file, function).
     """
 
     name: str
-    calls: Counter[tuple[str, str]] = field(default_factory=Counter)
-    per_thread: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    calls: Counter[tuple[str, str, str]] = field(default_factory=Counter)
 
     @property
     def files(self) -> list[str]:
         """Files that were entered, relative to the packages' parents."""
-        return sorted({file for file, _ in self.calls})
+        return sorted({file for _, file, _ in self.calls})
 
     @property
-    def num_functions(self) -> int:
-        """Number of different functions."""
-        return len(self.calls)
+    def functions(self) -> Counter[tuple[str, str]]:
+        """Number of calls by (file, function)."""
+        found: Counter[tuple[str, str]] = Counter()
+        for (_, *place), count in self.calls.items():
+            found[place[0], place[1]] += count
+        return found
 
     def num_calls(self, function: str, *, threads: str = "") -> int:
         """Number of calls of a function, in threads whose names begin with `threads`."""
         return sum(
             count
-            for (thread, _, name), count in self.per_thread.items()
+            for (thread, _, name), count in self.calls.items()
             if name == function and thread.startswith(threads)
         )
 
@@ -103,8 +104,7 @@ class Tracer:
         thread = threading.current_thread().name
         if thread.startswith(self._threads):
             with self._lock:
-                self.walk.calls[place] += 1
-                self.walk.per_thread[thread, *place] += 1
+                self.walk.calls[thread, *place] += 1
 
     @contextmanager
     def installed(self) -> Iterator["Tracer"]:
@@ -155,11 +155,10 @@ def packet_to_spool(stream: str, *, links: MockLinks | None = None) -> Walk:
         MockStation(
             streams, FaultScript(), 0, VirtualClock(), spool_root=Path(folder), links=links
         ) as station,
-    ):
         # Connected; from here on only the take is traced.
-        tracer.is_on = True
+        tracer.on(),
+    ):
         station.run_take(TakePrompt(task=TASK, instruction=TASK))
-        tracer.is_on = False
     return tracer.walk
 
 
@@ -287,11 +286,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.episodes:
         walks.append(window_into_training(options.episodes))
     for walk in walks:
-        print(f"{walk.name:30s} {len(walk.files):3d} files {walk.num_functions:4d} functions")
-        for (file, function), count in sorted(walk.calls.items()) if options.functions else ():
+        print(f"{walk.name:30s} {len(walk.files):3d} files {len(walk.functions):4d} functions")
+        for (file, function), count in sorted(walk.functions.items()) if options.functions else ():
             print(f"    {count:6d} {file}: {function}")
     found = {
-        walk.name: {"files": walk.files, "num_functions": walk.num_functions} for walk in walks
+        walk.name: {"files": walk.files, "num_functions": len(walk.functions)} for walk in walks
     }
     write_result(options.json, found)
     return 0

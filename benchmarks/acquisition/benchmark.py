@@ -3,39 +3,37 @@
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from benchmarks.acquisition.acceptance import requirements
 from benchmarks.acquisition.drivers import make_talks, measure_drivers
 from benchmarks.acquisition.families import make_families
 from benchmarks.acquisition.noise import Line, count_split_differences, judge
 from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.speed import measure_speed
-from benchmarks.acquisition.tables import panels, tables
+from benchmarks.acquisition.tables import panels, requirements, tables
 from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 
 LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
 PACKAGES = ("numpy", "pyserial")
-_QUICK = {"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5}
-_USUAL = {"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60}
+AMOUNTS = Amounts(
+    usual={"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60},
+    quick={"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5},
+)
 _NUM_PTY_ROUNDS = 3
 _BLOCKS = 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument(
-        "--packets", type=int, help=f"packets per family ({_USUAL['packets']}; quick 2000)"
+    AMOUNTS.add_options(
+        parser,
+        packets="packets per family",
+        rounds="timing rounds",
+        seconds="length of three runs",
+        splits="random splits",
     )
-    parser.add_argument("--rounds", type=int, help=f"timing rounds ({_USUAL['rounds']}; quick 1)")
-    parser.add_argument(
-        "--seconds", type=float, help=f"length of three runs ({_USUAL['seconds']:g}; quick 1)"
-    )
-    parser.add_argument("--splits", type=int, help=f"random splits ({_USUAL['splits']}; quick 5)")
     parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
 
 
@@ -46,7 +44,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: an invalid number.
     """
     del folder
-    plan = _plan(options)
+    plan = AMOUNTS.of(options, packets=5, seconds=1e-3)
     seed = options.seed
     families = make_families()
     with bar("bad line", len(families) * -(-plan["packets"] // _BLOCKS)) as step:
@@ -66,7 +64,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         speeds = measure_speed(families, plan["rounds"], seed=seed, on_step=step)
     talks = make_talks(seed=seed)
     with bar("every driver", plan["rounds"] * len(talks)) as step:
-        drivers = measure_drivers(talks, plan["rounds"], on_step=step)
+        driver_us = measure_drivers(talks, plan["rounds"], on_step=step)
     runs = []
     num_pty_rounds = 1 if options.quick else _NUM_PTY_ROUNDS
     with bar("eight gloves", num_pty_rounds) as step:
@@ -78,9 +76,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         stage="acquisition",
         machine=describe_machine(PACKAGES),
         options={**plan, "seed": seed},
-        tables=tables(judgements, speeds, drivers, line=LINE, core_share=share),
+        tables=tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
         panels=panels(judgements, speeds),
-        requirements=requirements(judgements, drivers, splits, share),
+        requirements=requirements(judgements, driver_us, splits, share),
         data={
             "line": asdict(LINE),
             "judgements": [asdict(found) for found in judgements],
@@ -91,12 +89,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             ],
             "drivers": [
                 {
-                    "driver": driver.name,
-                    "packet_bytes": driver.packet_bytes,
-                    "packet_reads": driver.packet_reads,
-                    "us_a_packet": list(driver.time_us.values),
+                    "driver": talk.name,
+                    "packet_bytes": talk.packet_bytes,
+                    "packet_reads": talk.packet_reads,
+                    "us_a_packet": list(driver_us[talk.name].values),
                 }
-                for driver in drivers
+                for talk in talks
             ],
             "eight_gloves": runs,
         },
@@ -106,16 +104,3 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "camera times include the quality checks; one in 10 JPEG images is decoded",
         ],
     )
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    plan: dict[str, Any] = {}
-    for name, default in (_QUICK if options.quick else _USUAL).items():
-        given = getattr(options, name)
-        plan[name] = default if given is None else given
-        if plan[name] <= 0:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected more than 0")
-    if plan["packets"] <= 4:
-        raise InvalidInputError(f"--packets: got {plan['packets']}, expected at least 5")
-    return plan

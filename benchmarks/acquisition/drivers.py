@@ -1,7 +1,7 @@
 """Processor time per packet of every driver, fed with the reads of its transport."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.acquisition.families import make_families
 from benchmarks.figures import Figure
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera import (
@@ -75,16 +75,6 @@ class DeviceTalk:
         return sum(map(len, self.packets)) / len(self.packets)
 
 
-@dataclass(frozen=True)
-class DriverSpeed:
-    """Processor time of one driver."""
-
-    name: str
-    packet_bytes: float
-    packet_reads: float
-    time_us: Figure
-
-
 def make_talks(*, seed: int) -> list[DeviceTalk]:
     """One device of each kind, without faults."""
     rng = np.random.default_rng(seed)
@@ -93,15 +83,11 @@ def make_talks(*, seed: int) -> list[DeviceTalk]:
 
 def measure_drivers(
     talks: Iterable[DeviceTalk], num_rounds: int, *, on_step: Callable[[str], None]
-) -> list[DriverSpeed]:
+) -> dict[str, Figure]:
     """µs a packet of processor time of each driver's decoder, in turns."""
-    named = {talk.name: talk for talk in talks}
-    subjects = {name: partial(_once, talk) for name, talk in named.items()}
-    found: Mapping[str, list[float]] = interleaved(subjects, num_rounds, on_step=on_step)
-    return [
-        DriverSpeed(talk.name, talk.packet_bytes, talk.packet_reads, Figure.of(found[talk.name]))
-        for talk in named.values()
-    ]
+    subjects = {talk.name: every_round(partial(_once, talk)) for talk in talks}
+    found = interleaved(subjects, num_rounds, on_step=on_step)
+    return {name: Figure.of(values) for name, values in found.items()}
 
 
 def decode_all(talk: DeviceTalk, decoder: Decoder) -> int:
@@ -114,8 +100,7 @@ def decode_all(talk: DeviceTalk, decoder: Decoder) -> int:
     return num_samples
 
 
-def _once(talk: DeviceTalk, round_index: int) -> float:
-    del round_index
+def _once(talk: DeviceTalk) -> float:
     decoder = talk.decoder()
     for read in talk.greeting:
         decoder.decode(read, 0)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -36,12 +35,8 @@ TOUCHED_SHARE = 0.3
 NO_CELL_SHARE = 0.3
 
 
-@runtime_checkable
-class Feed(Protocol):
-    """Decoder that maps bytes to the samples (baselines: payloads) of completed packets."""
-
-    def __call__(self, data: bytes, /) -> Sequence[bytes] | Sequence[Sample]:
-        """Decode the next bytes."""
+# Decoder that maps the next bytes to the samples (baselines: payloads) of completed packets.
+Feed = Callable[[bytes], Sequence[bytes] | Sequence[Sample]]
 
 
 @dataclass(frozen=True)
@@ -89,43 +84,15 @@ class FixedLength:
         return found
 
 
-class MarkAlone:
-    """Baseline: a packet is what lies between two marks."""
-
-    def __init__(self, mark: bytes, payload: slice) -> None:
-        self._mark, self._payload = mark, payload
-        self._buffer = bytearray()
-
-    def __call__(self, data: bytes) -> Sequence[bytes]:
-        """Payloads of what is taken for packets."""
-        buffer = self._buffer
-        buffer += data
-        found: list[bytes] = []
-        start = 0
-        while (end := buffer.find(self._mark, start + 1)) >= 0:
-            found.append(bytes(buffer[start:end][self._payload]))
-            start = end
-        del buffer[:start]
-        return found
-
-
 class TailAlone:
     """Baseline for packets that end with a mark: the bytes before it, if their length fits."""
 
     def __init__(self, mark: bytes) -> None:
-        self._mark = mark
-        self._buffer = bytearray()
+        self._mark, self._rest = mark, b""
 
     def __call__(self, data: bytes) -> Sequence[bytes]:
         """Payloads of what is taken for packets."""
-        buffer = self._buffer
-        buffer += data
-        found: list[bytes] = []
-        start = 0
-        while (end := buffer.find(self._mark, start)) >= 0:
-            found.append(bytes(buffer[start:end]))
-            start = end + len(self._mark)
-        del buffer[:start]
+        *found, self._rest = (self._rest + data).split(self._mark)
         return found
 
 
@@ -146,10 +113,7 @@ def make_families() -> tuple[Family, ...]:
             make=_make_ours,
             payload=ours_payload,
             decoder=partial(TactileGloveDecoder, "left"),
-            rivals={
-                "mark and length": lambda: FixedLength(MAGIC, ours_size, ours_payload),
-                "mark alone": lambda: MarkAlone(MAGIC, ours_payload),
-            },
+            rivals={"mark and length": lambda: FixedLength(MAGIC, ours_size, ours_payload)},
         ),
         Family(
             "wuji",
@@ -157,10 +121,7 @@ def make_families() -> tuple[Family, ...]:
             make=_make_wuji,
             payload=wuji_payload,
             decoder=partial(WujiGloveDecoder, "left"),
-            rivals={
-                "mark and length": lambda: FixedLength(MARK, PACKET_BYTES, wuji_payload),
-                "mark alone": lambda: MarkAlone(MARK, wuji_payload),
-            },
+            rivals={"mark and length": lambda: FixedLength(MARK, PACKET_BYTES, wuji_payload)},
         ),
         Family(
             "justfloat",

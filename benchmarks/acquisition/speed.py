@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.acquisition.families import Family
 from benchmarks.figures import Figure
-from benchmarks.rounds import interleaved
+from benchmarks.rounds import every_round, interleaved
 
 WHOLE = 0
 READ_SIZES = (64, WHOLE, 4096)
@@ -31,15 +31,13 @@ def measure_speed(
         for way in family.ways:
             for size in READ_SIZES:
                 name = f"{family.name}, {way}, {size or 'packet'}"
-                subjects[name] = partial(_once, family, way, (packets, size))
+                subjects[name] = every_round(partial(_once, family, way, packets, size))
                 keys[name] = (family.name, way, size)
     found = interleaved(subjects, num_rounds, on_step=on_step)
     return {keys[name]: Figure.of(values) for name, values in found.items()}
 
 
-def _once(family: Family, way: str, work: tuple[list[bytes], int], round_index: int) -> float:
-    del round_index
-    packets, size = work
+def _once(family: Family, way: str, packets: list[bytes], size: int) -> float:
     data = b"".join(packets)
     step = size or len(packets[0])
     portions = [data[at : at + step] for at in range(0, len(data), step)]

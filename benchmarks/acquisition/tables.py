@@ -1,22 +1,25 @@
-"""Tables and chart of the acquisition benchmark."""
+"""Tables, charts and requirements of the acquisition benchmark."""
 
 from collections.abc import Mapping, Sequence
 
-from benchmarks.acquisition.acceptance import OURS
-from benchmarks.acquisition.drivers import DriverSpeed
+from benchmarks.acquisition.drivers import DeviceTalk
 from benchmarks.acquisition.noise import Judgement, Line
 from benchmarks.acquisition.speed import READ_SIZES, WHOLE
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure
-from benchmarks.report import ResultTable
+from benchmarks.figures import Figure, Requirement, at_most
+from benchmarks.report import ResultTable, cells
 
+OURS = "ours"
+CHECKED = ("dextouch", "wuji")
+GLOVE = "glove "
 Speeds = Mapping[tuple[str, str, int], Figure]
 
 
 def tables(
     judgements: Sequence[Judgement],
     speeds: Speeds,
-    drivers: Sequence[DriverSpeed],
+    talks: Sequence[DeviceTalk],
+    driver_us: Mapping[str, Figure],
     *,
     line: Line,
     core_share: Figure,
@@ -32,12 +35,8 @@ def tables(
             [
                 (
                     f"{found.family}, {found.way}",
-                    str(found.sent),
-                    str(found.touched),
-                    str(found.delivered),
-                    str(found.wrong),
-                    f"{100 * found.wrong_share:.3g}",
-                    str(found.collateral),
+                    *cells(found.sent, found.touched, found.delivered, found.wrong),
+                    *cells(100 * found.wrong_share, found.collateral),
                 )
                 for found in judgements
             ],
@@ -55,12 +54,12 @@ def tables(
             ("driver", "bytes a packet", "reads a packet", "a packet (µs)"),
             [
                 (
-                    driver.name,
-                    f"{driver.packet_bytes:.0f}",
-                    f"{driver.packet_reads:g}",
-                    driver.time_us.text(),
+                    talk.name,
+                    f"{talk.packet_bytes:.0f}",
+                    f"{talk.packet_reads:g}",
+                    driver_us[talk.name].text(),
                 )
-                for driver in drivers
+                for talk in talks
             ],
         ),
         ResultTable(
@@ -73,24 +72,57 @@ def tables(
 
 def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:
     """Time against wrong packets, one panel per family."""
-    found = []
+    drawn = []
     for family in dict.fromkeys(judgement.family for judgement in judgements):
         points = [
-            _point(judgement, speeds[family, judgement.way, WHOLE])
-            for judgement in judgements
-            if judgement.family == family
+            Point.of(
+                found.way,
+                speeds[family, found.way, WHOLE],
+                100 * found.wrong_share,
+                is_ours=found.way == OURS,
+            )
+            for found in judgements
+            if found.family == family
         ]
         title = f"Decoding {family}"
-        found.append(Panel(title, "µs a packet", "wrong packets of those delivered (%)", points))
-    return found
+        drawn.append(Panel(title, "µs a packet", "wrong packets of those delivered (%)", points))
+    return drawn
 
 
-def _point(judgement: Judgement, time_us: Figure) -> Point:
-    return Point(
-        label=judgement.way,
-        time=time_us.median,
-        time_low=time_us.low,
-        time_high=time_us.high,
-        error=100 * judgement.wrong_share,
-        is_ours=judgement.way == OURS,
+def requirements(
+    judgements: Sequence[Judgement],
+    driver_us: Mapping[str, Figure],
+    split_differences: Mapping[str, int],
+    core_share: Figure | None,
+) -> list[Requirement]:
+    """Build the table of requirements; some may be unmeasured in this run."""
+    ours = {found.family: found for found in judgements if found.way == OURS}
+    table = []
+    for name in CHECKED:
+        found = ours.get(name)
+        many = "" if found is None else f" of {found.sent}"
+        table += [
+            at_most(
+                f"wrong packets{many}, {name}", None if found is None else float(found.wrong), 0.0
+            ),
+            at_most(
+                f"packets lost untouched{many}, {name}",
+                None if found is None else float(found.collateral),
+                0.0,
+            ),
+        ]
+    table.append(
+        at_most(
+            "ways of cutting the stream that change the packets, all families",
+            float(sum(split_differences.values())) if split_differences else None,
+            0.0,
+        )
     )
+    table += [
+        at_most(f"processor time a packet, {name}", time_us.median, 15.0, "µs")
+        for name, time_us in driver_us.items()
+        if name.startswith(GLOVE)
+    ]
+    share = None if core_share is None else core_share.median
+    table.append(at_most("core a stream, 8 gloves at 60 Hz on terminals", share, 1.0, "%"))
+    return table

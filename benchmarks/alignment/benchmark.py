@@ -9,13 +9,13 @@ from benchmarks.alignment.recordings import RecordedTake, record
 from benchmarks.alignment.tables import panels, requirements, tables
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_retargeter import warm_up
 
 PACKAGES = ("numpy", "numba", "scipy", "zstandard")
 QUICK_SECONDS, USUAL_SECONDS = "3", "10,60"
-QUICK_ROUNDS, USUAL_ROUNDS = 1, 5
+AMOUNTS = Amounts(usual={"rounds": 5}, quick={"rounds": 1})
 # Shorter takes have no stretch of 17 steps.
 MIN_SECONDS = 2.0
 
@@ -27,9 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="A,B",
         help=f"lengths of the takes ({USUAL_SECONDS}; quick {QUICK_SECONDS})",
     )
-    parser.add_argument(
-        "--rounds", type=int, help=f"rounds a take ({USUAL_ROUNDS}; quick {QUICK_ROUNDS})"
-    )
+    AMOUNTS.add_options(parser, rounds="rounds a take")
     parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
 
 
@@ -40,11 +38,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: a take that is too short, or no round.
     """
     lengths_s = _lengths_s(options)
-    num_rounds = options.rounds
-    if num_rounds is None:
-        num_rounds = QUICK_ROUNDS if options.quick else USUAL_ROUNDS
-    if num_rounds < 1:
-        raise InvalidInputError(f"--rounds: got {num_rounds}, expected at least 1")
+    num_rounds = AMOUNTS.of(options)["rounds"]
     takes = _record(lengths_s, options.seed, folder, bar)
     warm_up()
     results = [compare(take, num_rounds, folder, bar=bar) for take in takes]

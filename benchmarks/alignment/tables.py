@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from benchmarks.alignment.compare import METHODS, OURS, STEPS, MethodResult
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 
 Results = Mapping[str, MethodResult]
@@ -57,29 +57,20 @@ def panels(results: Results) -> list[Panel]:
             f"{title}, take of {results[OURS].take_s:g} s",
             "processor seconds of the alignment",
             what,
-            [_point(result, what) for result in results.values()],
+            [
+                Point.of(name, one.alignment_s, one.errors[what], is_ours=name == OURS)
+                for name, one in results.items()
+            ],
         )
         for title, what in CHARTS.items()
     ]
 
 
-def _point(result: MethodResult, what: str) -> Point:
-    spent = result.alignment_s
-    return Point(
-        result.method,
-        spent.median,
-        spent.low,
-        spent.high,
-        result.errors[what],
-        is_ours=result.method == OURS,
-    )
-
-
 def requirements(results: Results) -> list[Requirement]:
     """Requirements on speed and errors of the alignment service, on one take."""
     ours = results[OURS]
-    speed = Requirement(
-        "stored and aligned, times real time of one core", ours.speed.median, "at least", MIN_SPEED
+    speed = at_least(
+        "stored and aligned, times real time of one core", ours.speed.median, MIN_SPEED
     )
-    errors = [Requirement(what, ours.errors[what], "at most", BOUNDS[what]) for what in BOUNDS]
+    errors = [at_most(what, ours.errors[what], BOUNDS[what]) for what in BOUNDS]
     return [speed, *errors]

@@ -3,30 +3,27 @@
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from benchmarks.calibration.acceptance import notes, requirements
 from benchmarks.calibration.cameras import measure_cameras
 from benchmarks.calibration.compare import compare
 from benchmarks.calibration.refusals import try_scenes
-from benchmarks.calibration.tables import panels, tables
+from benchmarks.calibration.tables import notes, panels, requirements, tables
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.simulated.board_scenes import Motion, make_scene
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
-USUAL = {"seeds": 100, "camera_seeds": 20, "scenes": 20, "healthy": 50}
-QUICK = {"seeds": 4, "camera_seeds": 2, "scenes": 2, "healthy": 2}
+AMOUNTS = Amounts(
+    usual={"seeds": 100, "camera_seeds": 20, "scenes": 20, "healthy": 50},
+    quick={"seeds": 4, "camera_seeds": 2, "scenes": 2, "healthy": 2},
+)
 USUAL_COUNTS, QUICK_COUNTS = (8, 15, 25, 40), (8, 25)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument(
-        "--seeds", type=int, help=f"hand-eye scenes ({USUAL['seeds']}; quick {QUICK['seeds']})"
-    )
+    AMOUNTS.add_options(parser, seeds="hand-eye scenes")
     parser.add_argument("--views", type=int, default=20, help="views per scene (%(default)s)")
 
 
@@ -37,11 +34,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no seed.
     """
     del folder
-    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
-    if options.seeds is not None:
-        plan["seeds"] = options.seeds
-    if plan["seeds"] < 1:
-        raise InvalidInputError(f"--seeds: got {plan['seeds']}, expected at least 1")
+    plan = AMOUNTS.of(options)
     motion = Motion(num_views=options.views)
     with bar("making scenes", plan["seeds"]) as step:
         scenes = []

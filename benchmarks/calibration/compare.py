@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,7 @@ from dextouch.geometry import invert
 from services.alignment.calibration.motion import twist
 
 
-@dataclass(frozen=True)
-class Solved:
+class Solved(NamedTuple):
     """One method on one scene; `nees` per degree of freedom and `sigma` where available."""
 
     ms: float
@@ -88,20 +88,11 @@ def _solve_once(method: Method, scenes: Sequence[Scene], round_index: int) -> So
 
 
 def _result(name: str, solved: Sequence[Solved]) -> MethodResult:
-    def figure(key: str) -> Figure | None:
-        values = [getattr(one, key) for one in solved]
-        return None if None in values else Figure.of(values)
-
-    return MethodResult(
-        name,
-        len(solved),
-        ms=Figure.of([one.ms for one in solved]),
-        error_deg=Figure.of([one.error_deg for one in solved]),
-        error_mm=Figure.of([one.error_mm for one in solved]),
-        nees=figure("nees"),
-        sigma_deg=figure("sigma_deg"),
-        sigma_mm=figure("sigma_mm"),
-    )
+    columns: dict[str, Any] = {
+        key: None if None in values else Figure.of(values)
+        for key, values in zip(Solved._fields, zip(*solved, strict=True), strict=True)
+    }
+    return MethodResult(name, len(solved), **columns)
 
 
 def not_worse_share(

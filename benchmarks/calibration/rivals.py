@@ -1,16 +1,17 @@
 """Hand-eye methods under comparison: ours and OpenCV's."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.hand_eye import HandEyeNoise, HandEyeResult, solve_hand_eye
+from services.alignment.calibration.hand_eye import HandEyeNoise, solve_hand_eye
 from services.alignment.calibration.motion import park
 
 if TYPE_CHECKING:
@@ -31,102 +32,68 @@ class Answer:
     covariance: Float64[np.ndarray, "6 6"] | None = None
 
 
-class Method(ABC):
-    """A method that estimates the mount."""
+class Method(NamedTuple):
+    """A method that estimates the mount of a scene.
+
+    `solve` raises InvalidInputError: the method refuses the scene, or returns no finite mount.
+    """
 
     name: str
-
-    @abstractmethod
-    def solve(self, scene: "Scene") -> Answer:
-        """Estimate the mount.
-
-        Raises:
-            InvalidInputError: the method refuses the scene, or returns no finite mount.
-        """
+    solve: Callable[["Scene"], Answer]
 
 
-class Ours(Method):
+def _ours(scene: "Scene", *, with_corners: bool, noise: HandEyeNoise | None = None) -> Answer:
     """Our weighted bundle adjustment, with the corners or with the board's poses alone."""
-
-    def __init__(self, name: str, *, with_corners: bool, noise: HandEyeNoise | None = None) -> None:
-        self.name = name
-        self._with_corners, self._noise = with_corners, noise
-
-    def solve(self, scene: "Scene") -> Answer:
-        """By `solve_hand_eye`."""
-        views = scene.views if self._with_corners else None
-        result: HandEyeResult = solve_hand_eye(
-            scene.Ts_world_tracker, scene.Ts_camera_board, views=views, noise=self._noise
-        )
-        return Answer(result.T_tracker_camera, result.covariance)
+    views = scene.views if with_corners else None
+    result = solve_hand_eye(scene.Ts_world_tracker, scene.Ts_camera_board, views=views, noise=noise)
+    return Answer(result.T_tracker_camera, result.covariance)
 
 
-class OurPark(Method):
+def _our_park(scene: "Scene") -> Answer:
     """The closed-form solution that initializes our bundle adjustment."""
-
-    name = "our closed form"
-
-    def solve(self, scene: "Scene") -> Answer:
-        """By the closed form alone."""
-        return Answer(park(scene.Ts_world_tracker, scene.Ts_camera_board))
+    return Answer(park(scene.Ts_world_tracker, scene.Ts_camera_board))
 
 
-class OpenCvHandEye(Method):
+def _opencv_hand_eye(scene: "Scene", *, name: str) -> Answer:
     """`cv2.calibrateHandEye` with one of its methods."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def solve(self, scene: "Scene") -> Answer:
-        """By OpenCV."""
-        cv2 = _quiet_opencv()
-        tracker, board = scene.Ts_world_tracker, scene.Ts_camera_board
-        try:
-            # By keyword: the fifth positional argument is an output, not the method.
-            R, t = cv2.calibrateHandEye(
-                list(tracker[:, :3, :3]),
-                list(tracker[:, :3, 3]),
-                list(board[:, :3, :3]),
-                list(board[:, :3, 3]),
-                method=getattr(cv2, f"CALIB_HAND_EYE_{self.name.upper()}"),
-            )
-        except cv2.error as error:
-            raise InvalidInputError(f"{self.name}: OpenCV gives up ({error})") from error
-        return Answer(_finite(self.name, R, t))
+    tracker, board = scene.Ts_world_tracker, scene.Ts_camera_board
+    return Answer(_opencv("calibrateHandEye", "CALIB_HAND_EYE", name, tracker, board))
 
 
-class OpenCvRobotWorld(Method):
-    """`cv2.calibrateRobotWorldHandEye` with one of its methods."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def solve(self, scene: "Scene") -> Answer:
-        """By OpenCV, which finds the board's place too."""
-        cv2 = _quiet_opencv()
-
-        board, tracker = scene.Ts_camera_board, invert(scene.Ts_world_tracker)
-        try:
-            _, _, R, t = cv2.calibrateRobotWorldHandEye(
-                list(board[:, :3, :3]),
-                list(board[:, :3, 3]),
-                list(tracker[:, :3, :3]),
-                list(tracker[:, :3, 3]),
-                method=getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{self.name.upper()}"),
-            )
-        except cv2.error as error:
-            raise InvalidInputError(f"{self.name}: OpenCV gives up ({error})") from error
-        return Answer(invert(_finite(self.name, R, t)))
+def _opencv_robot_world(scene: "Scene", *, name: str) -> Answer:
+    """`cv2.calibrateRobotWorldHandEye` with one of its methods, which finds the board, too."""
+    board, tracker = scene.Ts_camera_board, invert(scene.Ts_world_tracker)
+    solver, prefix = "calibrateRobotWorldHandEye", "CALIB_ROBOT_WORLD_HAND_EYE"
+    return Answer(invert(_opencv(solver, prefix, name, board, tracker)))
 
 
-METHODS: tuple[Method, ...] = (
-    Ours(OURS, with_corners=True),
-    Ours(OURS_POSES, with_corners=False),
-    Ours(OURS_SIZE_KNOWN, with_corners=True, noise=HandEyeNoise(board_scale=2e-3)),
-    OurPark(),
-    *(OpenCvHandEye(name) for name in ("tsai", PARK, "horaud", "andreff", "daniilidis")),
-    *(OpenCvRobotWorld(name) for name in ("shah", "li")),
+METHODS = (
+    Method(OURS, partial(_ours, with_corners=True)),
+    Method(OURS_POSES, partial(_ours, with_corners=False)),
+    Method(
+        OURS_SIZE_KNOWN, partial(_ours, with_corners=True, noise=HandEyeNoise(board_scale=2e-3))
+    ),
+    Method("our closed form", _our_park),
+    *(
+        Method(name, partial(_opencv_hand_eye, name=name))
+        for name in ("tsai", PARK, "horaud", "andreff", "daniilidis")
+    ),
+    *(Method(name, partial(_opencv_robot_world, name=name)) for name in ("shah", "li")),
 )
+
+
+def _opencv(
+    solver: str, prefix: str, name: str, first: np.ndarray, second: np.ndarray
+) -> Float64[np.ndarray, "4 4"]:
+    """The last transform that a solver of OpenCV gives for two series of poses."""
+    cv2 = _quiet_opencv()
+    poses = [list(part) for Ts in (first, second) for part in (Ts[:, :3, :3], Ts[:, :3, 3])]
+    try:
+        # By keyword: the fifth positional argument is an output, not the method.
+        *_, R, t = getattr(cv2, solver)(*poses, method=getattr(cv2, f"{prefix}_{name.upper()}"))
+    except cv2.error as error:
+        raise InvalidInputError(f"{name}: OpenCV gives up ({error})") from error
+    return _finite(name, R, t)
 
 
 def _quiet_opencv() -> ModuleType:

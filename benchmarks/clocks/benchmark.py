@@ -1,9 +1,7 @@
 """Entry point of the benchmark stage `clocks`."""
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from benchmarks.clocks.compare import compare, compare_stampless
 from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STOP_SCENES, find_scene
@@ -11,20 +9,17 @@ from benchmarks.clocks.scores import WARM_UP_S
 from benchmarks.clocks.tables import panels, requirements, tables
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 
 PACKAGES = ("numpy",)
-_QUICK = {"seconds": 60.0, "rounds": 1}
-_USUAL = {"seconds": 600.0, "rounds": 5}
+AMOUNTS = Amounts(usual={"seconds": 600.0, "rounds": 5}, quick={"seconds": 60.0, "rounds": 1})
+# Online errors count after the warm-up, and a step comes in the middle.
+MIN_SECONDS = 2 * WARM_UP_S + 2
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument(
-        "--seconds", type=float, help=f"length of a take ({_USUAL['seconds']:g}; quick 60)"
-    )
-    parser.add_argument("--rounds", type=int, help=f"takes per scene ({_USUAL['rounds']}; quick 1)")
+    AMOUNTS.add_options(parser, seconds="length of a take", rounds="takes per scene")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first round (%(default)s)")
     names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES]).replace("%", "%%")
     parser.add_argument("--scenes", metavar="A,B", help=f"comma-separated scenes (all: {names})")
@@ -37,7 +32,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: an unknown scene.
         InvalidInputError: takes that are too short, or no round.
     """
-    plan = _plan(options)
+    plan = AMOUNTS.of(options, seconds=MIN_SECONDS)
     names = list(SCENES | MORE_SCENES | STOP_SCENES)
     if options.scenes is not None:
         names = [name.strip() for name in options.scenes.split(",")]
@@ -58,18 +53,3 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "after it; each round is a take with a different seed"
         ],
     )
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
-    given = {name: getattr(options, name) for name in defaults}
-    plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}
-    if plan["seconds"] < 2 * WARM_UP_S + 2:
-        raise InvalidInputError(
-            f"--seconds: got {plan['seconds']:g}, expected at least {2 * WARM_UP_S + 2:g}: online "
-            f"errors count after {WARM_UP_S:g} s, and a step comes in the middle"
-        )
-    if plan["rounds"] < 1:
-        raise InvalidInputError(f"--rounds: got {plan['rounds']}, expected at least 1")
-    return plan

@@ -9,7 +9,7 @@ from benchmarks.clocks.compare import COUNTED, NUMBERED, Result
 from benchmarks.clocks.rivals import OFFLINE, ONLINE
 from benchmarks.clocks.scenes import SCENES, STOP_SCENES
 from benchmarks.clocks.scores import BOUND_MS, RECOVERY_S
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 
 OURS_ONLINE, OURS_OFFLINE, ARRIVALS = "ours, online", "ours, offline", "arrival stamps"
@@ -59,30 +59,21 @@ def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list
     lossy = [r.rms_ms.median for r in dated if r.scene == "2 % lost"]
     cost = max((r.us_per_sample.median for r in online), default=None)
     return [
-        Requirement("online RMS, seven scenes", _worst(online, "rms_ms"), "at most", 0.3, "ms"),
-        Requirement("online p99, seven scenes", _worst(online, "p99_ms"), "at most", 1.0, "ms"),
-        Requirement("offline RMS, seven scenes", _worst(offline, "rms_ms"), "at most", 0.3, "ms"),
-        Requirement("offline RMS, stops", _worst(stopped, "rms_ms"), "at most", 0.3, "ms"),
-        Requirement("online RMS, stamps of 1 ms", _worst(coarse, "rms_ms"), "at most", 0.6, "ms"),
-        Requirement(
+        at_most("online RMS, seven scenes", _worst(online, "rms_ms"), 0.3, "ms"),
+        at_most("online p99, seven scenes", _worst(online, "p99_ms"), 1.0, "ms"),
+        at_most("offline RMS, seven scenes", _worst(offline, "rms_ms"), 0.3, "ms"),
+        at_most("offline RMS, stops", _worst(stopped, "rms_ms"), 0.3, "ms"),
+        at_most("online RMS, stamps of 1 ms", _worst(coarse, "rms_ms"), 0.6, "ms"),
+        at_most(
             f"after a step of -30 ms above {BOUND_MS:g} ms for",
             max((figure.high for figure in felt), default=None),
-            "at most",
             RECOVERY_S,
             "s",
         ),
-        Requirement("times better than arrivals", _gain(seven), "at least", 10.0),
-        Requirement("online, a sample", cost, "at most", 15.0, "µs"),
-        Requirement(
-            "RMS without stamps, up to 0.2 % lost", _worst(lossless, "rms_ms"), "at most", 0.3, "ms"
-        ),
-        Requirement(
-            "RMS without stamps, 2 % lost, median",
-            max(lossy, default=None),
-            "at most",
-            0.65,
-            "ms",
-        ),
+        at_least("times better than arrivals", _gain(seven), 10.0),
+        at_most("online, a sample", cost, 15.0, "µs"),
+        at_most("RMS without stamps, up to 0.2 % lost", _worst(lossless, "rms_ms"), 0.3, "ms"),
+        at_most("RMS without stamps, 2 % lost, median", max(lossy, default=None), 0.65, "ms"),
     ]
 
 
@@ -144,16 +135,8 @@ def _points(results: Sequence[Result]) -> list[Point]:
     points = []
     for way in ways:
         mine = [result for result in results if result.way == way]
-        times = [max(result.us_per_sample.median, _TINY_US) for result in mine]
+        times = Figure.of([max(result.us_per_sample.median, _TINY_US) for result in mine])
         error = max(result.rms_ms.median for result in mine)
-        points.append(
-            Point(
-                label=f"{way}: {error:.2g} ms",
-                time=float(np.median(times)),
-                time_low=min(times),
-                time_high=max(times),
-                error=error,
-                is_ours=way in {OURS_ONLINE, OURS_OFFLINE},
-            )
-        )
+        is_ours = way in {OURS_ONLINE, OURS_OFFLINE}
+        points.append(Point.of(f"{way}: {error:.2g} ms", times, error, is_ours=is_ours))
     return points

@@ -8,15 +8,14 @@ from statistics import mean
 from benchmarks.closure.contact_times import timing_errors
 from benchmarks.closure.methods import METHODS, OURS, Method
 from benchmarks.closure.replay import TASKS, ClosureTake, close_take
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_least
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
+from benchmarks.stages import Amounts, Bar
 
 PACKAGES = ("numpy", "mujoco", "numba")
 FIRST_SEED = 100
-NUM_TAKES = 20
+AMOUNTS = Amounts(usual={"takes": 20}, quick={"takes": 1})
 MIN_SUCCESS = 0.8
 QUICK_METHODS = (METHODS[0], OURS)
 COLUMNS = ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra")
@@ -26,9 +25,7 @@ Played = Mapping[tuple[str, Method], Sequence[ClosureTake]]
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    parser.add_argument(
-        "--takes", type=int, metavar="N", help=f"human takes per task ({NUM_TAKES}; quick 1)"
-    )
+    AMOUNTS.add_options(parser, takes="human takes per task")
     parser.add_argument(
         "--tasks", default=",".join(TASKS), metavar="A,B", help="tasks of the twin (%(default)s)"
     )
@@ -42,9 +39,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: no such task.
     """
     del folder
-    num_takes = options.takes if options.takes is not None else 1 if options.quick else NUM_TAKES
-    if num_takes < 1:
-        raise InvalidInputError(f"--takes: got {num_takes}, expected at least 1")
+    num_takes = AMOUNTS.of(options)["takes"]
     tasks = options.tasks.split(",")
     methods = QUICK_METHODS if options.quick else METHODS
     played: dict[tuple[str, Method], list[ClosureTake]] = {
@@ -92,9 +87,7 @@ def _table(played: Played, num_takes: int) -> ResultTable:
 
 
 def _requirement(played: Played, task: str) -> Requirement:
-    return Requirement(
-        f"{task}: success of {OURS.name}", _rate(played[task, OURS]), "at least", MIN_SUCCESS
-    )
+    return at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
 
 
 def _rate(takes: Sequence[ClosureTake]) -> float:

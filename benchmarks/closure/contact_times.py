@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from dextouch.tactile import PADS, in_contact
 from dextouch.tactile.layout import SIDES, split_pads
@@ -18,12 +18,8 @@ _NS_PER_MS: Final = 1e6
 
 @dataclass(frozen=True)
 class ContactTimes:
-    """First and last contact of each pad of the left and the right hand.
+    """First and last contact of each pad of the left and the right hand; NaN: never touched."""
 
-    `first_ms` and `last_ms` are zero for pads never `touched`.
-    """
-
-    touched: Bool[np.ndarray, "2 7"]
     first_ms: Float64[np.ndarray, "2 7"]
     last_ms: Float64[np.ndarray, "2 7"]
 
@@ -42,8 +38,7 @@ class TimingErrors:
 
 def contact_times(streams: Mapping[str, TruthStream]) -> ContactTimes:
     """Contact times of every pad in the streams `tactile_left` and `tactile_right`."""
-    touched = np.zeros((len(SIDES), len(PLACES)), dtype=bool)
-    first, last = np.zeros(touched.shape), np.zeros(touched.shape)
+    first, last = np.full((2, len(SIDES), len(PLACES)), np.nan)
     for row, side in enumerate(SIDES):
         stream = streams[f"tactile_{side}"]
         tips, palm = split_pads(in_contact(stream.values))
@@ -52,10 +47,9 @@ def contact_times(streams: Mapping[str, TruthStream]) -> ContactTimes:
         places = np.concatenate([pads, pads.any(axis=1, keepdims=True)], axis=1)
         for column in np.flatnonzero(places.any(axis=0)):
             at = np.flatnonzero(places[:, column])
-            touched[row, column] = True
             first[row, column] = stream.t_ref_ns[at[0]] / _NS_PER_MS
             last[row, column] = stream.t_ref_ns[at[-1]] / _NS_PER_MS
-    return ContactTimes(touched, first, last)
+    return ContactTimes(first, last)
 
 
 def timing_errors(pairs: Sequence[tuple[ContactTimes, ContactTimes]]) -> TimingErrors:
@@ -63,20 +57,21 @@ def timing_errors(pairs: Sequence[tuple[ContactTimes, ContactTimes]]) -> TimingE
 
     `num_missing` counts pads with contact in the human take only, `num_extra` in the replay only.
     """
-    hand_first: list[float] = []
-    hand_last: list[float] = []
-    pad_first: list[float] = []
-    pad_last: list[float] = []
-    missing = extra = 0
-    for human, replay in pairs:
-        both = human.touched & replay.touched
-        missing += int((human.touched & ~replay.touched)[:, :-1].sum())
-        extra += int((replay.touched & ~human.touched)[:, :-1].sum())
-        late_first, late_last = replay.first_ms - human.first_ms, replay.last_ms - human.last_ms
-        hand_first += late_first[:, -1][both[:, -1]].tolist()
-        hand_last += late_last[:, -1][both[:, -1]].tolist()
-        pad_first += late_first[:, :-1][both[:, :-1]].tolist()
-        pad_last += late_last[:, :-1][both[:, :-1]].tolist()
-    return TimingErrors(
-        tuple(hand_first), tuple(hand_last), tuple(pad_first), tuple(pad_last), missing, extra
+    first, last = (
+        np.array([[getattr(take, name) for take in pair] for pair in pairs])
+        for name in ("first_ms", "last_ms")
     )
+    late_first, late_last = first[:, 1] - first[:, 0], last[:, 1] - last[:, 0]
+    human, replay = np.moveaxis(np.isfinite(first[..., :-1]), 1, 0)
+    return TimingErrors(
+        hand_first_ms=_finite(late_first[..., -1]),
+        hand_last_ms=_finite(late_last[..., -1]),
+        pad_first_ms=_finite(late_first[..., :-1]),
+        pad_last_ms=_finite(late_last[..., :-1]),
+        num_missing=int((human & ~replay).sum()),
+        num_extra=int((replay & ~human).sum()),
+    )
+
+
+def _finite(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(values[np.isfinite(values)].tolist())

@@ -103,7 +103,7 @@ class RetargetedHand:
         offset = np.zeros(3) if wrist == "copied" else constant_offset_m(self.points)
         return np.tile(offset, (num_steps, 1))
 
-    def commands(self, method: Method, servos: HandServos) -> HandCommands:
+    def commands(self, method: Method) -> HandCommands:
         """Commands of this hand at every step."""
         offset_m = self.offset_m(method.wrist)
         Ts_world_robot = shifted_wrist(self.Ts_world_human, offset_m)
@@ -113,7 +113,9 @@ class RetargetedHand:
             joints = anchored_joints(self.hand, joints, self.points, offset_m, shares)
         if not method.presses:
             return HandCommands(Ts_world_robot, joints)
-        return commands_from_touch(self.hand, Ts_world_robot, joints, self.pad_forces_n, servos)
+        return commands_from_touch(
+            self.hand, Ts_world_robot, joints, self.pad_forces_n, TWIN_SERVOS
+        )
 
 
 @dataclass(frozen=True)
@@ -170,11 +172,9 @@ def _retargeted(streams: dict[str, TruthStream], side: Side) -> RetargetedHand:
     )
 
 
-def robot_trajectory(
-    take: RetargetedTake, method: Method, servos: HandServos = TWIN_SERVOS
-) -> HandTrajectory:
+def robot_trajectory(take: RetargetedTake, method: Method) -> HandTrajectory:
     """Robot commands at every step of the grid."""
-    left, right = (hand.commands(method, servos) for hand in (take.left, take.right))
+    left, right = (hand.commands(method) for hand in (take.left, take.right))
     return HandTrajectory(
         left.Ts_world_wrist,
         right.Ts_world_wrist,

@@ -14,7 +14,7 @@ from benchmarks.closure.methods import (
 )
 from dextouch.hands.actions import HandTrajectory, actions_from_poses, poses_from_actions
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.episodes import Recorder, TakeOptions, TruthEpisode, TruthStream, record
+from services.twin.episodes import Recorder, TakeOptions, TruthStream, record
 from services.twin.names import Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Plan, Stage, command_row
@@ -50,14 +50,7 @@ def closure_stage(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings(image_height_px=_IMAGE_PX, image_width_px=_IMAGE_PX))
 
 
-def human_take(task: str, seed: int, images: tuple[str, ...] = ()) -> TruthEpisode:
-    """The human's take of one seed, without noise."""
-    return record(closure_stage(task, "human"), seed, TakeOptions(images=images))
-
-
-def replay(
-    task: str, take: RetargetedTake, trajectory: HandTrajectory, images: tuple[str, ...] = ()
-) -> Replay:
+def replay(task: str, take: RetargetedTake, trajectory: HandTrajectory) -> Replay:
     """Play a trajectory with the robot hand, from the initial object poses of the human take.
 
     The trajectory is converted to 67-D actions and back, as in every episode.
@@ -65,7 +58,7 @@ def replay(
     stage = closure_stage(task, "robot")
     anchor = stage.start(Plan(take.object_poses, trajectory))
     commands = poses_from_actions(actions_from_poses(trajectory, anchor), anchor)
-    recorder = Recorder(stage, TakeOptions(images=images))
+    recorder = Recorder(stage, TakeOptions(images=()))
     recorder.sample(0)
     for row in range(1, NUM_GRID_STEPS):
         for step_index in stage.simulation.advance(command_row(commands, row)):
@@ -77,7 +70,7 @@ def close_take(
     task: str, seed: int, methods: Iterable[Method], done: Callable[[str], None] | None = None
 ) -> list[ClosureTake]:
     """Replay one human take with every method."""
-    episode = human_take(task, seed)
+    episode = record(closure_stage(task, "human"), seed, TakeOptions(images=()))
     take = retarget_take(episode)
     human_contact = contact_times(episode.streams)
     results = []

@@ -20,15 +20,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from services.alignment.retargeting.wrist_transfer import (
-    NUM_PADS,
-    fingertip_jacobians,
-    robot_places_m,
-)
+from services.alignment.retargeting.wrist_transfer import fingertip_jacobians, robot_places_m
 
 # Lever that converts moments to forces, about half the size of a grasp.
 _LEVER_M: Final = 0.05
@@ -52,11 +47,6 @@ class HandServos:
     finger_nm_rad: float
     wrist_n_m: float
     wrist_nm_rad: float
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < np.inf:
-                raise InvalidInputError(f"hand servos: got {name} {value}, expected > 0")
 
 
 @dataclass(frozen=True)
@@ -82,19 +72,9 @@ def commands_from_touch(
         joints_rad: [T, 20], target angles, inside the limits.
         pad_forces_n: [T, 6], target forces of thumb … little fingertip and palm.
         servos: stiffness of the commanded hand.
-
-    Raises:
-        ShapeError: lengths that differ.
-        NonFiniteError: NaN or infinity.
-        InvalidInputError: a negative force.
     """
     Ts = np.asarray(Ts_world_wrist, dtype=np.float64)
     joints = np.asarray(joints_rad, dtype=np.float64)
-    if Ts.shape != (len(joints), 4, 4):
-        raise ShapeError(
-            f"touch commands: got poses {Ts.shape} and joints {joints.shape}, expected [T, 4, 4] "
-            f"and [T, {NUM_JOINTS}]"
-        )
     forces_n = pressing_forces_n(hand, joints, pad_forces_n)
     _, jacobian = fingertip_jacobians(hand, joints)
     torques_nm = (np.swapaxes(jacobian, -1, -2) @ forces_n[:, :NUM_FINGERS, :, None])[..., 0]
@@ -114,23 +94,8 @@ def pressing_forces_n(
 
     Minimises Σ |f_i - F_i n_i|² / F_i, with the measured F_i along the normal n_i of pad i, plus
     the squared imbalance (of forces, and of moments about the centre of contact) over a slack.
-
-    Raises:
-        ShapeError: lengths that differ.
-        NonFiniteError: NaN or infinity.
-        InvalidInputError: a negative force.
     """
     felt_n = np.asarray(pad_forces_n, dtype=np.float64)
-    if felt_n.shape != (len(joints_rad), NUM_PADS):
-        raise ShapeError(
-            f"touch commands: got forces {felt_n.shape}, expected [{len(joints_rad)}, {NUM_PADS}]"
-        )
-    if not np.isfinite(felt_n).all():
-        raise NonFiniteError("touch commands: forces contain NaN or infinity; mask those samples")
-    if (felt_n < 0).any():
-        raise InvalidInputError(
-            f"touch commands: got {felt_n.min()} N, expected 0 or more; tare the glove"
-        )
     forces = np.zeros((*felt_n.shape, 3))
     touched = np.flatnonzero(felt_n.any(axis=1))
     if touched.size:

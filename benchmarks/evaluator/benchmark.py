@@ -14,7 +14,7 @@ from benchmarks.evaluator.keeping import KeptRows, Row
 from benchmarks.evaluator.kind_lines import VERDICTS
 from benchmarks.evaluator.kinds import NONE, STRENGTHS, KindsPlan
 from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.page import cell, write_page
+from benchmarks.evaluator.page import write_page
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
@@ -28,7 +28,7 @@ from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.bundled_policies import DEFAULT_POLICY
@@ -38,7 +38,7 @@ from services.twin.tasks import EVALUATED
 
 PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
-_USUAL_STARTS, _QUICK_STARTS = 20, 2
+AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 # Titles of the tables, by their names in `evaluator.json`.
 _ROWS: Final[Mapping[str, tuple[str, Callable[[TaskFigures], list[dict[str, Any]]]]]] = {
     "kinds": ("Mistakes by kind, beside the ladder", TaskFigures.kind_rows),
@@ -56,32 +56,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--world",
-        action="append",
-        type=Path,
-        help="checkpoint of the world model (committed one); may be repeated for training seeds",
-    )
-    parser.add_argument(
-        "--probe",
-        action="append",
-        type=Path,
-        help="checkpoint of the judge (committed one); once for all worlds, or once for each",
-    )
-    parser.add_argument(
-        "--direct",
-        action="append",
-        type=Path,
-        help="checkpoint of the direct judge, a baseline that imagines nothing (none); once for "
-        "all worlds, or once for each",
-    )
-    parser.add_argument(
-        "--without-touch",
-        action="append",
-        type=Path,
-        help="checkpoint of a world model trained without touch, as a baseline (none); once "
-        "for all worlds, or once for each",
-    )
+    each = "once for all worlds, or once for each"
+    for flag, what in {
+        "--world": "the world model (committed one); may be repeated for training seeds",
+        "--probe": f"the judge (committed one); {each}",
+        "--direct": f"the direct judge, a baseline that imagines nothing (none); {each}",
+        "--without-touch": f"a world model trained without touch, as a baseline (none); {each}",
+    }.items():
+        parser.add_argument(flag, action="append", type=Path, help=f"checkpoint of {what}")
     parser.add_argument(
         "--each-member",
         action="store_true",
@@ -115,9 +97,7 @@ def _add_rollouts(parser: argparse.ArgumentParser) -> None:
         help="scripts with position errors and all other policies; none: mistakes only (usual)",
     )
     parser.add_argument("--tasks", nargs="+", default=list(EVALUATED), help="(%(default)s)")
-    parser.add_argument(
-        "--starts", type=int, help=f"starts per task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
-    )
+    AMOUNTS.add_options(parser, starts="starts per task")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="%(default)s")
     parser.add_argument(
         "--cloned",
@@ -169,12 +149,15 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     figures, failed = figures_of_tasks(study, kept)
     lines = [line for each in figures for line in each.lines()]
     rows = {name: [row for each in figures for row in of(each)] for name, (_, of) in _ROWS.items()}
-    titled = {title: rows[name] for name, (title, _) in _ROWS.items()}
+    tables = [
+        interval_table(lines),
+        *(row_table(title, rows[name]) for name, (title, _) in _ROWS.items() if rows[name]),
+    ]
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, lines, titled, notes)
+    write_page(plan.keep / "evaluator.html", study.about, tables, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
@@ -192,10 +175,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "policies": plan.policies,
             "kinds": plan.kinds and asdict(plan.kinds),
         },
-        tables=[
-            interval_table(lines),
-            *(row_table(title, each) for title, each in titled.items() if each),
-        ],
+        tables=tables,
         panels=[],
         requirements=[
             *(line.requirement() for line in lines),
@@ -239,7 +219,7 @@ def _rolled(study: Study, kept: KeptRows, about: tuple[str, int, str]) -> list[R
 
 
 def interval_table(lines: Sequence[Line]) -> ResultTable:
-    """Figures with their intervals, and with those of every training seed if there are several."""
+    """Figures with intervals and bounds, and those of every training seed if there are several."""
     several = max((len(line.by_seed) for line in lines), default=1) > 1
     rows = [
         (
@@ -247,11 +227,13 @@ def interval_table(lines: Sequence[Line]) -> ResultTable:
             line.text(line.value),
             "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
             str(line.num),
+            f"{line.sense} {line.bound:g} {line.unit}".rstrip(),
+            line.requirement().verdict(),
             *([", ".join(map(line.text, line.by_seed))] if several else []),
         )
         for line in lines
     ]
-    columns = ["", "figure", "95 % over starts", "rollouts or policies"]
+    columns = ["", "figure", "95 % over starts", "rollouts or policies", "bound", "verdict"]
     columns += ["training seeds"] * several
     return ResultTable("Imagined and real", tuple(columns), rows)
 
@@ -259,7 +241,11 @@ def interval_table(lines: Sequence[Line]) -> ResultTable:
 def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
     """Rows of one kind as a table."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
-    return ResultTable(title, columns, [tuple(cell(row.get(n)) for n in columns) for row in rows])
+    return ResultTable(title, columns, [tuple(_cell(row.get(n)) for n in columns) for row in rows])
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else "" if value is None else str(value)
 
 
 def _results(
@@ -287,12 +273,9 @@ def _worlds(options: argparse.Namespace) -> Sequence[Path | None]:
 
 
 def _plan(options: argparse.Namespace) -> StudyPlan:
-    default = _QUICK_STARTS if options.quick else _USUAL_STARTS
-    num_starts = default if options.starts is None else options.starts
-    if num_starts < 1 or options.jobs < 1:
-        raise InvalidInputError(
-            f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
-        )
+    num_starts = AMOUNTS.of(options)["starts"]
+    if options.jobs < 1:
+        raise InvalidInputError(f"--jobs: got {options.jobs}, expected at least 1")
     only_mistakes = options.ladder == NONE
     if only_mistakes and (options.cloned or options.policy):
         raise InvalidInputError(

@@ -98,7 +98,7 @@ class Sampling:
         self.seeds = sorted({one.seed for one in rollouts})
         generator = np.random.default_rng(0)
         self.counts = start_counts(max(1, len(self.seeds)), generator, num_draws=NUM_DRAWS)
-        self._own = np.ones((1, max(1, len(self.seeds))))
+        self.own = np.ones((1, max(1, len(self.seeds))))
 
     def starts(self, rollouts: Iterable[Rolled]) -> np.ndarray:
         """Index of the start of every rollout."""
@@ -126,7 +126,7 @@ class Sampling:
             return undefined(what, bound)
         value, draws = (
             area_under_roc_of_draws(scores, positive, self.starts(rollouts), counts)
-            for counts in (self._own, self.counts)
+            for counts in (self.own, self.counts)
         )
         return Drawn(what, float(value[0]), draws, len(rollouts), bound, worst=worst)
 
@@ -139,7 +139,7 @@ class Sampling:
         starts = self.starts(mine)
         value, draws = (
             balanced_accuracy_of_draws(likely, success, starts, counts)
-            for counts in (self._own, self.counts)
+            for counts in (self.own, self.counts)
         )
         return Drawn(what, float(value[0]), draws, len(mine), ("at least", bound))
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float64
 
 from benchmarks.evaluator.drawn import (
     POLICIES,
@@ -17,6 +16,7 @@ from benchmarks.evaluator.drawn import (
     lines_over_seeds,
     undefined,
 )
+from benchmarks.evaluator.resampling import rates_of_draws
 from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
 from services.twin.scripted_actions import mistake_of
@@ -49,14 +49,18 @@ class KindFigures:
 
     def _drawn(self, rollouts: Sequence[Rolled]) -> list[Drawn]:
         what = f"mistakes ({self._name})"
-        policies = {"kinds and strengths": _policy_name, "kinds": kind_of}
+        policies = {"kinds and strengths": policy_name, "kinds": kind_of}
         return [
             *group_figures(self._sampling, what, rollouts),
             *(
                 figure
                 for name, policy_of in policies.items()
                 for figure in policy_figures(
-                    self._sampling, f"{POLICIES} ({self._name} {name})", rollouts, policy_of
+                    self._sampling,
+                    f"{POLICIES} ({self._name} {name})",
+                    rollouts,
+                    policy_of,
+                    (0.85, 0.12),
                 )
             ),
         ]
@@ -143,8 +147,17 @@ def policy_figures(
     what: str,
     rollouts: Sequence[Rolled],
     policy_of: Callable[[Rolled], str],
+    bounds: tuple[float, float],
 ) -> list[Drawn]:
-    """Agreement of success rates over policies, each from its own starts."""
+    """Agreement of success rates over policies, each from its own starts.
+
+    Args:
+        sampling: of the starts.
+        what: name of the figures.
+        rollouts: of all policies.
+        policy_of: the policy of a rollout.
+        bounds: least correlation and greatest MMRV.
+    """
     names = list(dict.fromkeys(map(policy_of, rollouts)))
     shape = (len(names), len(sampling.seeds))
     count, real, told = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -153,12 +166,15 @@ def policy_figures(
         count[at] += 1
         real[at] += one.success
         told[at] += one.rows[IMAGINED]["likely_success"]
-    bounds: tuple[Bound, Bound] = (("at least", 0.85), ("at most", 0.12))
-    titles = (f"{what}, Pearson", f"{what}, MMRV with ties")
+    about: tuple[tuple[str, Bound], ...] = (
+        (f"{what}, Pearson", ("at least", bounds[0])),
+        (f"{what}, MMRV with ties", ("at most", bounds[1])),
+    )
     if len(names) < 2:
-        return [undefined(*pair) for pair in zip(titles, bounds, strict=True)]
-    means = {"real": _rates(real, count)[0], "imagined": _rates(told, count)[0]}
-    draws = [_rates(side, count, sampling.counts) for side in (real, told)]
+        return [undefined(*each) for each in about]
+    sides = {"real": real, "imagined": told}
+    means = {name: rates_of_draws(side, count, sampling.own)[0] for name, side in sides.items()}
+    draws = [rates_of_draws(side, count, sampling.counts) for side in sides.values()]
     values = (pearson(**means), mmrv(**means, ties="simpler"))
     # A draw may lack all starts of a policy: its figures are undefined.
     whole = np.isfinite(draws[0]).all(axis=1)
@@ -166,18 +182,8 @@ def policy_figures(
     drawn[:, whole] = [of(*(side[whole] for side in draws)) for of in _OF_DRAWS]
     return [
         Drawn(title, value, each, len(names), bound)
-        for title, value, each, bound in zip(titles, values, drawn, bounds, strict=True)
+        for (title, bound), value, each in zip(about, values, drawn, strict=True)
     ]
-
-
-def _rates(
-    sums: Float64[np.ndarray, "policies starts"],
-    count: Float64[np.ndarray, "policies starts"],
-    draws: Float64[np.ndarray, "draws starts"] | None = None,
-) -> Float64[np.ndarray, "draws policies"]:
-    weights = np.ones((1, sums.shape[1])) if draws is None else draws
-    with np.errstate(invalid="ignore"):
-        return (weights @ sums.T) / (weights @ count.T)
 
 
 def kind_of(one: Rolled) -> str:
@@ -192,7 +198,8 @@ def kind_of(one: Rolled) -> str:
     return mistake.kind
 
 
-def _policy_name(one: Rolled) -> str:
+def policy_name(one: Rolled) -> str:
+    """The policy of a rollout."""
     return one.policy
 
 

@@ -1,6 +1,7 @@
 """Kept rows as the lines of the evaluator's table: figure, interval over starts, bound."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,16 +17,18 @@ from benchmarks.evaluator.drawn import (
     lines_over_seeds,
     undefined,
 )
-from benchmarks.evaluator.kind_lines import KindFigures
+from benchmarks.evaluator.kind_lines import (
+    IMAGINED,
+    TRUE,
+    KindFigures,
+    policy_figures,
+    policy_name,
+)
 from benchmarks.evaluator.plan import IDLE
-from benchmarks.evaluator.resampling import rates_of_draws
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
-from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.settings import RISK_OF_DECIDED
-from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
 from services.twin.scripted_actions import mistake_of
 
-TRUE, IMAGINED = "true verdict", "imagined verdict"
 _LAST_IMAGE = "verdict of the last image"
 
 
@@ -153,35 +156,17 @@ def _decision_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Dra
 def _policy_figures(
     sampling: Sampling, scripts: Sequence[Rolled], everything: Sequence[Rolled]
 ) -> list[Drawn]:
-    found = []
-    for name, rollouts, least, most in (
-        ("scripts", scripts, 0.93, 0.05),
-        ("all", everything, 0.90, 0.08),
+    """Agreement of success rates over the policies that have every start."""
+    figures = []
+    for name, rollouts, bounds in (
+        ("scripts", scripts, (0.93, 0.05)),
+        ("all", everything, (0.90, 0.08)),
     ):
-        correlation, violation = (
-            f"{POLICIES} ({name}), {word}" for word in ("Pearson", "MMRV with ties")
-        )
-        rates = _rates(rollouts, sampling.seeds)
-        if rates is None:
-            found += [
-                undefined(correlation, ("at least", least)),
-                undefined(violation, ("at most", most)),
-            ]
-            continue
-        real, imagined = rates
-        means = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
-        draws = [rates_of_draws(side, sampling.counts) for side in rates]
-        found += [
-            Drawn(
-                correlation, pearson(**means), pearson_of_draws(*draws), len(real),
-                ("at least", least),
-            ),
-            Drawn(
-                violation, mmrv(**means, ties="simpler"), mmrv_of_draws(*draws), len(real),
-                ("at most", most),
-            ),
-        ]  # fmt: skip
-    return found
+        starts = Counter(map(policy_name, rollouts))
+        whole = [one for one in rollouts if starts[one.policy] == len(sampling.seeds)]
+        what = f"{POLICIES} ({name})"
+        figures += policy_figures(sampling, what, whole, policy_name, bounds)
+    return figures
 
 
 def _idle_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Drawn]:
@@ -227,21 +212,3 @@ def _still_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Dra
         Drawn(touch, pressure, none, len(mine), ("at most", 2.0), "kPa"),
         Drawn(image, gain, none, len(mine), ("at least", -1.0), "dB"),
     ]
-
-
-def _rates(
-    rollouts: Sequence[Rolled], seeds: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Real and imagined outcomes [policies, starts] of the policies that have every start."""
-    found = {(one.policy, one.seed): one for one in rollouts}
-    names = [
-        name
-        for name in dict.fromkeys(one.policy for one in rollouts)
-        if all((name, seed) in found for seed in seeds)
-    ]
-    if len(names) < 2:
-        return None
-    grid = [[found[name, seed] for seed in seeds] for name in names]
-    real = np.array([[one.success for one in row] for row in grid], dtype=float)
-    told = [[one.rows[IMAGINED]["likely_success"] for one in row] for row in grid]
-    return real, np.array(told, dtype=float)

@@ -8,6 +8,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from benchmarks.evaluator.plan import NUM_STEPS
 from dextouch.clients import Policy, PolicyStart
+from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.schemas import (
     CHUNK_STEPS,
     Observation,
@@ -187,6 +188,33 @@ def _chunk(
     where = f"policy, step {first}: act"
     answer = ask(policy.act, seen, where=where)
     return action_chunk(answer, world.description, where=where)[:CHUNK_STEPS]
+
+
+def start_amid(
+    first: RolloutStart,
+    image: UInt8[np.ndarray, "h w 3"],
+    tactile_kpa: Float32[np.ndarray, "2 320"],
+    reached: Float64[np.ndarray, "67"],
+) -> RolloutStart:
+    """A start from a later step of a rollout, at which the hands have reached an action.
+
+    Args:
+        first: start of the rollout.
+        image: of the head camera at the step.
+        tactile_kpa: at the step.
+        reached: relative to the start of the rollout.
+    """
+    if first.anchor is None:
+        raise ValueError("the twin gives an anchor with every start")
+    observation = Observation(
+        first_step=0,
+        images={HEAD_CAMERA: image[None]},
+        tactile_kpa=tactile_kpa[None],
+        action_reached=reanchor(reached[None], 0),
+        reached_is_measured=True,
+    )
+    anchor = poses_from_actions(reached[None], first.anchor).anchor(0)
+    return replace(first, observation=observation, anchor=anchor)
 
 
 def start_in_twin(

@@ -13,7 +13,7 @@ from typing import Final
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from benchmarks.evaluator.drawn import Line
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_most
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 # Smallest tolerances by unit: of areas under the curve, correlations, rates and the like, and of
@@ -82,7 +82,7 @@ def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
         what = f"{line.task}: {line.what}, apart from {other.value:.3f} before"
         sampling = math.hypot(_half_width(line.interval), _half_width(other.interval))
         bound = max(TOLERANCES[other.unit], sampling)
-        found.append(Requirement(what, apart, "at most", bound, line.unit))
+        found.append(at_most(what, apart, bound, line.unit))
     return found
 
 

@@ -27,14 +27,18 @@ def _weights(counts: Counts, start_index: np.ndarray) -> Float64[np.ndarray, "dr
     return counts[:, np.asarray(start_index)]
 
 
-def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, "draws policies"]:
-    """Mean outcome of every policy in every draw.
+def rates_of_draws(
+    outcomes: np.ndarray, played: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, "draws policies"]:
+    """Mean outcome of every policy in every draw; NaN where a draw lacks all of its starts.
 
     Args:
-        outcomes: [policies, starts].
+        outcomes: [policies, starts], sums over the rollouts.
+        played: [policies, starts], numbers of rollouts.
         counts: from `start_counts`.
     """
-    return counts @ np.asarray(outcomes, dtype=np.float64).T / counts.sum(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((counts @ outcomes.T) / (counts @ played.T))
 
 
 def area_under_roc_of_draws(

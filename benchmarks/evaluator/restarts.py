@@ -1,20 +1,13 @@
 """Touch that a world imagines for one chunk when it is restarted from the true observation."""
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from benchmarks.evaluator.measuring import contact_counts
-from benchmarks.evaluator.playing import TrueRollout
+from benchmarks.evaluator.playing import TrueRollout, start_amid
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.hands.actions import (
-    HandTrajectory,
-    poses_from_actions,
-    reanchor,
-)
-from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
-from dextouch.streams import HEAD_CAMERA
+from dextouch.hands.actions import HandTrajectory, reanchor
+from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
 from dextouch.worlds import StartedRollout, State, World
 from services.twin.world import TwinState, TwinWorld
 
@@ -41,7 +34,8 @@ def contact_with_true_context(
     for index in range(len(real.images_of_chunks)):
         start, chunk = first, real.actions[index * CHUNK_STEPS : (index + 1) * CHUNK_STEPS]
         if index:
-            start = _restart(first, real, index, reached[index - 1])
+            image, touch = real.images_of_chunks[index - 1], real.tactile_kpa[index * CHUNK_STEPS]
+            start = start_amid(first, image, touch, reached[index - 1])
             chunk = reanchor(chunk, 0, anchor_action=reached[index - 1])
         state = world.reset(start).state
         imagined = world.step(state, chunk, seed=first.seed, selector=_NO_IMAGES)
@@ -60,23 +54,6 @@ def _reached_rows(
         rows.append(step.observation.action_reached[-1])
         state = step.state
     return rows
-
-
-def _restart(
-    first: RolloutStart, real: TrueRollout, index: int, reached: Float64[np.ndarray, "67"]
-) -> RolloutStart:
-    """The true step before chunk `index` as a rollout start."""
-    if first.anchor is None:
-        raise ValueError("the twin gives an anchor with every start")
-    observation = Observation(
-        first_step=0,
-        images={HEAD_CAMERA: real.images_of_chunks[index - 1][None]},
-        tactile_kpa=real.tactile_kpa[index * CHUNK_STEPS][None],
-        action_reached=reanchor(reached[None], 0),
-        reached_is_measured=True,
-    )
-    anchor = poses_from_actions(reached[None], first.anchor).anchor(0)
-    return replace(first, observation=observation, anchor=anchor)
 
 
 def chunks_that_move(

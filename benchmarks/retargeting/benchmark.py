@@ -2,12 +2,11 @@
 
 import argparse
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.retargeting.acceptance import requirements
 from benchmarks.retargeting.compare import (
     Effort,
     compare_pinches,
@@ -27,24 +26,21 @@ from benchmarks.retargeting.rivals import (
     missing_modules,
 )
 from benchmarks.retargeting.robustness import try_faults
-from benchmarks.retargeting.tables import panels, tables
-from benchmarks.stages import Bar
+from benchmarks.retargeting.tables import panels, requirements, tables
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 
 PACKAGES = ("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs")
-USUAL = Effort(2, 600, 5, 6, 5000, 0)
-QUICK = Effort(1, 120, 1, 1, 100, 0)
+AMOUNTS = Amounts(
+    usual={"seeds": 2, "samples": 600, "people": 5, "rounds": 6, "postures": 5000},
+    quick={"seeds": 1, "samples": 120, "people": 1, "rounds": 1, "postures": 100},
+)
 _NONE = "none"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument(
-        "--rounds", type=int, help=f"timing rounds ({USUAL.num_rounds}; quick {QUICK.num_rounds})"
-    )
-    parser.add_argument(
-        "--samples", type=int, help=f"of a motion ({USUAL.num_samples}; quick {QUICK.num_samples})"
-    )
+    AMOUNTS.add_options(parser, rounds="timing rounds", samples="of a motion")
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the first motion (%(default)s)"
     )
@@ -63,7 +59,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no round, or motions of fewer than 30 samples.
     """
     del folder
-    effort = _effort(options)
+    if options.seed < 0:
+        raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
+    plan = AMOUNTS.of(options, samples=30)
+    effort = Effort(**{f"num_{name}": one for name, one in plan.items()}, seed=options.seed)
     chosen, left_out = choose_rivals(options.rivals)
     with ExitStack() as stack:
         rivals = {one.name: stack.enter_context(RivalProcess(one)) for one in chosen}
@@ -123,19 +122,3 @@ def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
             f"{', '.join(missing)} not installed; {INSTALL}"
         )
     return told
-
-
-def _effort(options: argparse.Namespace) -> Effort:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    effort = replace(QUICK if options.quick else USUAL, seed=options.seed)
-    if options.rounds is not None:
-        effort = replace(effort, num_rounds=options.rounds)
-    if options.samples is not None:
-        effort = replace(effort, num_samples=options.samples)
-    if effort.num_rounds < 1:
-        raise InvalidInputError(f"--rounds: got {effort.num_rounds}, expected at least 1")
-    if effort.num_samples < 30:
-        raise InvalidInputError(f"--samples: got {effort.num_samples}, expected at least 30")
-    if effort.seed < 0:
-        raise InvalidInputError(f"--seed: got {effort.seed}, expected at least 0")
-    return effort

@@ -4,9 +4,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from typing import Final
 
-import numpy as np
+from scipy.spatial.transform import Rotation
 
-from dextouch.geometry.rotations import rotation_from_quaternion
 from dextouch.hands import CHAINS
 from dextouch.hands.robot_hand import RobotHand
 
@@ -28,8 +27,9 @@ def hand_urdf(hand: RobotHand) -> str:
         for joint, row in enumerate(finger.joints):
             child = link_name(CHAINS[index], joint)
             element = _joint(robot, row.name, "revolute", (parent, child))
-            R = rotation_from_quaternion(np.array(row.q_wxyz))
-            _origin(element, row.position_m, roll_pitch_yaw(R))
+            # Angles about fixed x, then y, then z, as URDF wants them.
+            R = Rotation.from_quat(row.q_wxyz, scalar_first=True)
+            _origin(element, row.position_m, R.as_euler("xyz", suppress_warnings=True))
             ET.SubElement(element, "axis", xyz=_text(row.axis))
             low, high = row.limits_rad
             limit = ET.SubElement(element, "limit", effort=_EFFORT, velocity=_VELOCITY)
@@ -49,17 +49,6 @@ def link_name(chain: str, joint: int) -> str:
 def tip_name(chain: str) -> str:
     """The link at a fingertip."""
     return f"{chain}_tip"
-
-
-def roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
-    """Angles (rad) about fixed x, then y, then z of a rotation [3, 3], as URDF wants them.
-
-    At a pitch of ±90° roll and yaw are not unique: yaw is zero.
-    """
-    pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
-    if np.hypot(R[0, 0], R[1, 0]) < 1e-9:
-        return float(np.arctan2(-R[1, 2], R[1, 1])), pitch, 0.0
-    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
 
 
 def _joint(robot: ET.Element, name: str, kind: str, links: tuple[str, str]) -> ET.Element:

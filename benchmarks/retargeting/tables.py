@@ -1,21 +1,35 @@
-"""Tables and charts of the retargeting benchmark."""
+"""Tables, charts and requirements of the retargeting benchmark."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple
+
+import numpy as np
 
 from benchmarks.chart import Panel, Point
-from benchmarks.report import ResultTable
-from benchmarks.retargeting.acceptance import velocity_limit_deg
+from benchmarks.figures import Requirement, Sense, at_least, at_most
+from benchmarks.report import ResultTable, cells
 from benchmarks.retargeting.compare import (
+    FULL,
+    FULL_NOISE,
+    NATURAL,
     NATURAL_NOISE,
     PINCH_INPUT,
     ROBOT_INPUT,
     RobotScores,
     Speed,
 )
-from benchmarks.retargeting.ours import OURS, OURS_LIVE, ColdStart
+from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
+from benchmarks.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from benchmarks.retargeting.robustness import HAND_LOST, NODE_LOST, NODES_LOST, Outcome
 from benchmarks.retargeting.robustness import table_rows as fault_rows
-from benchmarks.retargeting.scores import PinchScore
+from benchmarks.retargeting.scores import PinchScore, RobotScore
+from benchmarks.simulated.hand_motions import RATE_HZ
+from services.alignment.retargeting import RetargetOptions
+
+# (library, how many times as fast), each with its vectors from the wrist to 15 points.
+PROMISED_SPEED = ((DEX, 150.0), (DEXI, 5.0))
+# Tolerance for rounding at the velocity limit.
+_ROUNDING_DEG = 1e-6
 
 
 def tables(
@@ -62,14 +76,7 @@ def panels(
 
 def _points(speeds: Sequence[Speed], motion: str, errors: Mapping[str, float]) -> list[Point]:
     return [
-        Point(
-            label=speed.method,
-            time=speed.cpu_us.median,
-            time_low=speed.cpu_us.low,
-            time_high=speed.cpu_us.high,
-            error=errors[speed.method],
-            is_ours=speed.method == OURS,
-        )
+        Point.of(speed.method, speed.cpu_us, errors[speed.method], is_ours=speed.method == OURS)
         for speed in speeds
         if speed.motion == motion and speed.method in errors
     ]
@@ -102,19 +109,7 @@ def _robot_table(robot: RobotScores, name: str, rivals: Sequence[str]) -> Result
     return ResultTable(
         f"The robot's own hands, {name}: means, joints beyond limits, largest turn a sample",
         ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
-        [
-            (
-                method,
-                f"{score.tip_mean_mm:.3g}",
-                f"{score.tip_p95_mm:.3g}",
-                f"{score.tip_max_mm:.3g}",
-                f"{score.joint_mean_deg:.3g}",
-                f"{score.joint_max_deg:.3g}",
-                str(score.num_outside),
-                f"{score.max_step_deg:.3g}",
-            )
-            for method, score in robot[name].items()
-        ]
+        [(method, *cells(*astuple(score))) for method, score in robot[name].items()]
         + _unfinished(rivals, robot[name], 8),
     )
 
@@ -125,15 +120,96 @@ def _pinch_table(pinches: Mapping[str, PinchScore], rivals: Sequence[str]) -> Re
         f"{velocity_limit_deg():.3g} deg a sample",
         ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
         [
-            (
-                method,
-                f"{score.gap_mean_mm:.3g}",
-                f"{score.gap_p95_mm:.3g}",
-                f"{score.same_angle_deg:.3g}",
-                f"{score.max_step_deg:.3g}",
-                str(score.num_outside),
-            )
+            # All but the number of pinches.
+            (method, *cells(*astuple(score)[:-1]))
             for method, score in pinches.items()
         ]
         + _unfinished(rivals, pinches, 6),
     )
+
+
+def requirements(
+    speeds: Sequence[Speed],
+    robot: RobotScores,
+    pinches: Mapping[str, PinchScore],
+    cold: ColdStart,
+) -> list[Requirement]:
+    """Build the table of requirements; some may be unmeasured in this run."""
+    return [
+        *_speed(speeds),
+        *_exactness([robot[name][OURS_EXACT] for name in (NATURAL, FULL)]),
+        *_noise([robot[name][OURS] for name in (NATURAL_NOISE, FULL_NOISE)]),
+        *_pinches(pinches[OURS]),
+        *_limits(robot, pinches[OURS]),
+        *_cold(cold),
+    ]
+
+
+def worst_ratio(speeds: Sequence[Speed], ours: str, rival: str) -> float | None:
+    """Other library's time relative to ours: median over the rounds, for the worse input."""
+    times = {(speed.method, speed.motion): speed.cpu_us for speed in speeds}
+    motions = {motion for method, motion in times if method == rival}
+    ratios = [times[rival, motion].over(times[ours, motion]).median for motion in motions]
+    return min(ratios, default=None)
+
+
+def velocity_limit_deg() -> float:
+    """Maximum joint change between samples under our default velocity limit."""
+    return float(np.rad2deg(RetargetOptions().velocity_limit_rad_s / RATE_HZ))
+
+
+def _speed(speeds: Sequence[Speed]) -> list[Requirement]:
+    return [
+        at_least(
+            f"{OURS}: times as fast as {Rival(library, VECTOR).name}",
+            worst_ratio(speeds, OURS, Rival(library, VECTOR).name),
+            bound,
+        )
+        for library, bound in PROMISED_SPEED
+    ]
+
+
+def _exactness(scores: Sequence[RobotScore]) -> list[Requirement]:
+    rows: list[tuple[str, float, Sense, float, str]] = [
+        ("tip error, max", max(one.tip_max_mm for one in scores), "at most", 1e-3, "mm"),
+        ("joint error, max", max(one.joint_max_deg for one in scores), "at most", 0.01, "deg"),
+        ("joints beyond limits", float(sum(one.num_outside for one in scores)), "at most", 0.0, ""),
+    ]
+    return [Requirement(f"robot motion, {OURS_EXACT}: {row[0]}", *row[1:]) for row in rows]
+
+
+def _noise(scores: Sequence[RobotScore]) -> list[Requirement]:
+    tip_mm = max(one.tip_mean_mm for one in scores)
+    joint_deg = max(one.joint_mean_deg for one in scores)
+    return [
+        at_most("robot motion, 1 mm noise: tip error, mean", tip_mm, 1.3, "mm"),
+        at_most("robot motion, 1 mm noise: joint error, mean", joint_deg, 1.7, "deg"),
+    ]
+
+
+def _pinches(score: PinchScore) -> list[Requirement]:
+    rows = (
+        ("gap where the human's is below 3 mm, mean", score.gap_mean_mm, 1.5, "mm"),
+        ("gap where the human's is below 3 mm, p95", score.gap_p95_mm, 2.5, "mm"),
+        ("off the human joint angles, mean", score.same_angle_deg, 5.0, "deg"),
+    )
+    return [at_most(f"pinches: {row[0]}", row[1], *row[2:]) for row in rows]
+
+
+def _limits(robot: RobotScores, pinches: PinchScore) -> list[Requirement]:
+    scores = [found[OURS] for found in robot.values()]
+    step_deg = max([score.max_step_deg for score in scores] + [pinches.max_step_deg])
+    outside = sum(score.num_outside for score in scores) + pinches.num_outside
+    bound_deg = velocity_limit_deg() + _ROUNDING_DEG
+    return [
+        at_most("all motions: turn of a joint a sample", step_deg, bound_deg, "deg"),
+        at_most("all motions: joints beyond limits", float(outside), 0.0),
+    ]
+
+
+def _cold(cold: ColdStart) -> list[Requirement]:
+    once, retried = cold.num_found_once / cold.num_fingers, cold.num_found / cold.num_fingers
+    return [
+        at_least("cold start: fingers within 0.1 mm, one start", once, 0.999),
+        at_least("cold start: fingers within 0.1 mm, retries", retried, 1.0),
+    ]

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
@@ -17,7 +17,7 @@ from benchmarks.rollouts.watcher import listing_s, watched
 from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
 from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
 from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import ChildProcess
@@ -47,19 +47,20 @@ DURABLE: Final = Way("HTTP", "last image, in Redis", LAST, server="durable")
 DEVICES: Final = ("device", "batch device")
 NUM_ROLLOUTS: Final = 32
 NUM_LISTINGS: Final = 101
-USUAL: Final = {"rounds": 15, "chunks": 200, "crowd_chunks": 60, "watched_rollouts": 10_000}
-QUICK: Final = {"rounds": 3, "chunks": 20, "crowd_chunks": 3, "watched_rollouts": 100}
+AMOUNTS: Final = Amounts(
+    usual={"rounds": 15, "chunks": 200, "crowd_chunks": 60, "watched_rollouts": 10_000},
+    quick={"rounds": 3, "chunks": 20, "crowd_chunks": 3, "watched_rollouts": 100},
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument("--rounds", type=int, help="rounds (15; quick 3)")
-    parser.add_argument("--chunks", type=int, help="chunks of each way in a round (200; quick 20)")
-    parser.add_argument(
-        "--crowd-chunks", type=int, help=f"chunks of each of {NUM_ROLLOUTS} rollouts (60; quick 3)"
-    )
-    parser.add_argument(
-        "--watched-rollouts", type=int, help="open rollouts of a listing (10000; quick 100)"
+    AMOUNTS.add_options(
+        parser,
+        rounds="rounds",
+        chunks="chunks of each way in a round",
+        crowd_chunks=f"chunks of each of {NUM_ROLLOUTS} rollouts",
+        watched_rollouts="open rollouts of a listing",
     )
 
 
@@ -70,14 +71,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no round, or more chunks than a rollout may have.
     """
     del folder
-    plan = dict(QUICK if options.quick else USUAL)
-    plan |= {name: value for name in plan if (value := getattr(options, name)) is not None}
-    if plan["rounds"] < 1 or not all(
-        1 <= plan[name] <= MAX_CHUNKS for name in ("chunks", "crowd_chunks")
-    ):
+    plan = AMOUNTS.of(options, watched_rollouts=0)
+    if max(plan["chunks"], plan["crowd_chunks"]) > MAX_CHUNKS:
         raise InvalidInputError(
-            f"got {plan['rounds']} rounds of {plan['chunks']} chunks, expected at least one round "
-            f"and 1 … {MAX_CHUNKS} chunks"
+            f"got rollouts of {plan['chunks']} chunks and of {plan['crowd_chunks']} chunks, "
+            f"expected at most {MAX_CHUNKS}"
         )
     child = ChildProcess("benchmarks.rollouts.server")
     try:
@@ -156,10 +154,9 @@ def _listing_requirements(
     listings_s: Mapping[str, list[float]], num_rollouts: int
 ) -> list[Requirement]:
     return [
-        Requirement(
+        at_most(
             f"GET /v1/watch?limit=1, {num_rollouts} rollouts {where}, with a new connection, p50",
             1e3 * statistics.median(times_s),
-            "at most",
             MAX_LISTING_MS,
             "ms",
         )
@@ -210,10 +207,9 @@ def _requirements(
 ) -> list[Requirement]:
     beside = {"HTTP": "an echo of the same bytes", "WebSocket": "a minimal WebSocket server"}
     found = [
-        Requirement(
+        at_most(
             f"{_name(way)}: a chunk over {beside[way.protocol]}, p50",
             over[way].median,
-            "at most",
             MAX_OVER_ECHO[way.protocol],
         )
         for way in WAYS
@@ -224,29 +220,20 @@ def _requirements(
     alone, batched = (crowds[world] for world in DEVICES)
     return [
         *found,
-        Requirement(
-            "kept in Redis: further time of a chunk, p50",
-            durable_ms,
-            "at most",
-            MAX_DURABLE_MS,
-            "ms",
-        ),
-        Requirement(
+        at_most("kept in Redis: further time of a chunk, p50", durable_ms, MAX_DURABLE_MS, "ms"),
+        at_most(
             "read by a watcher five times a second: a chunk over an unwatched one, p50",
             times_s[_name(WATCHED)].over(unwatched).median,
-            "at most",
             MAX_WATCHED,
         ),
-        Requirement(
+        at_least(
             "32 rollouts on a device of 5 ms: chunks/s, batched over one by one",
             batched.chunks_per_s / alone.chunks_per_s,
-            "at least",
             MIN_BATCHED,
         ),
-        Requirement(
+        at_most(
             "32 rollouts on a device of 5 ms, batched: p99 over p50",
             batched.p99_s / batched.p50_s,
-            "at most",
             MAX_TAIL,
         ),
     ]

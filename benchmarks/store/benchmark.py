@@ -4,23 +4,21 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Bar
-from benchmarks.store.acceptance import OURS, requirements
+from benchmarks.stages import Amounts, Bar
 from benchmarks.store.appends import measure_appends
 from benchmarks.store.compare import DesignResult, Effort, compare
 from benchmarks.store.designs import Design
 from benchmarks.store.live import LiveResult, write_live
 from benchmarks.store.mcap_design import McapDesign
 from benchmarks.store.our_design import OurDesign
-from benchmarks.store.tables import panels, tables
+from benchmarks.store.tables import OURS, panels, requirements, tables
 from benchmarks.store.take import make_take
-from benchmarks.store.workload import CAMERAS, WINDOW_IMAGES, Workload
+from benchmarks.store.workload import CAMERAS, Workload
 from benchmarks.store.zarr_design import ZarrDesign
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import UnknownNameError
 
 DESIGNS: tuple[Design, ...] = (
     OurDesign("h264"),
@@ -31,20 +29,19 @@ DESIGNS: tuple[Design, ...] = (
     McapDesign(),
 )
 PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap")
-_QUICK = {"seconds": 2.0, "rounds": 1, "windows": 4}
-_USUAL = {"seconds": 10.0, "rounds": 5, "windows": 40}
+AMOUNTS = Amounts(
+    usual={"seconds": 10.0, "rounds": 5, "windows": 40},
+    quick={"seconds": 2.0, "rounds": 1, "windows": 4},
+)
+# More than the length of a window.
 _MIN_SECONDS = 1.0
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     names = ",".join(design.name for design in DESIGNS)
-    parser.add_argument(
-        "--seconds", type=float, help=f"length of the take ({_USUAL['seconds']:g}; quick 2)"
-    )
-    parser.add_argument("--rounds", type=int, help=f"rounds ({_USUAL['rounds']}; quick 1)")
-    parser.add_argument(
-        "--windows", type=int, help=f"random windows per round ({_USUAL['windows']}; quick 4)"
+    AMOUNTS.add_options(
+        parser, seconds="length of the take", rounds="rounds", windows="random windows per round"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the scene (%(default)s)")
     parser.add_argument(
@@ -59,7 +56,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: an unknown design.
         InvalidInputError: a take too short for a window, or no round or window.
     """
-    plan = _plan(options)
+    plan = AMOUNTS.of(options, seconds=_MIN_SECONDS)
     chosen = choose(options.designs)
     notes = [f"{d.name} is skipped: needs {d.missing()}" for d in chosen if d.missing()]
     designs = [design for design in chosen if design.missing() is None]
@@ -98,22 +95,6 @@ def choose(names: str | None) -> list[Design]:
         if name not in known:
             raise UnknownNameError("design", name, list(known))
     return [known[name] for name in wanted]
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
-    given = {name: getattr(options, name) for name in defaults}
-    plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}
-    if plan["seconds"] < _MIN_SECONDS:
-        raise InvalidInputError(
-            f"--seconds: got {plan['seconds']:g}, expected at least {_MIN_SECONDS:g}, the length "
-            f"of a window of {WINDOW_IMAGES} images"
-        )
-    for name in ("rounds", "windows"):
-        if plan[name] < 1:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
-    return plan
 
 
 def _live(

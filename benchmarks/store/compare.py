@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
-from benchmarks.store.designs import Design, OpenStore, ReadsTouch, StoreWindow
+from benchmarks.store.designs import Design, OpenStore, StoreWindow, StreamStore
 from benchmarks.store.workload import CAMERAS, WINDOW_IMAGES, WINDOW_TACTILE, Workload
 from dextouch.errors import CorruptDataError
 from dextouch.metrics.image import psnr
@@ -227,7 +227,7 @@ def _read_once(reader: OpenStore, all_starts: Starts, round_index: int) -> ReadC
             [partial(reader.windows, CAMERAS, start, threaded=True) for start in few]
         ),
         touch_ms=_mean_ms([partial(reader.touch, start) for _, start in starts])
-        if isinstance(reader, ReadsTouch)
+        if isinstance(reader, StreamStore)
         else None,
     )
 
@@ -241,10 +241,5 @@ def _mean_ms(calls: Sequence[Callable[[], object]]) -> float:
 
 
 def _read_figures(costs: Sequence[ReadCost]) -> dict[str, Any]:
-    touch_ms = [cost.touch_ms for cost in costs if cost.touch_ms is not None]
-    return {
-        "window_ms": Figure.of([cost.window_ms for cost in costs]),
-        "three_cameras_ms": Figure.of([cost.three_cameras_ms for cost in costs]),
-        "three_cameras_threaded_ms": Figure.of([c.three_cameras_threaded_ms for c in costs]),
-        "touch_ms": Figure.of(touch_ms) if touch_ms else None,
-    }
+    columns = zip(ReadCost._fields, zip(*costs, strict=True), strict=True)
+    return {name: None if None in values else Figure.of(values) for name, values in columns}

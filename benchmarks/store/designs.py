@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from benchmarks.store.workload import Workload
+from benchmarks.store.workload import WINDOW_IMAGES, WINDOW_TACTILE, Workload
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,30 @@ class OpenStore(ABC):
             return list(threads.map(lambda camera: self.window(camera, start), cameras))
 
 
-@runtime_checkable
-class ReadsTouch(Protocol):
-    """An open store that can read the touch of a window without images."""
+class StreamStore(OpenStore):
+    """An open store whose streams are read one by one, so touch also without images."""
+
+    @abstractmethod
+    def images(self, camera: str, start: int) -> np.ndarray:
+        """The images of a window."""
+
+    @abstractmethod
+    def numbers(self, name: str, start: int, count: int) -> np.ndarray:
+        """Samples of a numeric stream."""
 
     def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
         """34 samples of the left and of the right hand, those of the window at image `start`."""
+        left, right = (
+            self.numbers(name, 2 * start, WINDOW_TACTILE)
+            for name in ("tactile_left", "tactile_right")
+        )
+        return left, right
+
+    def window(self, camera: str, start: int) -> StoreWindow:
+        """From single streams."""
+        images = self.images(camera, start)
+        left, right = self.touch(start)
+        return StoreWindow(images, left, right, self.numbers("action", start, WINDOW_IMAGES))
 
 
 @runtime_checkable

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from benchmarks.store.designs import OpenStore, StoreWindow
+from benchmarks.store.designs import OpenStore, StreamStore
 from benchmarks.store.workload import (
     JPEG_QUALITY,
     WINDOW_IMAGES,
-    WINDOW_TACTILE,
     TimedStream,
     Workload,
 )
@@ -61,40 +60,28 @@ class McapDesign:
         return _OpenMcap(folder / _FILE)
 
 
-class _OpenMcap(OpenStore):
+class _OpenMcap(StreamStore):
     """Windows by time; all timestamps of a take are read when it is opened."""
 
     def __init__(self, path: Path) -> None:
         from mcap.reader import SeekingReader
 
         self._path = path
+        self._dtypes: dict[str, str] = {}
         stamps: dict[str, list[int]] = defaultdict(list)
         with path.open("rb") as file:
             for _, channel, message in SeekingReader(file).iter_messages():
                 stamps[channel.topic].append(message.log_time)
+                self._dtypes[channel.topic] = channel.metadata["dtype"]
         self._stamps = dict(stamps)
 
-    def window(self, camera: str, start: int) -> StoreWindow:
+    def images(self, camera: str, start: int) -> np.ndarray:
         images = self._payloads(camera, start, WINDOW_IMAGES)
-        left, right = self.touch(start)
-        actions = self._payloads("action", start, WINDOW_IMAGES)
-        return StoreWindow(
-            images=np.stack([simplejpeg.decode_jpeg(image) for image in images]),
-            tactile_left=left,
-            tactile_right=right,
-            actions=np.frombuffer(b"".join(actions), np.float32).reshape(WINDOW_IMAGES, -1),
-        )
+        return np.stack([simplejpeg.decode_jpeg(image) for image in images])
 
-    def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
-        """Both hands at their native rate."""
-        left, right = (
-            b"".join(self._payloads(name, 2 * start, WINDOW_TACTILE))
-            for name in ("tactile_left", "tactile_right")
-        )
-        return (
-            np.frombuffer(left, np.uint16).reshape(WINDOW_TACTILE, -1),
-            np.frombuffer(right, np.uint16).reshape(WINDOW_TACTILE, -1),
-        )
+    def numbers(self, name: str, start: int, count: int) -> np.ndarray:
+        content = b"".join(self._payloads(name, start, count))
+        return np.frombuffer(content, self._dtypes[name]).reshape(count, -1)
 
     def _payloads(self, name: str, start: int, count: int) -> list[bytes]:
         from mcap.reader import SeekingReader

@@ -8,10 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.store.designs import OpenStore, StoreWindow
+from benchmarks.store.designs import OpenStore, StreamStore
 from benchmarks.store.workload import (
     WINDOW_IMAGES,
-    WINDOW_TACTILE,
     TimedStream,
     Workload,
 )
@@ -62,29 +61,16 @@ class OurDesign:
         return _OpenOurs(EpisodeStore(folder).open(EPISODE_ID))
 
 
-class _OpenOurs(OpenStore):
+class _OpenOurs(StreamStore):
     """Windows by `EpisodeReader`: images by index, numbers by time."""
 
     def __init__(self, reader: EpisodeReader) -> None:
         self._reader = reader
 
-    def window(self, camera: str, start: int) -> StoreWindow:
-        left, right = self.touch(start)
-        return StoreWindow(
-            images=self._reader.images(camera, start, start + WINDOW_IMAGES),
-            tactile_left=left,
-            tactile_right=right,
-            actions=self._read("action", start, WINDOW_IMAGES),
-        )
+    def images(self, camera: str, start: int) -> np.ndarray:
+        return self._reader.images(camera, start, start + WINDOW_IMAGES)
 
-    def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
-        """Both hands at their native rate."""
-        return (
-            self._read("tactile_left", 2 * start, WINDOW_TACTILE),
-            self._read("tactile_right", 2 * start, WINDOW_TACTILE),
-        )
-
-    def _read(self, name: str, start: int, count: int) -> np.ndarray:
+    def numbers(self, name: str, start: int, count: int) -> np.ndarray:
         stamps = self._reader.stamps_ns(name)
         first_ns, last_ns = int(stamps[start]), int(stamps[start + count - 1])
         return self._reader.read(name, first_ns, last_ns + 1).values

@@ -1,14 +1,17 @@
-"""Tables and charts of the store benchmark."""
+"""Tables, charts and requirements of the store benchmark."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure
-from benchmarks.report import ResultTable
-from benchmarks.store.appends import AppendResult
+from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.report import ResultTable, cells
+from benchmarks.store.appends import SPOOL, SPOOL_SYNCED, AppendResult
 from benchmarks.store.compare import DesignResult
-from benchmarks.store.live import LiveResult
+from benchmarks.store.live import SPEED, LiveResult
 
+# The default configuration that requirements refer to, and the design compared with.
+OURS, RIVAL = "ours-h264", "zarr-jpeg"
 _WRITE_COLUMNS = ("design", "speed", "CPU (s)", "MB/min", "files", "PSNR (dB)")
 _READ_COLUMNS = ("design", "1 camera", "3 cameras", "3, threads", "touch (ms)")
 
@@ -25,22 +28,12 @@ def tables(
         ResultTable(
             "Appending one glove sample (ms)",
             ("way", "p50", "p99", "appends a round"),
-            [(a.name, a.p50_ms.text(), a.p99_ms.text(), str(a.num_appends)) for a in appends],
+            [(a.name, *cells(a.p50_ms, a.p99_ms, a.num_appends)) for a in appends],
         ),
         ResultTable(
             "Live recording of a full station (late: accepted more than 0.1 s after it was due)",
             ("speed", "rows", "late", "dropped", "worst lag (ms)", "closing (s)"),
-            [
-                (
-                    f"{run.speed:g}",
-                    str(run.num_rows),
-                    str(run.num_late),
-                    str(run.num_dropped),
-                    f"{run.worst_lag_ms:.3g}",
-                    f"{run.finish_s:.3g}",
-                )
-                for run in live
-            ],
+            [cells(*astuple(run)) for run in live],
         ),
     ]
     return [table for table in found if table.rows]
@@ -96,12 +89,10 @@ def panels(results: Mapping[str, DesignResult]) -> list[Panel]:
 
 def _points(results: Mapping[str, DesignResult], times: Mapping[str, Figure]) -> list[Point]:
     return [
-        Point(
-            label=f"{name}, {_megabytes(result)} MB/min",
-            time=times[name].median,
-            time_low=times[name].low,
-            time_high=times[name].high,
-            error=rms_levels(result.mean_psnr_db),
+        Point.of(
+            f"{name}, {_megabytes(result)} MB/min",
+            times[name],
+            rms_levels(result.mean_psnr_db),
             is_ours=name.startswith("ours"),
         )
         for name, result in results.items()
@@ -119,3 +110,56 @@ def _megabytes(result: DesignResult) -> str:
 
 def _rate(milliseconds: Figure) -> str:
     return milliseconds.inverse(1e3).text()
+
+
+def requirements(
+    results: Mapping[str, DesignResult],
+    appends: Sequence[AppendResult],
+    live: Sequence[LiveResult],
+) -> list[Requirement]:
+    """Build the table of requirements; some may be unmeasured in this run."""
+    ours, rival = results.get(OURS), results.get(RIVAL)
+    return [
+        *_against_rival(ours, rival),
+        at_most(
+            "processor seconds of writing a recorded second",
+            None if ours is None else ours.cpu_s.median / ours.seconds,
+            0.35,
+            "s",
+        ),
+        at_most(
+            f"rows late or dropped, station live at {SPEED:g} times real time",
+            float(max(run.num_untimely for run in live)) if live else None,
+            0.0,
+        ),
+        _append("numeric append, p99", SPOOL, appends, bound_ms=0.1),
+        _append("numeric append on the disk, p99", SPOOL_SYNCED, appends, bound_ms=1.0),
+        at_most(
+            "34 samples of both gloves at native rate",
+            None if ours is None or ours.touch_ms is None else ours.touch_ms.median,
+            0.4,
+            "ms",
+        ),
+    ]
+
+
+def _against_rival(ours: DesignResult | None, rival: DesignResult | None) -> list[Requirement]:
+    write = bytes_ = decibels = windows = None
+    if ours is not None and rival is not None:
+        write = rival.write_s.over(ours.write_s).median
+        bytes_ = ours.num_bytes / rival.num_bytes
+        decibels = rival.mean_psnr_db - ours.mean_psnr_db
+        windows = rival.window_ms.over(ours.window_ms).median
+    return [
+        at_least(f"write speed, times {RIVAL}", write, 2.0),
+        at_most(f"bytes, times {RIVAL}", bytes_, 0.2),
+        at_most(f"mean PSNR below {RIVAL}", decibels, 2.0, "dB"),
+        at_least(f"one-camera windows a second, times {RIVAL}", windows, 1.8),
+    ]
+
+
+def _append(
+    what: str, way: str, appends: Sequence[AppendResult], *, bound_ms: float
+) -> Requirement:
+    found = [append.p99_ms.median for append in appends if append.name == way]
+    return at_most(what, found[0] if found else None, bound_ms, "ms")

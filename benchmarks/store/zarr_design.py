@@ -7,11 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.store.designs import OpenStore, StoreWindow
+from benchmarks.store.designs import OpenStore, StreamStore
 from benchmarks.store.workload import (
     IMAGE_SHAPE,
     WINDOW_IMAGES,
-    WINDOW_TACTILE,
     Workload,
 )
 
@@ -83,7 +82,7 @@ class ZarrDesign:
         return {"serializer": codec, "compressors": None}
 
 
-class _OpenZarr(OpenStore):
+class _OpenZarr(StreamStore):
     """Windows by slices of arrays that are opened once."""
 
     def __init__(self, folder: Path) -> None:
@@ -94,16 +93,8 @@ class _OpenZarr(OpenStore):
         register()
         self._arrays: dict[str, Any] = dict(zarr.open_group(str(folder), mode="r").arrays())
 
-    def window(self, camera: str, start: int) -> StoreWindow:
-        left, right = self.touch(start)
-        return StoreWindow(
-            images=self._arrays[camera][start : start + WINDOW_IMAGES],
-            tactile_left=left,
-            tactile_right=right,
-            actions=self._arrays["action"][start : start + WINDOW_IMAGES],
-        )
+    def images(self, camera: str, start: int) -> np.ndarray:
+        return self.numbers(camera, start, WINDOW_IMAGES)
 
-    def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
-        """Both hands at their native rate."""
-        rows = slice(2 * start, 2 * start + WINDOW_TACTILE)
-        return self._arrays["tactile_left"][rows], self._arrays["tactile_right"][rows]
+    def numbers(self, name: str, start: int, count: int) -> np.ndarray:
+        return np.asarray(self._arrays[name][start : start + count])

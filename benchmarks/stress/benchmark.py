@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.figures import Requirement
+from benchmarks.figures import Requirement, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
@@ -90,8 +90,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     counts = Counter(one.verdict for one in findings)
     failed = Counter(one.stage for one in findings if one.verdict == "failed")
     requirements = [
-        Requirement(f"{name}: cells that fail", float(failed[name]), "at most", 0.0)
-        for name in chosen
+        at_most(f"{name}: cells that fail", float(failed[name]), 0.0) for name in chosen
     ]
     data = {"counts": counts, "cells": [_row_of_json(one) for one in findings]}
     return _report([_matrix(findings), _results(findings)], requirements, data)

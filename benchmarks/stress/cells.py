@@ -29,6 +29,12 @@ HAZARDS: Final[Mapping[str, str]] = {
 Verdict = Literal["held", "failed", "does not apply", "not run"]
 
 
+def bfloat16(values: np.ndarray) -> np.ndarray:
+    """Values truncated to bfloat16's eight bits of mantissa, as float32."""
+    bits = values.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
+    return bits.view(np.float32)
+
+
 class Check:
     """Collects the statements of one cell; any false one fails it."""
 
@@ -124,8 +130,7 @@ class StageCells:
     """The row of one stage: a cell or an exemption for every hazard."""
 
     name: str
-    cells: dict[str, Cell] = field(default_factory=dict)
-    exemptions: dict[str, Exemption] = field(default_factory=dict)
+    cells: dict[str, Cell | Exemption] = field(default_factory=dict)
 
     def cell(
         self, hazard: str, fed: str, *, slow: bool = False
@@ -143,7 +148,7 @@ class StageCells:
         """Declare hazards that cannot occur in the stage, with reasons."""
         for hazard, reason in reasons.items():
             self._free(hazard)
-            self.exemptions[hazard] = Exemption(self.name, hazard, reason)
+            self.cells[hazard] = Exemption(self.name, hazard, reason)
 
     def row(self) -> list[Cell | Exemption]:
         """Every hazard in the order of the matrix.
@@ -151,16 +156,15 @@ class StageCells:
         Raises:
             UnknownNameError: a hazard of the matrix has neither a check nor a reason.
         """
-        known: dict[str, Cell | Exemption] = {**self.exemptions, **self.cells}
-        missing = [hazard for hazard in HAZARDS if hazard not in known]
+        missing = [hazard for hazard in HAZARDS if hazard not in self.cells]
         if missing:
-            raise UnknownNameError(f"cell of stage {self.name}", missing[0], list(known))
-        return [known[hazard] for hazard in HAZARDS]
+            raise UnknownNameError(f"cell of stage {self.name}", missing[0], list(self.cells))
+        return [self.cells[hazard] for hazard in HAZARDS]
 
     def _free(self, hazard: str) -> None:
         if hazard not in HAZARDS:
             raise UnknownNameError("hazard", hazard, list(HAZARDS))
-        if hazard in self.cells or hazard in self.exemptions:
+        if hazard in self.cells:
             raise InvalidInputError(f"stress: {self.name}, {hazard} is registered twice")
 
 

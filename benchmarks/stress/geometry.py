@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.cells import Check, StageCells, bfloat16
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import (
@@ -113,9 +113,8 @@ def _precision(check: Check) -> None:
     vectors = np.random.default_rng(0).normal(size=(200, 3))
     exact = rotation_from_vector(vectors)
     six = rotation_to_6d(exact)
-    bits = six.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
     for name, rounded, bound in (
-        ("bfloat16", bits.view(np.float32), 2.0**-6),
+        ("bfloat16", bfloat16(six), 2.0**-6),
         ("float16", six.astype(np.float16), 2.0**-9),
     ):
         R = rotation_from_6d(rounded)

@@ -13,7 +13,7 @@ from benchmarks.simulated.board_scenes import (
     selected_boards,
     simulated_boards,
 )
-from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.cells import Check, StageCells, bfloat16
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
@@ -101,7 +101,7 @@ def _precision(check: Check) -> None:
     check.at_most("float32: mount changes", mount_difference(exact, single)[0], 1e-5, "rad")
     half = _mount(tracker.astype(np.float16), board.astype(np.float16))
     check.at_most("float16: mount changes", mount_difference(exact, half)[0], _MAX_RAD, "rad")
-    coarse = _bfloat16(tracker)
+    coarse = bfloat16(tracker)
     check.refused("bfloat16, no rotations any more", lambda: _mount(coarse, board))
 
 
@@ -141,9 +141,3 @@ def _scene() -> Scene:
 
 def _mount(Ts_world_tracker: np.ndarray, Ts_camera_board: np.ndarray) -> np.ndarray:
     return solve_hand_eye(Ts_world_tracker, Ts_camera_board).T_tracker_camera
-
-
-def _bfloat16(values: np.ndarray) -> np.ndarray:
-    """Truncate values to bfloat16's eight bits of mantissa."""
-    bits = values.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
-    return bits.view(np.float32)

@@ -8,9 +8,8 @@ import numpy as np
 
 import services.evaluation
 from benchmarks.stress.cells import Check, StageCells
-from benchmarks.stress.worlds import NUM_CHUNKS, twin_start
-from dextouch.clients import PolicyStart
-from dextouch.errors import DexTouchError, InvalidInputError, NonFiniteError
+from benchmarks.stress.worlds import NUM_CHUNKS, demonstration
+from dextouch.errors import DexTouchError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import CHUNK_STEPS, Observation
 from dextouch.streams import HEAD_CAMERA
@@ -115,7 +114,7 @@ def _precision(check: Check) -> None:
     found = load_checkpoint(_PRETRAINED / "behaviour_cloning.safetensors", kind=KIND)
     rounded = {name: tensor.bfloat16() for name, tensor in found.tensors.items()}
     policy = BehaviourCloningPolicy(Checkpoint(found.metadata, rounded))
-    policy.reset(_policy_start())
+    policy.reset(demonstration(_PX).policy_start)
     chunk = policy.act(_seen())
     _command_is_bounded(check, chunk)
     check.at_most("policy's command moves", np.abs(chunk - _act(_seen()))[:, :3].max(), 0.02, "m")
@@ -125,7 +124,7 @@ def _precision(check: Check) -> None:
 @STAGE.cell("long_run", "63 chunks of the cloned policy on images that never change, then of hold")
 def _long_run(check: Check) -> None:
     policy = _policy()
-    policy.reset(_policy_start())
+    policy.reset(demonstration(_PX).policy_start)
     seen = _seen()
     for chunk in range(NUM_CHUNKS):
         actions = policy.act(seen)
@@ -134,11 +133,11 @@ def _long_run(check: Check) -> None:
         seen = replace(
             _seen(CHUNK_STEPS), first_step=1 + CHUNK_STEPS * chunk, action_reached=actions
         )
-    anchor = _policy_start().anchor
+    anchor = demonstration(_PX).policy_start.anchor
     R = poses_from_actions(actions, anchor).Ts_world_wrist_left[-1, :3, :3]
     check.at_most("RᵀR - 1", np.abs(R.T @ R - np.eye(3)).max(), 1e-9)
     hold = HoldPolicy()
-    hold.reset(_policy_start())
+    hold.reset(demonstration(_PX).policy_start)
     pose = _seen().action_reached[-1]
     for _ in range(NUM_CHUNKS):
         held = hold.act(replace(_seen(), action_reached=pose[None]))
@@ -177,19 +176,10 @@ def _policy() -> BehaviourCloningPolicy:
     return BehaviourCloningPolicy.load(_PRETRAINED / "behaviour_cloning.safetensors")
 
 
-def _policy_start() -> PolicyStart:
-    start, _ = twin_start(_PX)
-    if start.anchor is None or start.K_head is None:
-        raise InvalidInputError("stress: the twin's start has no anchor")
-    return PolicyStart(start.task, start.instruction, 0, start.anchor, start.K_head)
-
-
 @cache
 def _seen(num_steps: int = 1) -> Observation:
     """The first observation of a demonstration, repeated for some steps."""
-    observation = twin_start(_PX)[0].observation
-    if observation is None:
-        raise InvalidInputError("stress: the twin's start has no observation")
+    observation = demonstration(_PX).observation
     return replace(
         observation,
         images={HEAD_CAMERA: np.repeat(observation.images[HEAD_CAMERA], num_steps, axis=0)},
@@ -206,7 +196,7 @@ def _ending(pressure_kpa: float) -> Ending:
 
 def _act(observation: Observation) -> np.ndarray:
     policy = _policy()
-    policy.reset(_policy_start())
+    policy.reset(demonstration(_PX).policy_start)
     return policy.act(observation)
 
 

@@ -32,23 +32,6 @@ _PX = 32
 _TRAINED_KPA = 10.0
 
 
-@STAGE.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")
-def _rotations(check: Check) -> None:
-    worlds.check_rotations(check, _subject())
-
-
-@STAGE.cell(
-    "non_finite", "NaN, infinity, 5e-324 and 1e300 in actions; NaN and 1e-40 kPa at the start"
-)
-def _non_finite(check: Check) -> None:
-    worlds.check_non_finite(check, _subject())
-
-
-@STAGE.cell("touch", "every taxel at 0, -5, 2, 650, 99 999 and 200 000 kPa at the start")
-def _touch(check: Check) -> None:
-    worlds.check_touch(check, _subject(), _TRAINED_KPA)
-
-
 @STAGE.cell("ends", "chunks of 4 and 64 steps and beyond")
 def _ends(check: Check) -> None:
     worlds.check_chunk_ends(check, _subject())
@@ -67,7 +50,7 @@ def _precision(check: Check) -> None:
         check.refused(
             f"weights {dtype}",
             lambda c=checkpoint: Subject(  # type: ignore[misc]
-                StateWorld(c), subject.start, subject.actions
+                StateWorld(c), subject.begun
             ).step(subject.still()),
             InvalidInputError,
         )
@@ -91,11 +74,6 @@ def _long_run(check: Check) -> None:
     check.refused("hands that move for ever", lambda: _play(check, subject), EndedError)
 
 
-@STAGE.cell("batch", "three rollouts at once and alone, one of them at 650 kPa")
-def _batch(check: Check) -> None:
-    worlds.check_batch(check, _subject(), max_kpa=1e-2)
-
-
 STAGE.does_not_apply(
     one_axis="nothing is estimated from motion; see hand-eye",
     clock="steps are counted, there is no clock; see clocks",
@@ -104,7 +82,7 @@ STAGE.does_not_apply(
 
 
 def _play(check: Check, subject: Subject) -> None:
-    state = subject.world.reset(subject.start).state
+    state = subject.world.reset(subject.begun.start).state
     for index, chunk in enumerate(worlds.there_and_back(subject.actions)):
         stepped = subject.world.step(state, chunk, seed=index, selector=worlds.TOUCH_ONLY)
         state = stepped.state
@@ -115,10 +93,8 @@ def _play(check: Check, subject: Subject) -> None:
 
 @cache
 def _subject() -> Subject:
-    start, actions = worlds.twin_start(_PX)
     with tempfile.TemporaryDirectory() as folder:
-        world = open_world(_written(Path(folder)))
-    return Subject(world, start, actions)
+        return Subject(open_world(_written(Path(folder))), worlds.demonstration(_PX))
 
 
 def _checkpoint() -> StateCheckpoint:
@@ -153,3 +129,6 @@ def _written(folder: Path) -> Path:
     path = folder / "untrained.safetensors"
     write_state_checkpoint(path, dynamics, renderer, metadata)
     return path
+
+
+worlds.add_shared_cells(STAGE, _subject, lambda: _TRAINED_KPA)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from benchmarks.stress.cells import Check, StageCells
-from benchmarks.stress.worlds import twin_start
+from benchmarks.stress.worlds import demonstration
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from services.world_model.network.configuration import NetworkConfig, Precision
 from services.world_model.network.flow_matching import MIN_TIME, training_times
@@ -177,11 +177,9 @@ STAGE.does_not_apply(
 @cache
 def _episode() -> EpisodeArrays:
     """A static scene of the twin with a moving hand and some touch."""
-    start, actions = twin_start(_PX)
-    observation = start.observation
-    if observation is None or start.anchor is None or start.K_head is None:
-        raise InvalidInputError("stress: the twin's start has no observation")
-    rows = np.concatenate([observation.action_reached, actions[: _STEPS - 1]])
+    shown = demonstration(_PX)
+    start, observation = shown.policy_start, shown.observation
+    rows = np.concatenate([observation.action_reached, shown.actions[: _STEPS - 1]])
     touch = np.random.default_rng(0).uniform(0, 20, (_STEPS, 2, 320)).astype(np.float32)
     return EpisodeArrays(
         episode_id="stress",

@@ -4,14 +4,14 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.cells import Check, StageCells, bfloat16
 from benchmarks.stress.worlds import (
     NUM_CHUNKS,
     SEED,
     TASK,
     TOUCH_ONLY,
+    demonstration,
     there_and_back,
-    twin_start,
 )
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, WRIST_RIGHT
@@ -85,7 +85,7 @@ def _touch(check: Check) -> None:
 @STAGE.cell("ends", "one step; a rollout cut into chunks of 16 and of 4 steps")
 def _ends(check: Check) -> None:
     world, begun = _begun()
-    _, actions = twin_start(16)
+    actions = demonstration(16).actions
     whole = world.step(begun.state, actions[:16], seed=0, selector=TOUCH_ONLY)
     state = begun.state
     for k in range(0, 16, 4):
@@ -98,12 +98,11 @@ def _ends(check: Check) -> None:
 
 @STAGE.cell("precision", "a demonstration's commands rounded to float32 and bfloat16, five chunks")
 def _precision(check: Check) -> None:
-    _, actions = twin_start(16)
+    actions = demonstration(16).actions
     exact = _reached(actions[:80])
     single = _reached(actions[:80].astype(np.float32).astype(np.float64))
     check.at_most("float32: wrists off", np.abs(single - exact)[:, :3].max(), 1e-3, "m")
-    bits = actions[:80].astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
-    coarse = _reached(bits.view(np.float32).astype(np.float64))
+    coarse = _reached(bfloat16(actions[:80]).astype(np.float64))
     check.finite("bfloat16: poses", coarse)
     check.at_most("bfloat16: wrists off", np.abs(coarse - exact)[:, :3].max(), 0.01, "m")
 
@@ -113,7 +112,7 @@ def _precision(check: Check) -> None:
 )
 def _long_run(check: Check) -> None:
     world, begun = _begun()
-    _, actions = twin_start(16)
+    actions = demonstration(16).actions
     state = begun.state
     for chunk in there_and_back(actions):
         stepped = world.step(state, chunk, seed=0, selector=TOUCH_ONLY)
@@ -137,7 +136,7 @@ def _long_run(check: Check) -> None:
 @STAGE.cell("batch", "two rollouts in turns in one world, and alone in worlds of their own")
 def _batch(check: Check) -> None:
     world = TwinWorld(_SETTINGS)
-    _, actions = twin_start(16)
+    actions = demonstration(16).actions
     states = [world.reset(RolloutStart(TASK, seed, "")).state for seed in (SEED, SEED + 1)]
     for k in (0, 16):
         states = [

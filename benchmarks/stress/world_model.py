@@ -8,7 +8,6 @@ import torch
 from benchmarks.stress import worlds
 from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import Subject
-from dextouch.errors import InvalidInputError
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import Checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
@@ -22,24 +21,6 @@ STAGE = StageCells("world-model")
 _BFLOAT16_KPA, _BFLOAT16_LEVELS = 5.0, 12
 # Target of the roadmap: hands that stand still without contact feel nothing.
 _STILL_KPA = 2.0
-
-
-@STAGE.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")
-def _rotations(check: Check) -> None:
-    worlds.check_rotations(check, _subject())
-
-
-@STAGE.cell(
-    "non_finite", "NaN, infinity, 5e-324 and 1e300 in actions; NaN and 1e-40 kPa at the start"
-)
-def _non_finite(check: Check) -> None:
-    worlds.check_non_finite(check, _subject())
-
-
-@STAGE.cell("touch", "every taxel at 0, -5, 2, 650, 99 999 and 200 000 kPa at the start")
-def _touch(check: Check) -> None:
-    trained_kpa = float(_checkpoint().model.tokenizer.peak_kpa)
-    worlds.check_touch(check, _subject(), trained_kpa)
 
 
 @STAGE.cell("ends", "flow times 0 and 1, one Euler step; chunks of 4 and 16 steps and beyond")
@@ -70,7 +51,7 @@ def _precision(check: Check) -> None:
         checkpoint = Checkpoint(model, _checkpoint().metadata, _checkpoint().digest)
         coarse_worlds[f"weights {dtype}"] = ModelWorld(checkpoint)
     for name, world in coarse_worlds.items():
-        coarse = Subject(world, subject.start, subject.actions).step(subject.actions[:16])
+        coarse = Subject(world, subject.begun).step(subject.actions[:16])
         worlds.check_answer(check, coarse)
         off_kpa = np.abs(coarse.tactile_kpa - exact.tactile_kpa).max()
         check.at_most(f"{name}: touch off", off_kpa, _BFLOAT16_KPA, "kPa")
@@ -86,12 +67,10 @@ def _precision(check: Check) -> None:
 def _device(check: Check) -> None:
     model = JointWorldModel(_checkpoint().metadata.network).eval().to("meta")
     subject = _subject()
-    start = subject.start
-    if start.observation is None or start.anchor is None or start.K_head is None:
-        raise InvalidInputError("stress: a world model starts from an observation")
+    seen, start = subject.begun.observation, subject.begun.policy_start
     request = PredictionRequest(
-        first_image=start.observation.images[HEAD_CAMERA][0],
-        first_tactile_kpa=start.observation.tactile_kpa[0],
+        first_image=seen.images[HEAD_CAMERA][0],
+        first_tactile_kpa=seen.tactile_kpa[0],
         actions=np.concatenate([subject.still(1), subject.actions[:16]]),
         action_kind="commanded",
         instruction=start.instruction,
@@ -114,11 +93,6 @@ def _long_run(check: Check) -> None:
     check.at_most("peak of any chunk", max(peaks), _STILL_KPA, "kPa")
 
 
-@STAGE.cell("batch", "three rollouts at once and alone, one of them at 650 kPa")
-def _batch(check: Check) -> None:
-    worlds.check_batch(check, _subject(), max_kpa=1e-2)
-
-
 STAGE.does_not_apply(
     one_axis="nothing is estimated from motion; see hand-eye",
     clock="steps are counted, there is no clock; see clocks",
@@ -133,4 +107,7 @@ def _checkpoint() -> Checkpoint:
 @cache
 def _subject() -> Subject:
     world = ModelWorld(_checkpoint())
-    return Subject(world, *worlds.twin_start(world.description.image_width_px))
+    return Subject(world, worlds.demonstration(world.description.image_width_px))
+
+
+worlds.add_shared_cells(STAGE, _subject, lambda: float(_checkpoint().model.tokenizer.peak_kpa))

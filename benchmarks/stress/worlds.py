@@ -1,20 +1,22 @@
 """Stress checks shared by all kinds of world models, and their rollout start."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.stress.cells import Check
-from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
-from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, actions_from_poses
+from benchmarks.evaluator.playing import start_in_twin
+from benchmarks.stress.cells import Check, StageCells
+from dextouch.clients import PolicyStart
+from dextouch.errors import DegenerateRotationError, NonFiniteError, ShapeError
+from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
+from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
 from services.twin.world import TwinWorld
 
 NUM_CHUNKS = 63
@@ -24,52 +26,78 @@ TASK = "stand_bottle"
 TOUCH_ONLY = ReturnSelector(cameras=())
 
 
+class Demonstration(NamedTuple):
+    """The start of a demonstration, for worlds and for policies, and its commanded actions."""
+
+    start: RolloutStart
+    observation: Observation
+    policy_start: PolicyStart
+    actions: np.ndarray
+
+
 @dataclass(frozen=True)
 class Subject:
-    """A world, a start for it, and the commanded actions of a demonstration from there."""
+    """A world, and a demonstration from whose start it is tried."""
 
     world: BatchWorld[Any]
-    start: RolloutStart
-    actions: np.ndarray
+    begun: Demonstration
+
+    @property
+    def actions(self) -> np.ndarray:
+        """Commanded actions of the demonstration."""
+        return self.begun.actions
 
     def still(self, num_steps: int = CHUNK_STEPS) -> np.ndarray:
         """Commands that hold the initial pose."""
-        observation = self.start.observation
-        if observation is None:
-            raise InvalidInputError("stress: a world model starts from an observation")
-        return np.repeat(observation.action_reached[-1:], num_steps, axis=0)
+        return np.repeat(self.begun.observation.action_reached[-1:], num_steps, axis=0)
 
     def touching(self, pressure_kpa: float) -> RolloutStart:
         """The start with every taxel at one pressure."""
-        observation = self.start.observation
-        if observation is None:
-            raise InvalidInputError("stress: a world model starts from an observation")
-        tactile_kpa = np.full_like(observation.tactile_kpa, pressure_kpa)
-        return replace(self.start, observation=replace(observation, tactile_kpa=tactile_kpa))
+        seen = self.begun.observation
+        tactile_kpa = np.full_like(seen.tactile_kpa, pressure_kpa)
+        return replace(self.begun.start, observation=replace(seen, tactile_kpa=tactile_kpa))
 
     def step(self, actions: np.ndarray, start: RolloutStart | None = None) -> Observation:
         """Observation after the first chunk."""
-        state = self.world.reset(start or self.start).state
+        state = self.world.reset(start or self.begun.start).state
         return self.world.step(state, actions, seed=1).observation
 
 
 @cache
-def twin_start(image_px: int) -> tuple[RolloutStart, np.ndarray]:
-    """First observation of a twin demonstration, and its commanded actions."""
+def demonstration(image_px: int) -> Demonstration:
+    """A demonstration of the twin."""
     settings = TwinSettings(
         cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
     )
-    world, stage = TwinWorld(settings), Stage(TASK, "robot", settings)
-    begun = world.reset(RolloutStart(TASK, SEED, stage.task.instruction))
-    start = RolloutStart(
-        TASK,
-        SEED,
-        stage.task.instruction,
-        observation=begun.observation,
-        anchor=begun.anchor,
-        K_head=begun.K_head,
+    world = TwinWorld(settings)
+    stage = world.stage(TASK)
+    begun, start, policy_start = start_in_twin(world, TASK, SEED, stage.task.instruction)
+    actions = scripted_actions(stage, SEED, script_name(0.0))
+    return Demonstration(start, begun.observation, policy_start, actions)
+
+
+def add_shared_cells(
+    stage: StageCells, subject: Callable[[], Subject], trained_kpa: Callable[[], float]
+) -> None:
+    """Add the checks of rotations, numbers, touch and batches, the same for every world model.
+
+    Args:
+        stage: to add them to.
+        subject: opens what is tried.
+        trained_kpa: the largest pressure that the model was trained on.
+    """
+    stage.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")(
+        lambda check: check_rotations(check, subject())
     )
-    return start, actions_from_poses(stage.plan(SEED).commands, begun.anchor)[1:]
+    stage.cell(
+        "non_finite", "NaN, infinity, 5e-324 and 1e300 in actions; NaN and 1e-40 kPa at the start"
+    )(lambda check: check_non_finite(check, subject()))
+    stage.cell("touch", "every taxel at 0, -5, 2, 650, 99 999 and 200 000 kPa at the start")(
+        lambda check: check_touch(check, subject(), trained_kpa())
+    )
+    stage.cell("batch", "three rollouts at once and alone, one of them at 650 kPa")(
+        lambda check: check_batch(check, subject(), max_kpa=1e-2)
+    )
 
 
 def check_rotations(check: Check, subject: Subject) -> None:
@@ -92,7 +120,7 @@ def check_rotations(check: Check, subject: Subject) -> None:
 
 def check_non_finite(check: Check, subject: Subject) -> None:
     """NaN, infinity, denormal and huge numbers in actions and starts."""
-    state = subject.world.reset(subject.start).state
+    state = subject.world.reset(subject.begun.start).state
     before = subject.world.snapshot(state)
     for bad in (np.nan, np.inf, -np.inf):
         for column in (0, 5, JOINTS_LEFT.start):
@@ -137,7 +165,7 @@ def check_chunk_ends(check: Check, subject: Subject) -> None:
 
 def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
     """Three rollouts in a batch and alone, one of them with saturated touch."""
-    starts = [subject.start, subject.touching(650.0), subject.start]
+    starts = [subject.begun.start, subject.touching(650.0), subject.begun.start]
     chunks = np.stack([subject.actions[:16], subject.still(), subject.still()])
     states = [subject.world.reset(start).state for start in starts]
     together = subject.world.step_batch(states, chunks, seeds=[1, 1, 1])

@@ -4,27 +4,24 @@ import argparse
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.rounds import every_round, interleaved
+from benchmarks.stages import Amounts, Bar
 from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
 from benchmarks.twin.physics import (
     AS_SERVED,
     SOLVERS,
     ContactChunks,
     ContactError,
-    Played,
-    Solver,
     contact_error,
 )
-from dextouch.errors import InvalidInputError
 from services.twin.tasks import TASK_NAMES
 
 PACKAGES: Final = ("numpy", "mujoco-core")
@@ -32,14 +29,16 @@ PACKAGES: Final = ("numpy", "mujoco-core")
 FIRST_SEED: Final = 30_000
 # 16 steps at 15 a second.
 CHUNK_MS: Final = 16 / 15 * 1e3
-USUAL: Final = {"rounds": 15, "seeds": 3, "solver_rounds": 5}
-QUICK: Final = {"rounds": 3, "seeds": 1, "solver_rounds": 1}
+AMOUNTS: Final = Amounts(
+    usual={"rounds": 15, "seeds": 3, "solver_rounds": 5},
+    quick={"rounds": 3, "seeds": 1, "solver_rounds": 1},
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument("--task", default="stand_bottle", choices=TASK_NAMES, help="(%(default)s)")
-    parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 3)")
+    AMOUNTS.add_options(parser, rounds="rounds")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -49,10 +48,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no round.
     """
     del folder
-    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
-    plan["rounds"] = plan["rounds"] if options.rounds is None else options.rounds
-    if plan["rounds"] < 1:
-        raise InvalidInputError(f"--rounds: got {plan['rounds']}, expected at least 1")
+    plan = AMOUNTS.of(options)
     chunk = TimedChunk(options.task, FIRST_SEED)
     subjects = chunk.subjects()
     with bar("selectors", plan["rounds"] * len(subjects)) as step:
@@ -113,14 +109,7 @@ def solver_table(
 def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) -> Panel:
     """Time of a chunk against its contact error, relative to the default solver."""
     points = [
-        Point(
-            label=name,
-            time=times_ms[name].median,
-            time_low=times_ms[name].low,
-            time_high=times_ms[name].high,
-            error=error.force_n,
-            is_ours=name == AS_SERVED,
-        )
+        Point.of(name, times_ms[name], error.force_n, is_ours=name == AS_SERVED)
         for name, error in errors.items()
     ]
     label = "RMS error of pad forces after one chunk (N)"
@@ -132,12 +121,11 @@ def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> l
     saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
     share = times_ms[HEAD].median / CHUNK_MS
     return [
-        Requirement(f"{HEAD_LAST}, share of the time of {HEAD}", saved, "at most", 0.9),
-        Requirement(f"{HEAD}, share of real time", share, "at most", 0.5),
-        Requirement(
+        at_most(f"{HEAD_LAST}, share of the time of {HEAD}", saved, 0.9),
+        at_most(f"{HEAD}, share of real time", share, 0.5),
+        at_least(
             "selectors that leave the state after a chunk as it is, share",
             float(states_are_equal),
-            "at least",
             1.0,
         ),
     ]
@@ -147,8 +135,8 @@ def _solvers(
     task: str, plan: Mapping[str, int], bar: Bar
 ) -> tuple[dict[str, Figure], dict[str, ContactError], int]:
     """Milliseconds of the median chunk by round, and errors, of every solver."""
-    chunks = ContactChunks([task], range(FIRST_SEED, FIRST_SEED + plan["seeds"]))
-    subjects = {name: partial(_played, chunks, solver) for name, solver in SOLVERS.items()}
+    chunks = ContactChunks(task, range(FIRST_SEED, FIRST_SEED + plan["seeds"]))
+    subjects = {name: every_round(partial(chunks.play, solver)) for name, solver in SOLVERS.items()}
     with bar("solvers", plan["solver_rounds"] * len(subjects)) as step:
         found = interleaved(subjects, plan["solver_rounds"], on_step=step)
     times_ms = {
@@ -158,8 +146,3 @@ def _solvers(
     truth = found[AS_SERVED][0]
     errors = {name: contact_error(rounds[-1], truth) for name, rounds in found.items()}
     return times_ms, errors, len(chunks)
-
-
-def _played(chunks: ContactChunks, solver: Solver, round_index: int) -> list[Played]:
-    del round_index
-    return chunks.play(solver)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from dextouch.hands.actions import actions_from_poses
+from benchmarks.rounds import every_round
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
+from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
 from services.twin.world import TwinState, TwinWorld
 
 # Both scripts have contact in their second chunk.
@@ -35,10 +35,8 @@ class TimedChunk:
 
     def __init__(self, task: str, seed: int) -> None:
         self._world = TwinWorld(TwinSettings())
-        commands = Stage(task, "robot", TwinSettings()).plan(seed).commands
-        started = self._world.reset(RolloutStart(task, seed, ""))
-        rows = actions_from_poses(commands, started.anchor)[1:]
-        state: TwinState = started.state
+        state: TwinState = self._world.reset(RolloutStart(task, seed, "")).state
+        rows = scripted_actions(self._world.stage(task), seed, script_name(0.0))
         for chunk in range(CHUNK):
             before = rows[chunk * CHUNK_STEPS :][:CHUNK_STEPS]
             state = self._world.step(state, before, seed=0).state
@@ -46,7 +44,10 @@ class TimedChunk:
 
     def subjects(self) -> dict[str, Callable[[int], float]]:
         """Functions that measure processor milliseconds of the chunk with each selector."""
-        return {name: partial(self._timed, selector) for name, selector in SELECTORS.items()}
+        return {
+            name: every_round(partial(self._timed, selector))
+            for name, selector in SELECTORS.items()
+        }
 
     def states_are_equal(self) -> bool:
         """Whether the state after the chunk is bit-identical for every selector."""
@@ -56,8 +57,7 @@ class TimedChunk:
     def _step(self, selector: ReturnSelector) -> TwinState:
         return self._world.step(self._state, self._actions, seed=0, selector=selector).state
 
-    def _timed(self, selector: ReturnSelector, round_index: int) -> float:
-        del round_index
+    def _timed(self, selector: ReturnSelector) -> float:
         begin_s = time.process_time()
         self._step(selector)
         return 1e3 * (time.process_time() - begin_s)

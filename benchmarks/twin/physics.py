@@ -67,35 +67,31 @@ class ContactChunks:
     Errors are therefore those of one chunk and do not accumulate.
 
     Args:
-        tasks: of the twin.
-        seeds: of the demonstrations of each task.
+        task: of the twin.
+        seeds: of the demonstrations.
     """
 
-    def __init__(self, tasks: Sequence[str], seeds: Sequence[int]) -> None:
-        self._stages = {task: Stage(task, "robot", TwinSettings()) for task in tasks}
-        self._begins: list[tuple[str, Plan, int, Float64[np.ndarray, " numbers"]]] = []
-        for task in tasks:
-            for seed in seeds:
-                self._add(task, self._stages[task].plan(seed))
-
-    def _add(self, task: str, plan: Plan) -> None:
-        stage = self._stages[task]
-        stage.start(plan)
-        for first in range(1, len(plan.commands.joints_left_rad), CHUNK_STEPS):
-            state = stage.simulation.state()
-            if _play(stage.simulation, plan, first).pad_forces_n.any():
-                self._begins.append((task, plan, first, state))
+    def __init__(self, task: str, seeds: Sequence[int]) -> None:
+        stage = Stage(task, "robot", TwinSettings())
+        self._simulation = stage.simulation
+        self._begins: list[tuple[Plan, int, Float64[np.ndarray, " numbers"]]] = []
+        for seed in seeds:
+            plan = stage.plan(seed)
+            stage.start(plan)
+            for first in range(1, len(plan.commands.joints_left_rad), CHUNK_STEPS):
+                state = stage.simulation.state()
+                if _play(stage.simulation, plan, first).pad_forces_n.any():
+                    self._begins.append((plan, first, state))
 
     def __len__(self) -> int:
         return len(self._begins)
 
     def play(self, solver: Solver) -> list[Played]:
         """Play every chunk with one solver; the default options are restored afterwards."""
-        played = []
-        for task, plan, first, state in self._begins:
-            simulation = self._stages[task].simulation
-            option = simulation.scene.model.opt
-            kept = option.iterations, option.solver, option.cone
+        played, simulation = [], self._simulation
+        option = simulation.scene.model.opt
+        kept = option.iterations, option.solver, option.cone
+        for plan, first, state in self._begins:
             simulation.set_state(state, step_index=(first - 1) * STEPS_PER_GRID)
             option.iterations = kept[0] if solver.iterations is None else solver.iterations
             option.solver = kept[1] if solver.kind is None else solver.kind

@@ -1,20 +1,19 @@
 """Entry point of the benchmark stage `world-model`."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from benchmarks.figures import Figure
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.rounds import interleaved
-from benchmarks.stages import Bar
+from benchmarks.rounds import every_round, interleaved
+from benchmarks.stages import Amounts, Bar
 from benchmarks.world_model.held_out import HeldOut, held_out
 from benchmarks.world_model.rollouts import (
-    Imagined,
     RolloutError,
     imagine,
     imagine_together,
@@ -36,15 +35,20 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import EVERYTHING, ReturnSelector
 from dextouch.worlds import BatchWorld, CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
-
-if TYPE_CHECKING:
-    from services.world_model.state_world import StateWorld
+from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
+from services.world_model.network.model import Sampling
+from services.world_model.shipped_checkpoints import (
+    PRETRAINED,
+    STATE_MODEL,
+    paper_form_checkpoint,
+)
+from services.world_model.state_world import StateWorld
+from services.world_model.world import ModelWorld
 
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
-USUAL: Final = {"rounds": 7, "seeds": 6}
-QUICK: Final = {"rounds": 1, "seeds": 1}
+AMOUNTS: Final = Amounts(usual={"rounds": 7, "seeds": 6}, quick={"rounds": 1, "seeds": 1})
 VARIANTS: Final = (
     *(Variant(steps) for steps in (1, 2, 4, 8)),
     *(Variant(steps, recomputed=True) for steps in (2, 4, 8)),
@@ -67,8 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--state-model", type=Path, help="state model to time (default: the package's own)"
     )
-    parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
-    parser.add_argument("--seeds", type=int, help=f"episodes per task ({USUAL['seeds']}; quick 1)")
+    AMOUNTS.add_options(parser, rounds="rounds", seeds="episodes per task")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -77,13 +80,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
-    from services.world_model.checkpoints import read_checkpoint
-    from services.world_model.network.model import Sampling
-    from services.world_model.shipped_checkpoints import paper_form_checkpoint
-    from services.world_model.world import ModelWorld
-
     del folder
-    plan = _plan(options)
+    plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
     variants = {
@@ -140,21 +138,19 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def _times(
     worlds: Mapping[str, World[Any]], episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
 ) -> dict[str, Figure]:
-    subjects = {name: partial(_imagined, world, episodes) for name, world in worlds.items()}
+    subjects = {
+        name: every_round(partial(imagine, world, episodes)) for name, world in worlds.items()
+    }
     with bar("steps and precision", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
 
 
-def _state_world(path: Path | None) -> "StateWorld":
-    from services.world_model.checkpoints import read_state_checkpoint
-    from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL
-    from services.world_model.state_world import StateWorld
-
+def _state_world(path: Path | None) -> StateWorld:
     return StateWorld(read_state_checkpoint(path or PRETRAINED / STATE_MODEL))
 
 
-def _state_costs(world: "StateWorld", num_rounds: int, bar: Bar) -> dict[str, Figure]:
+def _state_costs(world: StateWorld, num_rounds: int, bar: Bar) -> dict[str, Figure]:
     """Milliseconds per chunk of the state model, with one demonstration of each of its tasks."""
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     episodes = held_out(tasks, [FIRST_SEED], world.description.image_height_px)
@@ -172,30 +168,16 @@ def _costs(
     bar: Bar,
 ) -> dict[str, Figure]:
     """Milliseconds per chunk of one rollout, by requested images and batch size."""
-    subjects: dict[str, Callable[[int], Imagined]] = {
-        asked_name(asked, count): partial(_together, world, episodes, count, selector)
+    subjects = {
+        asked_name(asked, count): every_round(
+            partial(imagine_together, world, episodes, count, selector)
+        )
         for count in batches
         for asked, selector in SELECTORS.items()
     }
     with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
-
-
-def _imagined(world: World[Any], episodes: Sequence[HeldOut], round_index: int) -> Imagined:
-    del round_index
-    return imagine(world, episodes)
-
-
-def _together(
-    world: BatchWorld[Any],
-    episodes: Sequence[HeldOut],
-    num_rollouts: int,
-    selector: ReturnSelector,
-    round_index: int,
-) -> Imagined:
-    del round_index
-    return imagine_together(world, episodes, num_rollouts, selector)
 
 
 def _data(
@@ -210,14 +192,3 @@ def _data(
         "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
         "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
     }
-
-
-def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of the options, otherwise the usual or the quick defaults."""
-    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
-    for name in ("rounds", "seeds"):
-        given = getattr(options, name)
-        plan[name] = plan[name] if given is None else given
-        if plan[name] < 1:
-            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
-    return plan

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.hands.actions import actions_from_poses
+from benchmarks.evaluator.playing import start_in_twin
 from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
+from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
 from services.twin.world import TwinWorld
 
 
@@ -45,15 +45,13 @@ def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[
         cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
     )
     world = TwinWorld(settings)
-    return [
-        _played(world, Stage(task, "robot", settings), seed) for task in tasks for seed in seeds
-    ]
+    return [_played(world, task, seed) for task in tasks for seed in seeds]
 
 
-def _played(world: TwinWorld, stage: Stage, seed: int) -> HeldOut:
-    task = stage.task
-    begun = world.reset(RolloutStart(task.name, seed, task.instruction))
-    actions = actions_from_poses(stage.plan(seed).commands, begun.anchor)[1:]
+def _played(world: TwinWorld, task: str, seed: int) -> HeldOut:
+    stage = world.stage(task)
+    begun, start, _ = start_in_twin(world, task, seed, stage.task.instruction)
+    actions = scripted_actions(stage, seed, script_name(0.0))
     state, seen = begun.state, []
     for first in range(0, len(actions), CHUNK_STEPS):
         stepped = world.step(
@@ -65,14 +63,7 @@ def _played(world: TwinWorld, stage: Stage, seed: int) -> HeldOut:
         state = stepped.state
         seen.append(stepped.observation)
     return HeldOut(
-        start=RolloutStart(
-            task.name,
-            seed,
-            task.instruction,
-            observation=begun.observation,
-            anchor=begun.anchor,
-            K_head=begun.K_head,
-        ),
+        start=start,
         actions=actions,
         images=np.concatenate([one.images[HEAD_CAMERA] for one in seen]),
         tactile_kpa=np.concatenate([one.tactile_kpa for one in seen]),

@@ -2,16 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 from benchmarks.world_model.rollouts import RolloutError
 from dextouch.schemas import CHUNK_STEPS
-
-if TYPE_CHECKING:
-    from services.world_model.network.configuration import Precision, Sampler
+from services.world_model.network.configuration import Precision, Sampler
 
 COPY_FIRST: Final = "copy-first"
 MAX_CHUNK_MS: Final = 50.0
@@ -27,8 +25,8 @@ class Variant:
     """A sampling setting; `recomputed`: nothing is shared by its steps."""
 
     steps: int
-    sampler: "Sampler" = "euler"
-    precision: "Precision" = "float32"
+    sampler: Sampler = "euler"
+    precision: Precision = "float32"
     recomputed: bool = False
 
     @property
@@ -94,19 +92,15 @@ def state_model_table(costs_ms: Mapping[str, Figure], name: str) -> ResultTable:
 def state_model_requirements(costs_ms: Mapping[str, Figure]) -> list[Requirement]:
     """Requirements on single rollouts, and on batches compared with them."""
     chunks = [
-        Requirement(
-            f"state model, a chunk, {asked}",
-            costs_ms[asked_name(asked, 1)].median,
-            "at most",
-            bound_ms,
-            "ms",
+        at_most(
+            f"state model, a chunk, {asked}", costs_ms[asked_name(asked, 1)].median, bound_ms, "ms"
         )
         for asked, bound_ms in MAX_STATE_CHUNK_MS.items()
     ]
     single, batch = (costs_ms[asked_name("all images", count)] for count in (1, 16))
     speedup = single.over(batch).median
     what = "state model, all images, throughput of a batch of 16 over single rollouts"
-    return [*chunks, Requirement(what, speedup, "at least", MIN_BATCH_SPEEDUP)]
+    return [*chunks, at_least(what, speedup, MIN_BATCH_SPEEDUP)]
 
 
 def panels(
@@ -123,14 +117,7 @@ def panels(
             "processor ms a chunk",
             label,
             [
-                Point(
-                    label=name,
-                    time=times_ms[name].median,
-                    time_low=times_ms[name].low,
-                    time_high=times_ms[name].high,
-                    error=getattr(error, key),
-                    is_ours=name == served,
-                )
+                Point.of(name, times_ms[name], getattr(error, key), is_ours=name == served)
                 for name, error in errors.items()
             ],
         )
@@ -147,7 +134,7 @@ def requirements(
     ours, copied = errors[served], errors[COPY_FIRST]
     image, touch = ours.image_levels / copied.image_levels, ours.touch_kpa / copied.touch_kpa
     return [
-        Requirement("a chunk, all images", times_ms[served].median, "at most", MAX_CHUNK_MS, "ms"),
-        Requirement("image error, share of copy-first's", image, "at most", 1.0),
-        Requirement("touch error, share of copy-first's", touch, "at most", 1.0),
+        at_most("a chunk, all images", times_ms[served].median, MAX_CHUNK_MS, "ms"),
+        at_most("image error, share of copy-first's", image, 1.0),
+        at_most("touch error, share of copy-first's", touch, 1.0),
     ]

@@ -7,10 +7,8 @@ import pytest
 
 from benchmarks.closure.contact_times import contact_times, timing_errors
 from benchmarks.closure.methods import METHODS, OURS, retarget_take
-from benchmarks.closure.pictures import write_sheet
 from benchmarks.closure.replay import TASKS, close_take
 from dextouch.errors import InvalidInputError
-from dextouch.images import jpeg_size
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -66,14 +64,6 @@ def test_twenty_retargeted_takes(task, capsys):
     assert rate(by_method[OURS]) >= 0.8
     # Nothing is held by a hand that only goes where the human's was.
     assert rate(by_method[COPIED]) <= 0.2
-
-
-@pytest.mark.slow
-def test_a_sheet_shows_human_and_replay(tmp_path):
-    path = tmp_path / "sheet.jpg"
-    succeeded = write_sheet("stack_bowls", SEEDS[0], [COPIED, OURS], path)
-    assert succeeded == [False, True]
-    assert jpeg_size(path.read_bytes()) == (3 * 128 + 2 * 4, 9 * 128)
 
 
 @pytest.mark.long

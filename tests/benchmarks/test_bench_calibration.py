@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import benchmark
-from benchmarks.calibration.acceptance import requirements
 from benchmarks.calibration.cameras import CameraResult
 from benchmarks.calibration.compare import MethodResult, not_worse_share, score
 from benchmarks.calibration.refusals import SceneResult, scene_makers
 from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
+from benchmarks.calibration.tables import requirements
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.simulated.board_scenes import Motion, board_points, make_scene
@@ -44,7 +44,7 @@ def test_every_method_is_measured_on_every_seed(run):
     assert list(figures["hand_eye"]) == NAMES
     for result in figures["hand_eye"].values():
         for key in ("ms", "error_deg", "error_mm"):
-            assert len(result[key]["values"]) == benchmark.QUICK["seeds"]
+            assert len(result[key]["values"]) == benchmark.AMOUNTS.quick["seeds"]
             assert min(result[key]["values"]) > 0
 
 

@@ -13,7 +13,6 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.retargeting import benchmark, compare, rival_process, rivals
-from benchmarks.retargeting.acceptance import requirements, velocity_limit_deg, worst_ratio
 from benchmarks.retargeting.compare import (
     PINCH_INPUT,
     ROBOT_INPUT,
@@ -23,14 +22,14 @@ from benchmarks.retargeting.compare import (
     compare_speed,
     scale_of,
 )
-from benchmarks.retargeting.hand_urdf import hand_urdf, roll_pitch_yaw
+from benchmarks.retargeting.hand_urdf import hand_urdf
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import RIVALS
 from benchmarks.retargeting.robustness import faulty_motions, try_faults
 from benchmarks.retargeting.scores import PinchScore, RobotScore, score_robot
-from benchmarks.retargeting.tables import tables
+from benchmarks.retargeting.tables import requirements, tables, velocity_limit_deg, worst_ratio
 from benchmarks.simulated.hand_motions import cold_postures, robot_motion
 from dextouch.errors import (
     InvalidInputError,
@@ -112,22 +111,6 @@ def test_the_urdf_moves_like_the_hand(side):
         np.testing.assert_allclose(found, tips, atol=1e-9)
     limits = np.array([model.joint(name).range for name in hand.joint_names])
     np.testing.assert_allclose(limits, np.column_stack([hand.lower_rad, hand.upper_rad]))
-
-
-def rotation(roll, pitch, yaw):
-    cr, cp, cy = np.cos([roll, pitch, yaw])
-    sr, sp, sy = np.sin([roll, pitch, yaw])
-    R_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    R_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ R_y @ R_x
-
-
-@pytest.mark.parametrize("pitch", [-np.pi / 2, -1.5, 0.0, 0.7, np.pi / 2])
-def test_angles_of_a_rotation(pitch):
-    R = rotation(0.4, pitch, -2.5)
-    # Upright, what is left of a cosine by rounding must not be taken for an angle.
-    R[np.abs(R) < 1e-12] = 0.0
-    np.testing.assert_allclose(rotation(*roll_pitch_yaw(R)), R, atol=1e-12)
 
 
 def fake_rival(solve, joint_names=None):

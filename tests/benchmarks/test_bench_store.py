@@ -17,12 +17,11 @@ import simplejpeg
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.store import benchmark
-from benchmarks.store.acceptance import requirements
 from benchmarks.store.compare import DesignResult, expected_window, image_psnr
 from benchmarks.store.designs import OpenStore
 from benchmarks.store.live import LiveResult
 from benchmarks.store.scene import NOISE_SIGMA_LEVELS, make_scene
-from benchmarks.store.tables import panels, rms_levels
+from benchmarks.store.tables import panels, requirements, rms_levels
 from benchmarks.store.take import make_take
 from benchmarks.store.workload import (
     CAMERAS,

@@ -24,7 +24,7 @@ def test_agreement_of_each_draw_is_that_of_the_drawn_starts():
     rng = np.random.default_rng(3)
     real, imagined = (rng.random((2, 5, 8)) < 0.5).astype(float)
     counts = start_counts(8, rng, num_draws=50)
-    rates = [rates_of_draws(x, counts) for x in (real, imagined)]
+    rates = [rates_of_draws(x, np.ones_like(x), counts) for x in (real, imagined)]
     together = {"pearson": pearson_of_draws(*rates), "mmrv": mmrv_of_draws(*rates)}
     for draw, row in enumerate(counts):
         columns = _drawn_starts(row)

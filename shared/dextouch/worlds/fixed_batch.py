@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EVERYTHING, ReturnSelector, RolloutStart
+from dextouch.schemas import EVERYTHING, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.worlds.world import BatchWorld, StartedRollout, SteppedRollout
 
 State = TypeVar("State")
@@ -29,9 +29,13 @@ class FixedBatchWorld(BatchWorld[State]):
     def __init__(self, world: BatchWorld[State], size: int) -> None:
         if size < 1:
             raise InvalidInputError(f"fixed batch: got a size of {size}, expected at least 1")
-        self.description = world.description
         self._world = world
         self._size = size
+
+    @property
+    def description(self) -> WorldDescription:
+        """That of the world."""
+        return self._world.description
 
     def reset(self, start: RolloutStart) -> StartedRollout[State]:
         """See World."""
