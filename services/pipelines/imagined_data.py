@@ -31,7 +31,7 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
 )
 from services.world_model.state_world import StateWorld
-from services.world_model.training.dataset import fingerprint, read_episode
+from services.world_model.training.dataset import read_episode
 from services.world_model.world import open_world
 
 WORLD = "world_model"
@@ -216,7 +216,7 @@ def refuse_trained_episodes(
         trained = [
             one
             for one in wanted
-            if fingerprint(read_episode(store.open(one), image_px=px)) in prints
+            if read_episode(store.open(one), image_px=px).fingerprint() in prints
         ]
     if trained:
         raise ConflictError(

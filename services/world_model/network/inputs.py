@@ -164,16 +164,12 @@ def pose_raster(
         Ts_world_wrist = anchors[:, None, index] @ pose_from_9d(actions[..., wrist])
         points_wrist = hand_points_m(actions[..., joints], side=side)
         points_camera = apply(Ts_camera_world @ Ts_world_wrist, points_wrist)
-        pixels, visible = _project_each(K_head, points_camera)
+        each = zip(K_head, points_camera, strict=True)
+        pixels, visible = map(np.stack, zip(*(project(K, one) for K, one in each), strict=True))
         # Far outside the image a blot is zero; clipping keeps float32 squares finite.
         pixels = np.clip(pixels, -10.0 * image_px, 10.0 * image_px)
         rasters.append(blots(pixels, visible, image_px=image_px, cells=cells))
     return np.stack(rasters, axis=2)
-
-
-def _project_each(K_head: np.ndarray, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [project(K, points) for K, points in zip(K_head, points_camera, strict=True)]
-    return np.stack([pixels for pixels, _ in pairs]), np.stack([front for _, front in pairs])
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,13 @@ class RendererRun:
         *,
         rng: np.random.Generator,
     ) -> None:
-        check_clips(clips, config)
+        sizes = {clip.images.shape[1:3] for clip in clips}
+        multiple = config.pixel_multiple
+        if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):
+            raise InvalidInputError(
+                f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, "
+                f"expected at least one clip and one size whose sides are multiples of {multiple}"
+            )
         self._clips = clips
         self._settings = settings
         self._rng = rng
@@ -199,17 +205,6 @@ def _edges(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 rows colu
     down = images[..., 2:, 1:-1] + images[..., :-2, 1:-1]
     side = min(_EDGE_WINDOW_PX, *centre.shape[-2:])
     return functional.avg_pool2d((across + down - 4.0 * centre).abs(), side, stride=3)
-
-
-def check_clips(clips: Sequence[SceneClip], config: RendererConfig) -> None:
-    """Reject clips that the network cannot learn from."""
-    sizes = {clip.images.shape[1:3] for clip in clips}
-    multiple = config.pixel_multiple
-    if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):
-        raise InvalidInputError(
-            f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, expected "
-            f"at least one clip and one size whose sides are multiples of {multiple}"
-        )
 
 
 def gather(clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]) -> Scenes:

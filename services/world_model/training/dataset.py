@@ -86,8 +86,20 @@ class EpisodeArrays:
         return tuple(self.actions)
 
     def fingerprint(self) -> str:
-        """`fingerprint` of its arrays."""
-        return fingerprint(self)
+        """SHA-256 of observations and actions; identifies equal data under another name.
+
+        Checkpoints list those of their training episodes, so that none of them is held out later.
+        """
+        digest = hashlib.sha256()
+        digest.update(np.ascontiguousarray(self.images).tobytes())
+        digest.update(np.ascontiguousarray(self.tactile_kpa, dtype="<f4").tobytes())
+        for kind in sorted(self.actions):
+            digest.update(kind.encode())
+            # Rounded to a micrometre: re-anchoring changes the last bits of poses. Adding zero
+            # turns minus zero into zero.
+            rounded = self.actions[kind].round(6) + 0.0
+            digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
+        return digest.hexdigest()
 
     def cut(self, place: WindowPosition) -> "Window":
         """Cut the window at a place in this episode."""
@@ -118,23 +130,6 @@ class WindowBatch:
     images: UInt8[Tensor, "batch time px px 3"]
     tactile_kpa: Float32[Tensor, "batch time 2 320"]
     tactile_valid: Bool[Tensor, "batch time 2"]
-
-
-def fingerprint(episode: EpisodeArrays) -> str:
-    """SHA-256 of observations and actions; identifies equal data under another name.
-
-    Checkpoints list those of their training episodes, so that none of them is held out later.
-    """
-    digest = hashlib.sha256()
-    digest.update(np.ascontiguousarray(episode.images).tobytes())
-    digest.update(np.ascontiguousarray(episode.tactile_kpa, dtype="<f4").tobytes())
-    for kind in sorted(episode.actions):
-        digest.update(kind.encode())
-        # Rounded to a micrometre: re-anchoring changes the last bits of poses. Adding zero
-        # turns minus zero into zero.
-        rounded = episode.actions[kind].round(6) + 0.0
-        digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
-    return digest.hexdigest()
 
 
 def cut_window(
@@ -257,7 +252,7 @@ class StoredEpisode:
         return self.num_steps
 
     def fingerprint(self) -> str:
-        """`fingerprint` of its arrays when it was indexed."""
+        """That of its arrays when it was indexed."""
         return self.print_sha256
 
     def load(self) -> EpisodeArrays:

@@ -37,7 +37,6 @@ class StateFigures:
     figures: dict[str, float]
     disagreement_m: float
     distance: float
-    num_latents: int
 
 
 def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
@@ -62,7 +61,6 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
         {name: round(float(value), 4) for name, value in figures.items()},
         disagreement_m=float(torch.cat(disagreement_m).quantile(_BOUND_QUANTILE)),
         distance=max(_SMALLEST_DISTANCE, float(torch.cat(distance).quantile(_BOUND_QUANTILE))),
-        num_latents=(table.num_steps - 1) // STEPS_PER_LATENT,
     )
 
 

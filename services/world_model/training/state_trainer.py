@@ -8,7 +8,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ from services.world_model.training.state_data import (
     splits_by_task,
     trained_splits,
 )
-from services.world_model.training.state_evaluation import StateFigures, evaluate_dynamics
+from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
@@ -134,8 +134,13 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     _train_parts(work)
     dynamics, renderer, cpu_s = _assembled(work, codec)
     measured = evaluate_dynamics(dynamics, heldout_table)
-    measured = replace(measured, num_latents=horizon_latents)
-    metadata = _metadata(work, data, measured, command=command, cpu_s=cpu_s)
+    bounds = StateBounds(
+        disagreement_m=measured.disagreement_m,
+        distance=measured.distance,
+        horizon_latents=horizon_latents,
+        of_chunks=True,
+    )
+    metadata = _metadata(work, data, bounds, measured.figures, command=command, cpu_s=cpu_s)
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
     return StateReport(
@@ -150,7 +155,13 @@ def train_state(settings: StateTrainSettings) -> StateReport:
 
 
 def _metadata(
-    work: "_Work", data: StateData, measured: StateFigures, *, command: str, cpu_s: float
+    work: "_Work",
+    data: StateData,
+    bounds: StateBounds,
+    metrics: dict[str, float],
+    *,
+    command: str,
+    cpu_s: float,
 ) -> StateMetadata:
     """Provenance and accuracy of a trained model."""
     settings, base = work.settings, work.base
@@ -160,12 +171,7 @@ def _metadata(
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
-        bounds=StateBounds(
-            disagreement_m=measured.disagreement_m,
-            distance=measured.distance,
-            horizon_latents=measured.num_latents,
-            of_chunks=True,
-        )
+        bounds=bounds
         if base is None or settings.learn == "all"
         else base.checkpoint.metadata.bounds,
         command=command,
@@ -187,7 +193,7 @@ def _metadata(
             inherited=() if base is None else base.checkpoint.metadata.sets,
             ancestor=None if base is None else base.checkpoint.digest,
         ),
-        metrics=measured.figures,
+        metrics=metrics,
     )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from pydantic import JsonValue
-from torch import Tensor
 
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
@@ -215,10 +214,6 @@ class TrainingRun:
             log=tuple(astuple(entry) for entry in self.log),
         )
         return TrainingState(tensors, facts)
-
-    def like_state(self) -> dict[str, Tensor]:
-        """Tensors with the names, shapes and sharding of those of a state after a step."""
-        return {**moments_like(self.loop.optimizer), **self.state({}).tensors}
 
     def restore(self, state: TrainingState) -> None:
         """Continue from `state`."""
@@ -456,7 +451,8 @@ def _run_or_resume(
         tokenizer_digest=None if tokenizer is None else tokenizer.digest,
     )
     if settings.resume and files.exists():
-        run.restore(files.read(identity, run.like_state()))
+        like = {**moments_like(run.loop.optimizer), **run.state(identity).tensors}
+        run.restore(files.read(identity, like))
     elif ancestor is not None:
         run.start_from(ancestor)
     else:

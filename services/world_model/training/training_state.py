@@ -168,17 +168,9 @@ def state_path(output: Path) -> Path:
     return output.with_name(output.name + SUFFIX)
 
 
-def identity_of(
-    settings: TrainSettings,
-    *,
-    data_hash: str,
-    init_digest: str | None,
-    tokenizer_digest: str | None = None,
-) -> dict[str, JsonValue]:
-    """Settings and data that must not change when a run resumes."""
-    kept: dict[str, JsonValue] = settings.model_dump(mode="json", exclude=_FREE_SETTINGS)
-    digests = {"init_digest": init_digest, "tokenizer_digest": tokenizer_digest}
-    return {**kept, "data_hash": data_hash, **digests}
+def identity_of(settings: TrainSettings, **digests: str | None) -> dict[str, JsonValue]:
+    """Settings, and digests of the data and of files, that must not change when a run resumes."""
+    return {**settings.model_dump(mode="json", exclude=_FREE_SETTINGS), **digests}
 
 
 def write_state(path: Path, state: TrainingState) -> None:

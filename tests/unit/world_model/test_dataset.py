@@ -10,7 +10,6 @@ from dextouch.errors import InvalidInputError
 from services.world_model.training.dataset import (
     WindowSampler,
     cut_window,
-    fingerprint,
     load_episodes,
     read_episode,
 )
@@ -84,18 +83,19 @@ def test_too_short_episodes_and_none_are_refused(toy_episode):
 
 def test_the_fingerprint_is_of_the_content_not_the_name(toy_episode):
     episode = toy_episode(0)
-    assert fingerprint(replace(episode, episode_id="other", scene="push_box/99")) == fingerprint(
-        episode
+    assert (
+        replace(episode, episode_id="other", scene="push_box/99").fingerprint()
+        == episode.fingerprint()
     )
     touched = episode.tactile_kpa.copy()
     touched[3, 1, 7] += 1e-3
-    assert fingerprint(replace(episode, tactile_kpa=touched)) != fingerprint(episode)
+    assert replace(episode, tactile_kpa=touched).fingerprint() != episode.fingerprint()
 
 
 def test_a_store_is_loaded_whole(toy_store, toy_episodes):
     loaded = load_episodes(str(toy_store.root))
     assert [e.episode_id for e in loaded] == [e.episode_id for e in toy_episodes]
-    assert fingerprint(loaded[2]) == fingerprint(toy_episodes[2])
+    assert loaded[2].fingerprint() == toy_episodes[2].fingerprint()
 
 
 def test_every_start_is_drawn_the_last_one_too(toy_episode):
@@ -112,6 +112,6 @@ def test_a_window_carries_the_flags_of_its_own_steps(toy_episode):
 
 def test_other_actions_are_another_fingerprint(toy_episode):
     episode = toy_episode(0)
-    before = fingerprint(episode)
+    before = episode.fingerprint()
     episode.actions["measured"][3, 20] += 0.01
-    assert fingerprint(episode) != before
+    assert episode.fingerprint() != before

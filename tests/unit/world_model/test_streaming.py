@@ -15,7 +15,6 @@ from services.world_model.command_line import run_train
 from services.world_model.training.dataset import (
     WindowPosition,
     WindowSampler,
-    fingerprint,
     index_episodes,
     load_episodes,
     read_batches,
@@ -86,8 +85,8 @@ def test_an_indexed_episode_says_what_it_is(stored, in_memory):
         )  # fmt: skip
         assert len(ours) == len(theirs)
         assert set(ours.action_kinds) == {"measured", "commanded"}
-        assert ours.fingerprint() == fingerprint(theirs)
-        assert fingerprint(ours.load()) == ours.fingerprint()
+        assert ours.fingerprint() == theirs.fingerprint()
+        assert ours.load().fingerprint() == ours.fingerprint()
 
 
 @pytest.fixture
@@ -189,7 +188,7 @@ def test_streaming_splits_and_reports_as_training_in_memory(toy_store, train_set
     assert [e.episode_id for e in trained] == [e.episode_id for e in plain[0]]
     assert [e.episode_id for e in heldout] == [e.episode_id for e in plain[1]]
     metadata = read_checkpoint(train(settings).checkpoint).metadata
-    assert metadata.train_fingerprints == tuple(sorted(fingerprint(e) for e in plain[0]))
+    assert metadata.train_fingerprints == tuple(sorted(e.fingerprint() for e in plain[0]))
     given = settings.model_copy(update={"heldout": settings.episodes})
     with pytest.raises(InvalidInputError, match="also trained on"):
         train(given)

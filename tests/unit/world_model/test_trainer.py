@@ -11,7 +11,7 @@ from safetensors import safe_open
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
 from services.world_model.training import evaluation
-from services.world_model.training.dataset import cut_window, fingerprint, stack_windows
+from services.world_model.training.dataset import cut_window, stack_windows
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
 from services.world_model.training.trainer import TrainingRun, check_disjoint, train, train_on
@@ -76,7 +76,9 @@ def test_a_report_holds_what_was_measured_on_the_stored_weights(
     stored = read_checkpoint(report.checkpoint)
     assert stored.digest == report.digest
     assert stored.metadata.metrics == report.metrics
-    assert stored.metadata.train_fingerprints == tuple(sorted(map(fingerprint, toy_episodes)))
+    assert stored.metadata.train_fingerprints == tuple(
+        sorted(e.fingerprint() for e in toy_episodes)
+    )
     assert stored.metadata.tasks == ("push_box",)
     assert seen == report.log
     again = evaluate_prediction(
@@ -116,7 +118,7 @@ def test_held_out_episodes_cannot_be_trained_on(toy_episodes, heldout, train_set
 
 
 def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
-    prints = [fingerprint(toy_episodes[2])]
+    prints = [toy_episodes[2].fingerprint()]
     with pytest.raises(InvalidInputError, match="toy-2"):
         evaluate_prediction(tiny_model, toy_episodes, train_fingerprints=prints)
     with pytest.raises(InvalidInputError, match="without a window"):
