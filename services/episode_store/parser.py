@@ -72,7 +72,11 @@ def store_parser() -> argparse.ArgumentParser:
     does = "permanently delete items in the trash"
     purge = _command(commands, shared, "purge", does, "--older-than 30d")
     purge.add_argument(
-        "--older-than", type=seconds_of, default=0.0, metavar="AGE", help="such as 30d or 12h"
+        "--older-than",
+        type=seconds_of,
+        default=0.0,
+        metavar="AGE",
+        help="items deleted longer ago than this, such as 30d or 12h",
     )
     return parser
 

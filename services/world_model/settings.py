@@ -129,7 +129,8 @@ class CoreSettings(FrozenModel):
     )
 
 
-# What is trained of a state model that a training starts from.
+# What is trained of a state model that a training starts from; its other parts are kept. "readers"
+# are the start readers and the estimate of success, "success" is that estimate alone.
 Learned = Literal["all", "readers", "success"]
 
 

@@ -311,6 +311,11 @@ class StateWorld(BatchWorld[StateRollout]):
         ]
 
     def _uncertainty(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Uncertainty:
+        """Uncertainty of a chunk.
+
+        `distance` is of the hands' motion alone; of the start image count which objects are found,
+        their sizes and where the members' readers disagree, but not the readers' own `sd_m`.
+        """
         bounds = self._metadata.bounds
         # Of the worst latent step, independent of the chunk length.
         disagreement_m = float(steps.disagreement_m[index].max())

@@ -2,7 +2,7 @@ r"""Text that people type: characters that change how other text is shown are re
 
 Control characters can change a terminal or forge lines of a log, and bidirectional marks the order
 in which a line is read. Requests refuse them (`FreeText`, `FreeLines`); what was stored before
-stays readable, and is escaped where it is printed (`printable`).
+stays readable, and is escaped where it is printed (`printable`). Schemas limit lengths.
 """
 
 import json

@@ -186,7 +186,8 @@ class NetworkConfig(FrozenModel):
         default=True, description="add the conditions to the tokens, too"
     )
     use_pose_raster: bool = Field(
-        default=True, description="condition on a raster of the projected hands, too"
+        default=True,
+        description="condition on a raster of the projected hands, too, of 4 cells per token side",
     )
     use_scene_encoder: bool = Field(
         default=True,

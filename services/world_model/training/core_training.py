@@ -234,7 +234,9 @@ def core_loss(
 ) -> Float32[Tensor, ""]:
     """Weighted sum of the errors in objects, touch, contact and final success.
 
-    Where hands are held still without contact, the targets are no motion and no change of touch.
+    Where hands are held still without contact, the targets are no motion and no change of touch. A
+    change of it needs a new `CORE_VERSION` (`state_trainer`): finished members are not trained
+    again without.
     """
     commands, start = batch.commands, batch.start
     table, rows = data.table, batch.rows

@@ -1,4 +1,7 @@
-"""A state model that a training starts from: what it keeps, and what is trained of it."""
+"""A state model that a training starts from, and its parts as a training continues them.
+
+Which parts are trained and which are kept is decided in `state_trainer`, by `--learn`.
+"""
 
 from collections.abc import Mapping
 from functools import cached_property

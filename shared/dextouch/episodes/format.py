@@ -114,7 +114,10 @@ def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
 
 
 def codec_of(descriptor: StreamDescriptor) -> Codec:
-    """Codec of a stream's values."""
+    """Codec of a stream's values, by its unit.
+
+    There is no default for images: who makes the stream (a driver, the twin, an import) names it.
+    """
     units: Mapping[str, Codec] = {JPEG_UNIT: "jpeg", H264_UNIT: "h264"}
     return units.get(descriptor.unit, "zstd")
 

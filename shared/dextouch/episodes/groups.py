@@ -361,7 +361,9 @@ class GroupReader(Generic[A]):
         raise NotFoundError(f"{self._what}: {name!r} holds no image that can be decoded")
 
     def verify(self) -> Verification:
-        """Read everything and compare it with the commit record.
+        """Read everything and compare it with the commit record, up to the first damage.
+
+        `dextouch.episodes.care` finds all damage, for `store verify` and `store repair`.
 
         Raises:
             CorruptDataError: the first damaged array, by name.

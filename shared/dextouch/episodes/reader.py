@@ -33,7 +33,7 @@ MAX_CAMERA_THREADS = 8
 SAME_INSTANT_NS = 1_000
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
 # Type and shape of the fields that are one array each; -1 is the number of steps.
-_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+_WINDOW_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "tactile_kpa": ("float32", (-1, 2, 320)),
     "tactile_valid": ("bool", (-1, 2)),
     "actions": ("float64", (-1, 67)),
@@ -136,7 +136,7 @@ def mean_over_ranges(
 
 def encode_window(window: Window) -> bytes:
     """Serialize a window."""
-    arrays = {name: getattr(window, name) for name in _ARRAYS}
+    arrays = {name: getattr(window, name) for name in _WINDOW_ARRAYS}
     arrays["anchor"] = np.stack(window.anchor.as_tuple())
     for camera, images in window.images.items():
         arrays[_IMAGES + camera] = images
@@ -160,7 +160,7 @@ def decode_window(data: bytes, *, max_bytes: int) -> Window:
             f"window: got action kind {action_kind!r} and instruction {instruction!r}, "
             f"expected one of {get_args(ActionKind)} and a text"
         )
-    plain: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
+    plain: dict[str, Any] = {name: arrays[name] for name in _WINDOW_ARRAYS}
     plain["anchor"] = AnchorPoses(*arrays["anchor"])
     return Window(
         images={camera: arrays[_IMAGES + camera] for camera in cameras},
@@ -175,7 +175,7 @@ def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
     n = len(arrays["t_ref_ns"]) if "t_ref_ns" in arrays and arrays["t_ref_ns"].ndim else 0
     expected = {
         name: (dtype, tuple(n if size < 0 else size for size in shape))
-        for name, (dtype, shape) in _ARRAYS.items()
+        for name, (dtype, shape) in _WINDOW_ARRAYS.items()
     }
     for camera in cameras:
         # Height and width vary by camera; gray images have one channel.

@@ -8,6 +8,8 @@ from pydantic_core import from_json, to_json
 from dextouch import errors
 from dextouch.frozen_model import FrozenModel
 
+# Letters of a task's sentence, in takes, episodes and rollouts alike.
+MAX_INSTRUCTION = 2000
 ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 # Of a W3C trace (docs/operations.md#traces).

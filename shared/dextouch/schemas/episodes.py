@@ -12,6 +12,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.common import (
+    MAX_INSTRUCTION,
     Box,
     ClockMethod,
     ClockWarning,
@@ -117,7 +118,7 @@ class EpisodeAttributes(FrozenModel):
     format_version: Literal[1] = FORMAT_VERSION
     episode_id: StoreId
     task: str = Field(min_length=1, max_length=128)
-    instruction: str = Field(max_length=2000)
+    instruction: str = Field(max_length=MAX_INSTRUCTION)
     domain: Domain
     origin: Origin
     station: str | None = Field(default=None, min_length=1, max_length=128)
@@ -258,7 +259,7 @@ class RecordingAttributes(FrozenModel):
     format_version: Literal[1] = FORMAT_VERSION
     recording_id: StoreId
     task: str = Field(min_length=1, max_length=128)
-    instruction: str = Field(max_length=2000)
+    instruction: str = Field(max_length=MAX_INSTRUCTION)
     domain: Domain
     station: str = Field(min_length=1, max_length=128)
     operator: str | None = None

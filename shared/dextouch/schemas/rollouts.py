@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas.common import MAX_INSTRUCTION
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
@@ -85,7 +86,7 @@ class StartRequest(FrozenModel):
     world: FreeText
     task: FreeText
     seed: int = Field(ge=0, le=MAX_SEED)
-    instruction: FreeText = Field(max_length=1000)
+    instruction: FreeText = Field(max_length=MAX_INSTRUCTION)
     action_kind: ActionKind = "commanded"
 
 
@@ -103,7 +104,8 @@ class Uncertainty(FrozenModel):
 
     Attributes:
         disagreement: between several predictions of the same steps.
-        distance: of the rollout from the training distribution.
+        distance: of the rollout from the training distribution, by what the world compares: the
+            state model's is of the hands' motion.
         outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
         reason: why it is outside; None otherwise.
         success_probability: probability that the task is done after these steps, in the world's own

@@ -7,7 +7,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.common import Domain, StoreId
+from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
 
 RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
@@ -31,7 +31,7 @@ class TakePrompt(FrozenModel):
     """What is going to be recorded; given before the start."""
 
     task: FreeText = Field(min_length=1, max_length=128)
-    instruction: FreeText = Field(min_length=1, max_length=2000)
+    instruction: FreeText = Field(min_length=1, max_length=MAX_INSTRUCTION)
     domain: Domain = "human"
     operator: FreeText | None = Field(default=None, max_length=128)
     consent: bool = False
