@@ -63,12 +63,10 @@ def timing_errors(pairs: Sequence[tuple[ContactTimes, ContactTimes]]) -> TimingE
     )
     late = [times[:, 1] - times[:, 0] for times in (first, last)]
     human, replay = np.moveaxis(np.isfinite(first[..., :-1]), 1, 0)
-    return TimingErrors(
-        *(_finite(times[..., -1]) for times in late),
-        *(_finite(times[..., :-1]) for times in late),
-        num_missing=int((human & ~replay).sum()),
-        num_extra=int((replay & ~human).sum()),
-    )
+    hand_first, hand_last = (_finite(times[..., -1]) for times in late)
+    pad_first, pad_last = (_finite(times[..., :-1]) for times in late)
+    missing, extra = int((human & ~replay).sum()), int((replay & ~human).sum())
+    return TimingErrors(hand_first, hand_last, pad_first, pad_last, missing, extra)
 
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:

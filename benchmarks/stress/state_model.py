@@ -49,9 +49,7 @@ def _precision(check: Check) -> None:
         )
         check.refused(
             f"weights {dtype}",
-            lambda c=checkpoint: Subject(  # type: ignore[misc]
-                StateWorld(c), subject.begun
-            ).step(subject.still()),
+            lambda c=checkpoint: Subject(StateWorld(c), subject.begun).step(subject.still()),
             kind=InvalidInputError,
         )
 
