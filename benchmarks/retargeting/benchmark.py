@@ -62,7 +62,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     if options.seed < 0:
         raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
     plan = AMOUNTS.of(options, samples=30)
-    effort = Effort(*plan.values(), options.seed)
+    counts = {f"num_{name}": count for name, count in plan.items()}
+    effort = Effort(**counts, seed=options.seed)
     chosen, left_out = choose_rivals(options.rivals)
     with ExitStack() as stack:
         rivals = {one.name: stack.enter_context(RivalProcess(one)) for one in chosen}
