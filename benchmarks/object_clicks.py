@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from dextouch.episodes import EpisodeGrid, clicked_poses
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform_from_pose
+from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import (
     ClickedAt,
     EpisodeAttributes,
@@ -69,18 +70,14 @@ class _Start:
             name=HEAD_CAMERA, kind="image", shape=(side_px, side_px, 3), dtype="uint8", unit="rgb8",
             nominal_rate_hz=15,
         )  # fmt: skip
-        still = matrix_rows(np.eye(4))
+        anchor = AnchorPoses(np.eye(4), np.eye(4), self.T_world_camera)
         return EpisodeAttributes(
             episode_id="clicked",
             task=self.task,
             instruction="",
             domain="robot",
             origin="twin",
-            anchor=StoredAnchor(
-                T_world_wrist_left=still,
-                T_world_wrist_right=still,
-                T_world_camera_head=matrix_rows(self.T_world_camera),
-            ),
+            anchor=StoredAnchor.from_poses(anchor),
             K_head=matrix_rows(self.camera(side_px)),
             streams=(camera,),
         )

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from scipy.optimize import least_squares
 
 from benchmarks.simulated.hand_motions import Motion
-from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.errors import LimitExceededError
 from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import NUM_FINGERS
 from dextouch.tactile.layout import Side
@@ -62,14 +62,9 @@ class Person(HumanHand):
         side: of the hand.
         size: relative to the average hand, above zero.
         seed: of the deviations of bones and knuckle positions.
-
-    Raises:
-        InvalidInputError: a size of zero or less.
     """
 
     def __init__(self, side: Side, size: float, seed: int) -> None:
-        if not size > 0:
-            raise InvalidInputError(f"size of a hand: got {size}, expected above zero")
         self.size = size
         rng = np.random.default_rng([seed, int(side == "right")])
         fingers = tuple(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from numpy.random import Generator
 
 from benchmarks.simulated.finger_contact import touching
-from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.errors import LimitExceededError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS
 from dextouch.tactile.layout import Side
@@ -64,11 +64,8 @@ def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> M
         natural: within the usual range of hands; otherwise the joints' whole range.
 
     Raises:
-        InvalidInputError: fewer than 2 samples.
         LimitExceededError: no motion of this seed is slow enough and collision-free.
     """
-    if num_samples < 2:
-        raise InvalidInputError(f"motion: got {num_samples} samples, expected at least 2")
     hand = twin_hand(side, "robot")
     rng = np.random.default_rng([seed, int(natural), int(side == "right")])
     rate_hz = rng.uniform(*SINE_RANGE_HZ, (NUM_JOINTS, _NUM_SINES))
@@ -109,13 +106,7 @@ def with_noise(motion: Motion, sigma_m: float, rng: Generator) -> Motion:
 
 
 def with_dropouts(motion: Motion, share: float, rng: Generator) -> Motion:
-    """Randomly drop nodes (NaN), except the wrist; joint angles are unchanged.
-
-    Raises:
-        InvalidInputError: a share outside 0 … 1.
-    """
-    if not 0.0 <= share <= 1.0:
-        raise InvalidInputError(f"dropouts: got a share of {share}, expected 0 … 1")
+    """Randomly drop nodes (NaN), except the wrist; joint angles are unchanged."""
     lost: Bool[np.ndarray, "time 25"] = rng.random(motion.keypoints_m.shape[:2]) < share
     lost[:, NODE_INDEX["wrist", "wrist"]] = False
     return replace(motion, keypoints_m=np.where(lost[..., None], np.nan, motion.keypoints_m))

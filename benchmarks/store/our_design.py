@@ -15,6 +15,7 @@ from benchmarks.store.workload import (
     Workload,
 )
 from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
 
@@ -114,7 +115,6 @@ def _descriptor(name: str, stream: TimedStream, what: tuple[StreamKind, str]) ->
 
 def episode_attributes(streams: tuple[StreamDescriptor, ...]) -> EpisodeAttributes:
     """Placeholder attributes of an episode."""
-    still = matrix_rows(np.eye(4))
     return EpisodeAttributes(
         episode_id=EPISODE_ID,
         task="bench",
@@ -122,9 +122,7 @@ def episode_attributes(streams: tuple[StreamDescriptor, ...]) -> EpisodeAttribut
         domain="robot",
         origin="recorded",
         model_rate_hz=30.0,
-        anchor=StoredAnchor(
-            T_world_wrist_left=still, T_world_wrist_right=still, T_world_camera_head=still
-        ),
+        anchor=StoredAnchor.from_poses(AnchorPoses(np.eye(4), np.eye(4), np.eye(4))),
         K_head=matrix_rows(np.eye(3)),
         streams=streams,
     )

@@ -89,11 +89,16 @@ class Check:
         self.true(f"{what} equal to the bit", same)
 
     def refused(
-        self, what: str, call: Callable[[], object], kind: type[DexTouchError] = InvalidInputError
+        self,
+        what: str,
+        call: Callable[..., object],
+        *arguments: object,
+        kind: type[DexTouchError] = InvalidInputError,
+        **options: object,
     ) -> None:
-        """A call that must raise a DexTouch error of this kind."""
+        """A call with these arguments that must raise a DexTouch error of this kind."""
         try:
-            call()
+            call(*arguments, **options)
         except DexTouchError as error:
             if isinstance(error, kind):
                 self._refusals.setdefault(type(error).__name__, []).append(what)

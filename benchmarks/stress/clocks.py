@@ -51,7 +51,7 @@ def _clock(check: Check) -> None:
     back[1500:] -= 10_000_000_000
     model = fit_clock(back, host)
     check.true("a step back is found and ambiguous", model.num_steps == 1 and model.is_ambiguous)
-    check.refused("dates without arrivals", lambda: model.to_host_ns(back))
+    check.refused("dates without arrivals", model.to_host_ns, back)
 
 
 @STAGE.cell(
@@ -61,17 +61,15 @@ def _non_finite(check: Check) -> None:
     device, host = _take(100, 0.0)
     broken = device.astype(np.float64)
     broken[50] = np.nan
-    check.refused("NaN stamps", lambda: fit_clock(broken, host), ClockFitError)
-    check.refused("NaN counts", lambda: unwrap_counter(broken, modulus=2**32), ShapeError)
-    check.refused(
-        "count past the modulus", lambda: unwrap_counter(np.array([70_000]), modulus=2**16)
-    )
-    check.refused("count past the counter", lambda: TickCounter(16, 1000).to_ns(65_536, 0))
-    check.refused("arrivals go back", lambda: fit_clock(device, host[::-1]), ClockFitError)
-    check.refused("a clock that stands", lambda: fit_clock(device * 0, host), ClockFitError)
+    check.refused("NaN stamps", fit_clock, broken, host, kind=ClockFitError)
+    check.refused("NaN counts", unwrap_counter, broken, kind=ShapeError, modulus=2**32)
+    check.refused("count past the modulus", unwrap_counter, np.array([70_000]), modulus=2**16)
+    check.refused("count past the counter", TickCounter(16, 1000).to_ns, 65_536, 0)
+    check.refused("arrivals go back", fit_clock, device, host[::-1], kind=ClockFitError)
+    check.refused("a clock that stands", fit_clock, device * 0, host, kind=ClockFitError)
     clock = OnlineClock(None)
     clock.update(t_host_ns=0, t_device_ns=0)
-    check.refused("a stamp that is missing", lambda: clock.update(t_host_ns=1))
+    check.refused("a stamp that is missing", clock.update, t_host_ns=1)
 
 
 @STAGE.cell("ends", "10 samples, the fewest; dates before the first and after the last sample")
@@ -85,8 +83,8 @@ def _ends(check: Check) -> None:
         700_000,
         "ns",
     )
-    check.refused("9 samples", lambda: fit_clock(device[:9], host[:9]), ClockFitError)
-    check.refused("no sample", lambda: fit_clock(device[:0], host[:0]), ClockFitError)
+    check.refused("9 samples", fit_clock, device[:9], host[:9], kind=ClockFitError)
+    check.refused("no sample", fit_clock, device[:0], host[:0], kind=ClockFitError)
 
 
 @STAGE.cell("precision", "stamps near 2^62 ns, where float64 knows only every 512th nanosecond")

@@ -65,13 +65,9 @@ def _rotations(check: Check) -> None:
         ("opposite columns", [1.0, 0, 0, -1.0, 0, 0]),
         ("zero column", [0.0, 0, 0, 0, 1.0, 0]),
     ):
-        check.refused(
-            what,
-            lambda c=columns: rotation_from_6d(np.array(c)),  # type: ignore[misc]
-            DegenerateRotationError,
-        )
+        check.refused(what, rotation_from_6d, np.array(columns), kind=DegenerateRotationError)
     check.refused(
-        "zero quaternion", lambda: rotation_from_quaternion(np.zeros(4)), DegenerateRotationError
+        "zero quaternion", rotation_from_quaternion, np.zeros(4), kind=DegenerateRotationError
     )
 
 
@@ -85,10 +81,10 @@ def _non_finite(check: Check) -> None:
         ):
             values = np.ones(size)
             values[-1] = bad
-            check.refused(f"{bad} in {what}", lambda c=call, v=values: c(v), NonFiniteError)  # type: ignore[misc]
+            check.refused(f"{bad} in {what}", call, values, kind=NonFiniteError)
     actions = np.zeros((3, 67))
     actions[2, 41] = np.nan
-    check.refused("NaN action", lambda: check_actions(actions), NonFiniteError)
+    check.refused("NaN action", check_actions, actions, kind=NonFiniteError)
     for length in (5e-324, 1e-200, 1e308):
         R = rotation_from_6d(np.array([0, length, 0, -length, 0, 0]))
         quarter = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
@@ -105,7 +101,7 @@ def _ends(check: Check) -> None:
     check.equal("pose of the first anchor", actions[0, :9], IDENTITY_POSE_9D)
     check.equal("pose of the last anchor", moved[16, :9], IDENTITY_POSE_9D)
     for index in (-1, 17):
-        check.refused(f"index {index}", lambda i=index: reanchor(actions, i), InvalidInputError)  # type: ignore[misc]
+        check.refused(f"index {index}", reanchor, actions, index, kind=InvalidInputError)
 
 
 @STAGE.cell("precision", "6-D rotations rounded to bfloat16 and float16")

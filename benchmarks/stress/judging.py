@@ -1,7 +1,7 @@
 """Stress of the success classifier and the policies with unusual touch and poses."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -58,22 +58,24 @@ def _non_finite(check: Check) -> None:
         tactile_kpa = _seen().tactile_kpa.copy()
         tactile_kpa[-1, 0, 3] = bad
         broken = replace(_seen(), tactile_kpa=tactile_kpa)
-        check.refused(f"policy, touch {bad}", partial(_act, broken), NonFiniteError)
+        check.refused(f"policy, touch {bad}", _act, broken, kind=NonFiniteError)
         ending = _ending(0.0)
         touch = ending.tactile_kpa.copy()
         touch[1, 1, 300] = bad
         check.refused(
             f"probe, touch {bad}",
-            partial(_probe().verdict, replace(ending, tactile_kpa=touch)),
-            NonFiniteError,
+            _probe().verdict,
+            replace(ending, tactile_kpa=touch),
+            kind=NonFiniteError,
         )
         for column in (0, JOINTS_LEFT.start):
             reached = _seen().action_reached.copy()
             reached[-1, column] = bad
             check.refused(
                 f"policy, reached {bad}",
-                partial(_act, replace(_seen(), action_reached=reached)),
-                DexTouchError,
+                _act,
+                replace(_seen(), action_reached=reached),
+                kind=DexTouchError,
             )
         poses = np.zeros((3, 2, 7), dtype=np.float32)
         poses[..., 3], poses[1, 0, 2] = 1.0, bad
@@ -99,8 +101,8 @@ def _touch(check: Check) -> None:
 @STAGE.cell("ends", "an ending of 2 steps; the policy at step 0 and long after its horizon")
 def _ends(check: Check) -> None:
     short = replace(_seen(2), tactile_kpa=_seen(2).tactile_kpa)
-    check.refused("2 steps", lambda: Ending.of(short, "stand_bottle", imagined=False))
-    check.refused("no ending", lambda: _probe().probabilities([]))
+    check.refused("2 steps", Ending.of, short, "stand_bottle", imagined=False)
+    check.refused("no ending", _probe().probabilities, [])
     for step in (0, 79, 80, 10**6):
         _command_is_bounded(check, _act(replace(_seen(), first_step=step)))
     at_horizon, after = (_act(replace(_seen(), first_step=step)) for step in (80, 10**9))

@@ -32,7 +32,7 @@ def _rotations(check: Check) -> None:
             off = np.abs(angles - np.array([0.0, 0.25, 0.5, 1.0]) * angle).max()
             check.at_most("angles on the way off", off, 1e-7, "rad")
     poses[4, 3:] = 0.0
-    check.refused("a lost quaternion", lambda: poses_on_grid(poses, at), DegenerateRotationError)
+    check.refused("a lost quaternion", poses_on_grid, poses, at, kind=DegenerateRotationError)
 
 
 @STAGE.cell("clock", "gaps, stamps that stand or go back, a stream of one sample, edges")
@@ -51,8 +51,12 @@ def _clock(check: Check) -> None:
     ):
         check.refused(
             what,
-            lambda t=times: place_on_grid(t, grid, period_ns=_PERIOD_NS, max_gap_ns=_GAP_NS),  # type: ignore[misc]
-            InvalidInputError,
+            place_on_grid,
+            times,
+            grid,
+            kind=InvalidInputError,
+            period_ns=_PERIOD_NS,
+            max_gap_ns=_GAP_NS,
         )
     single = place_on_grid(_T_NS[:1], grid, period_ns=_PERIOD_NS, max_gap_ns=_GAP_NS)
     check.true("one sample places nothing", not single.valid.any())
@@ -76,7 +80,7 @@ def _non_finite(check: Check) -> None:
     for bad in (np.nan, np.inf):
         poses = np.repeat(pose_from_transform(np.eye(4))[None], 11, axis=0)
         poses[3, 5] = bad
-        check.refused(f"{bad} in a pose", lambda p=poses: poses_on_grid(p, at), NonFiniteError)  # type: ignore[misc]
+        check.refused(f"{bad} in a pose", poses_on_grid, poses, at, kind=NonFiniteError)
 
 
 @STAGE.cell("touch", "pressures of 0 and 650 kPa in turns, on the grid and past both edges")

@@ -69,10 +69,8 @@ def _non_finite(check: Check) -> None:
     )
     lost = HandRetargeter("right").step(np.full((25, 3), np.nan))
     check.true("a hand that is lost says so", (lost.status == RetargetStatus.MISSING).all())
-    check.refused(
-        "no sample ever", lambda: HandRetargeter("right").retarget(np.full((5, 25, 3), np.nan))
-    )
-    check.refused("NaN joints at reset", lambda: retargeter.reset(np.full(20, np.nan)))
+    check.refused("no sample ever", HandRetargeter("right").retarget, np.full((5, 25, 3), np.nan))
+    check.refused("NaN joints at reset", retargeter.reset, np.full(20, np.nan))
 
 
 @STAGE.cell("precision", "keypoints rounded to float32 and float16 (0.1 mm)")

@@ -49,10 +49,8 @@ def _precision(check: Check) -> None:
         )
         check.refused(
             f"weights {dtype}",
-            lambda c=checkpoint: Subject(  # type: ignore[misc]
-                StateWorld(c), subject.begun
-            ).step(subject.still()),
-            InvalidInputError,
+            lambda c=checkpoint: Subject(StateWorld(c), subject.begun).step(subject.still()),
+            kind=InvalidInputError,
         )
 
 
@@ -71,7 +69,7 @@ def _long_run(check: Check) -> None:
     if poses is not None and last is not None:
         moved_m = np.abs(last[-1, :, :3] - poses[-1, :, :3]).max()
         check.at_most("objects beside still hands move", moved_m, 1e-6, "m")
-    check.refused("hands that move for ever", lambda: _play(check, subject), EndedError)
+    check.refused("hands that move for ever", _play, check, subject, kind=EndedError)
 
 
 STAGE.does_not_apply(

@@ -24,10 +24,10 @@ _CELLS = raw_indices(side="left")
 @STAGE.cell("clock", "a rest take of 59 readings, and one that jumps half-way")
 def _clock(check: Check) -> None:
     rest = _take(0.0)
-    check.refused("59 readings", lambda: measure_tare(rest[:59], side="left"))
+    check.refused("59 readings", measure_tare, rest[:59], side="left")
     jumped = rest.copy()
     jumped[300:] += 50.0
-    check.refused("a zero that jumps", lambda: measure_tare(jumped, side="left"))
+    check.refused("a zero that jumps", measure_tare, jumped, side="left")
 
 
 @STAGE.cell(
@@ -37,12 +37,12 @@ def _non_finite(check: Check) -> None:
     for bad in (np.nan, np.inf):
         rest = _take(0.0)
         rest[10, 20] = bad
-        check.refused(f"{bad} at rest", lambda r=rest: measure_tare(r, side="left"), NonFiniteError)  # type: ignore[misc]
-        check.refused(f"{bad} kPa", lambda b=bad: _press(b, _take(10.0)), NonFiniteError)  # type: ignore[misc]
+        check.refused(f"{bad} at rest", measure_tare, rest, kind=NonFiniteError, side="left")
+        check.refused(f"{bad} kPa", _press, bad, _take(10.0), kind=NonFiniteError)
         gains = np.full(360, _GAIN)
         gains[7] = bad
-        check.refused(f"gain {bad}", lambda g=gains: _calibration(g), NonFiniteError)  # type: ignore[misc]
-    check.refused("gain 0", lambda: _calibration(np.zeros(360)))
+        check.refused(f"gain {bad}", _calibration, gains, kind=NonFiniteError)
+    check.refused("gain 0", _calibration, np.zeros(360))
     counts = _take(10.0)
     counts[:, _CELLS[3]] = np.nan
     found = _calibration(np.full(360, _GAIN))
@@ -50,7 +50,7 @@ def _non_finite(check: Check) -> None:
     kpa = found.to_kpa(counts, refused=refused)
     check.true("an absent taxel is named and zero", refused[3] > 0 and not kpa[:, 3].any())
     check.finite("pressures", kpa)
-    check.refused("NaN to forces", lambda: pad_forces_n(np.full((1, 320), np.nan)), NonFiniteError)
+    check.refused("NaN to forces", pad_forces_n, np.full((1, 320), np.nan), kind=NonFiniteError)
     tiny = pad_forces_n(np.full((1, 320), 5e-324))
     check.at_most("force of 5e-324 kPa", tiny.max(), 0.0, "N")
 
@@ -83,7 +83,7 @@ def _touch(check: Check) -> None:
 
 @STAGE.cell("ends", "pressures of 0 and 1e-12 kPa; no press; 60 readings, the fewest")
 def _ends(check: Check) -> None:
-    check.refused("0 kPa", lambda: _press(0.0, _take(0.0)))
+    check.refused("0 kPa", _press, 0.0, _take(0.0))
     check.refused("no press", lambda: fit_gain(_tare(), []))
     check.refused("1e-12 kPa", lambda: fit_gain(_tare(), [_press(1e-12, _take(0.0))]))
     short = measure_tare(_take(0.0)[:60], side="left")

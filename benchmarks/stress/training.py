@@ -1,7 +1,7 @@
 """Stress of training: losses and steps on corrupt, untouched and saturated windows."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -36,9 +36,7 @@ def _rotations(check: Check) -> None:
         if is_taken:
             check.finite("losses", np.array(_run(broken).learn(_batch_of(broken, 8))))
         else:
-            check.refused(
-                "parallel columns", partial(_batch_of, broken, 8), DegenerateRotationError
-            )
+            check.refused("parallel columns", _batch_of, broken, 8, kind=DegenerateRotationError)
 
 
 @STAGE.cell("non_finite", "NaN and infinity in true touch and in a weight", slow=True)
@@ -50,13 +48,13 @@ def _non_finite(check: Check) -> None:
         run = _run(_episode())
         before = [weight.clone() for weight in run.model.parameters()]
         broken = replace(batch, tactile_kpa=touch)
-        check.refused(f"touch {bad}", partial(run.learn, broken), NonFiniteError)
+        check.refused(f"touch {bad}", run.learn, broken, kind=NonFiniteError)
         same = all(torch.equal(a, b) for a, b in zip(before, run.model.parameters(), strict=True))
         check.true("no weight moved", same)
     run = _run(_episode())
     with torch.no_grad():
         next(run.model.parameters()).view(-1)[0] = float("nan")
-    check.refused("a weight NaN", lambda: run.learn(_batch_of(_episode(), 4)), NonFiniteError)
+    check.refused("a weight NaN", run.learn, _batch_of(_episode(), 4), kind=NonFiniteError)
 
 
 @STAGE.cell("touch", "windows of 0, 650 and 99 999 kPa, and of no valid sample", slow=True)
@@ -94,9 +92,7 @@ def _ends(check: Check) -> None:
         lambda: WindowSampler([_episode()], np.random.default_rng(0), max_steps=65),
     )
     check.refused(
-        "held-out among trained",
-        lambda: check_disjoint([_episode()], [_episode()]),
-        InvalidInputError,
+        "held-out among trained", check_disjoint, [_episode()], [_episode()], kind=InvalidInputError
     )
 
 

@@ -40,7 +40,7 @@ def _rotations(check: Check) -> None:
         _answers(check, _step(actions))
     lost = _still(16)
     lost[4, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = [1.0, 0, 0, 1.0, 5e-7, 0]
-    check.refused("columns of sine 5e-7", lambda: _step(lost), DegenerateRotationError)
+    check.refused("columns of sine 5e-7", _step, lost, kind=DegenerateRotationError)
 
 
 @STAGE.cell("non_finite", "NaN and infinity in actions; 5e-324, 3 m and 50 rad in a step")
@@ -50,7 +50,7 @@ def _non_finite(check: Check) -> None:
     for bad in (np.nan, np.inf):
         actions = _still(16)
         actions[3, 41] = bad
-        check.refused(f"{bad}", lambda a=actions: _step(a), NonFiniteError)  # type: ignore[misc]
+        check.refused(f"{bad}", _step, actions, kind=NonFiniteError)
     tiny = _still(16)
     tiny[:, 0] = 5e-324
     _answers(check, _step(tiny))

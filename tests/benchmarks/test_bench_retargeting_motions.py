@@ -48,8 +48,6 @@ def test_robot_motions_are_fast_free_of_contact_and_inside_limits(side, natural)
     again, other = (robot_motion(side, 240, seed, natural=natural) for seed in (3, 4))
     np.testing.assert_array_equal(motion.keypoints_m, again.keypoints_m)
     assert not np.allclose(motion.joints_rad, other.joints_rad)
-    with pytest.raises(InvalidInputError, match="got 1 samples"):
-        robot_motion(side, 1, 0, natural=natural)
 
 
 def test_motions_that_are_too_fast_are_played_more_slowly(monkeypatch):
@@ -125,8 +123,6 @@ def test_faults_are_put_into_keypoints_and_not_into_the_truth():
     for changed in (noisy, lossy):
         assert (changed.keypoints_m[:, wrist] == 0).all()
         np.testing.assert_array_equal(changed.joints_rad, motion.joints_rad)
-    with pytest.raises(InvalidInputError, match=r"1\.5"):
-        with_dropouts(motion, 1.5, rng)
 
 
 def bones_m(hand):
@@ -141,8 +137,6 @@ def test_people_are_of_their_size_with_bones_of_their_own(side):
         ratios = bones_m(person) / average / size
         assert np.abs(ratios - 1).max() <= BONE_SPREAD + 1e-9
         assert np.ptp(ratios) > BONE_SPREAD
-    with pytest.raises(InvalidInputError, match="size"):
-        Person(side, 0.0, 0)
 
 
 @pytest.mark.parametrize("side", SIDES)

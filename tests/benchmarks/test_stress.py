@@ -89,7 +89,7 @@ def _raise(error):
         (lambda check: 1 / 0, "failed"),
         (lambda check: check.refused("x", lambda: None), "failed"),
         (lambda check: check.refused("x", lambda: _raise(NonFiniteError("no"))), "held"),
-        (lambda check: check.refused("x", lambda: _raise(InvalidInputError("no")), NonFiniteError),
+        (lambda check: check.refused("x", _raise, InvalidInputError("no"), kind=NonFiniteError),
          "failed"),
         (lambda check: check.equal("x", np.zeros(2), np.zeros(2, np.float32)), "failed"),
         (lambda check: check.equal("x", np.full(2, np.nan), np.full(2, np.nan)), "held"),
