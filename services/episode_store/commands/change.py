@@ -1,6 +1,5 @@
 """Commands that change a store: `delete`, `deletions`, `restore`, `purge` and `repair`."""
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -82,7 +81,7 @@ def _delete_all_of(context: Context) -> Outcome:
         f"{len(receipt.unreadable)} unreadable of {receipt.num_files_searched} files searched; "
         f"receipt {path}"
     )
-    return json.loads(json.dumps(asdict(receipt))), 0 if receipt.complete else EXIT_DAMAGED
+    return receipt.model_dump(mode="json"), 0 if receipt.complete else EXIT_DAMAGED
 
 
 def _outstanding_line(station: str, recordings: Sequence[str], *, has_answered: bool) -> str:

@@ -38,7 +38,7 @@ class CopyFirstWorld:
         model_rate_hz: float = 15.0,
     ) -> None:
         shape = (tasks, cameras, image_height_px, image_width_px, model_rate_hz)
-        self.description = WorldDescription(
+        self._description = WorldDescription(
             name="copy-first",
             kind="baseline",
             digest=hashlib.sha256(f"copy-first/1 {shape}".encode()).hexdigest(),
@@ -56,6 +56,11 @@ class CopyFirstWorld:
         """Create the baseline for the tasks and cameras of another world."""
         size = {"image_height_px", "image_width_px", "model_rate_hz"}
         return CopyFirstWorld(**other.model_dump(include={"tasks", "cameras"} | size))
+
+    @property
+    def description(self) -> WorldDescription:
+        """See World."""
+        return self._description
 
     @property
     def is_quick(self) -> bool:

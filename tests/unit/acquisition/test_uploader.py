@@ -182,7 +182,7 @@ def test_a_full_disk_does_not_end_the_uploads(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "write", full)
+    monkeypatch.setattr(os, "writev", full)
     assert uploader.upload_all() == []
     monkeypatch.undo()
     assert "no space left" in uploader.status()[0].error

@@ -31,13 +31,20 @@ def test_a_full_disk_leaves_nothing(store, file_size_limit):
 
 
 def test_short_writes_go_on_where_they_ended(store, monkeypatch):
-    whole = os.write
-    monkeypatch.setattr(os, "write", lambda file, data: whole(file, bytes(data)[:7]))
+    short: list[int] = []
+
+    def writev(file, views):
+        short.append(os.write(file, bytes(views[0])[:7]))
+        return short[-1]
+
+    monkeypatch.setattr(os, "writev", writev)
     with store.writer(kind="recording", attributes=take(FORCE)) as writer:
         record(writer, 0, 17)
     reader = store.recording("take-1")
     reader.verify()
     assert reader.read("force").t_host_ns.tolist() == list(range(17))
+    assert max(short) == 7
+    assert len(short) > 17
 
 
 FULL_DISK = """
