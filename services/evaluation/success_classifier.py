@@ -268,7 +268,7 @@ class Verdict:
     `probability` is the probe's, joined with the world's own estimate `world_probability` where an
     imagined ending has one. `likely_success` is the more probable outcome, also where the probe
     abstains; `reason` says why it does. `milestones` are the probabilities that each was reached by
-    the end, for those that the probe can classify.
+    the end, for those that the probe can classify; none is below that of success, which needs all.
     """
 
     probability: float
@@ -385,7 +385,7 @@ class SuccessClassifier:
         names = self.shape.milestones.get(ending.task, ())
         reached = sigmoid(odds[1:])
         milestones = {
-            name: float(reached[index])
+            name: max(float(reached[index]), probability)
             for index, name in enumerate(names)
             if name in self._classifiable.get(ending.task, ())
         }

@@ -134,7 +134,7 @@ def test_its_figures_of_every_kind_are_kept(judge):
     }
 
 
-def test_milestones_that_can_be_told_are_told(judge):
+def test_classifiable_milestones_are_reported(judge):
     assert judge.shape.milestones["reach"] == ("begun", "moved", "there")
     # "begun" holds in every episode, so nothing shows that the judge can tell it.
     assert "there" in judge.metadata.settings["told_milestones"]["reach"]
@@ -142,6 +142,13 @@ def test_milestones_that_can_be_told_are_told(judge):
     wins = [e for e in _episodes(range(700, 724)) if e.success and e.task == "reach"]
     told = [judge.verdict(e.final).milestones["there"] for e in wins]
     assert np.mean(told) > 0.7
+
+
+def test_no_milestone_is_less_probable_than_success_which_needs_all(judge):
+    ending = _episode("reach", 1, imagined=True).final
+    for estimate in (0.02, 0.5, 0.98):
+        verdict = judge.verdict(replace(ending, success_probability=estimate))
+        assert min(verdict.milestones.values()) >= verdict.probability
 
 
 def test_an_ending_with_neither_images_nor_poses_is_refused(judge):
