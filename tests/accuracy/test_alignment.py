@@ -25,7 +25,7 @@ from services.twin.hands import HumanHand
 
 DURATION_S = 80 / 15
 START_HOST_NS = 7_000_000_000_000
-K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
+K_HEAD = ((10.0, 0.0, 4.0), (0.0, 10.0, 4.0), (0.0, 0.0, 1.0))
 SIDES = ("left", "right")
 LATENCY_MS = {"tactile": 2.0, "keypoints": 3.0, "pose": 4.0, "image": 21.0, "robot_state": 1.0}
 CAPABILITIES = ClockCapabilities(crc=True, sequence=True, device_time=True)

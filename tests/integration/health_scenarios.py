@@ -177,6 +177,20 @@ def at_rest(stream: ReplayStream) -> ReplayStream:
     return replace(stream, values=np.broadcast_to(stream.values[0], stream.values.shape).copy())
 
 
+def in_millimetres(stream: ReplayStream) -> ReplayStream:
+    """Positions in another unit, as long as the device plays."""
+    return replace(stream, values=stream.values * ([1000] * 3 + [1] * 4))
+
+
+def frozen_amid_noise(stream: ReplayStream) -> ReplayStream:
+    """A noisy tracker that repeats its last pose."""
+    noise_m = 5e-4 * np.random.default_rng(0).standard_normal((len(stream.values), 3))
+    noisy = stream.values + np.pad(noise_m, ((0, 0), (0, 4)))
+    return changed(lambda values: np.broadcast_to(values[0], values.shape))(
+        replace(stream, values=noisy.astype(stream.values.dtype))
+    )
+
+
 def untouched_then_shifted(stream: ReplayStream) -> ReplayStream:
     """An open hand whose zero moves by 0.5 kPa."""
     return changed(lambda values: values + np.float32(0.5))(
@@ -351,6 +365,8 @@ SCENARIOS: dict[str, Scenario] = {
     "thumb occluded": Scenario(FINGERS, "tracking", {"occluded_s": PAUSE}),
     "pose jumps": Scenario(WRIST, "jump", {"jumped_s": SHORT}),
     "pose noise of 0.2 m": Scenario(WRIST, "jump", {"position_noise_m": 0.2}),
+    "pose in millimetres": Scenario(WRIST, "implausible", edit=in_millimetres),
+    "pose frozen": Scenario(WRIST, "frozen", edit=frozen_amid_noise, is_timed=True),
     "pose noise of 3 mm": Scenario(WRIST, "pose_jitter", {"position_noise_m": 3e-3}, edit=at_rest),
     "image frozen": Scenario(
         CAMERA, "image_frozen", edit=changed_images(lambda images: images[:1]), is_timed=True

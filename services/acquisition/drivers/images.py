@@ -33,6 +33,9 @@ from services.acquisition.drivers.packets import DecoderStatistics
 CHECK_EVERY = 3
 # More than three equal images in a row: no sensor is that free of noise.
 MAX_EQUAL_IMAGES = 3
+# Cameras that send every image twice repeat half of them; the share is over some 30 images.
+MAX_EQUAL_SHARE = 0.4
+EQUAL_SHARE_IMAGES = 30
 BLURRED_BELOW = 0.3
 # Before that many checks there is no session to compare with.
 MIN_SHARPNESSES = 10
@@ -53,13 +56,13 @@ class ImageQuality:
     """Quality of the newest images of one camera, and counters since the start.
 
     Attributes:
-        frozen: more than three images in a row were equal.
+        frozen: more than three images in a row were equal, or over 40 % equal the one before.
         blurred: sharpness below 0.3 of the session's median.
         clipped_ratio: share of pixels at the dark or the bright end, 0 … 1.
         gap: at least one image is missing in the driver's timestamps within the last second.
         num_checked: images whose sharpness and exposure were checked.
         num_images: all images seen.
-        num_frozen: images that were equal to at least three before them.
+        num_frozen: images that were equal to at least three before them, or repeated regularly.
         num_blurred: of the checked ones.
         num_clipped: of the checked ones, those with more than 20 % clipped pixels.
         num_gaps: gaps of the driver's stamps.
@@ -125,6 +128,7 @@ class ImageChecker:
         self._found = ImageQuality()
         self._checksum: int | None = None
         self._num_equal = 0
+        self._equal_share = 0.0
         self._last_t_ns: int | None = None
         self._gap_seen_ns: int | None = None
         self._median = SessionMedian()
@@ -145,9 +149,12 @@ class ImageChecker:
         """The next image as bytes that are equal only for equal images, such as its JPEG bytes."""
         self._found.num_images += 1
         checksum = zlib.crc32(data)
-        self._num_equal = self._num_equal + 1 if checksum == self._checksum else 1
+        is_equal = checksum == self._checksum
+        self._num_equal = self._num_equal + 1 if is_equal else 1
         self._checksum = checksum
-        self._found.frozen = self._num_equal > MAX_EQUAL_IMAGES
+        self._equal_share += (is_equal - self._equal_share) / EQUAL_SHARE_IMAGES
+        repeats = self._equal_share > MAX_EQUAL_SHARE
+        self._found.frozen = self._num_equal > MAX_EQUAL_IMAGES or repeats
         self._found.num_frozen += self._found.frozen
         if t_ns is not None:
             self._note_stamp(t_ns)

@@ -42,6 +42,7 @@ from services.acquisition.health.streams import (
     CameraCheck,
     FiniteCheck,
     LinkCheck,
+    PlausibilityCheck,
     PoseCheck,
     SampleQueue,
     TrackingCheck,
@@ -378,9 +379,11 @@ def _value_judges(
         nan = FiniteCheck("nan", "taxels are no numbers")
         return [nan] if cells is None else [nan, cells]
     if descriptor.kind == "keypoints":
-        return [FiniteCheck("tracking", "nodes are not seen")]
+        return [FiniteCheck("tracking", "nodes are not seen"), PlausibilityCheck(descriptor)]
     if descriptor.kind == "pose":
-        return [PoseCheck(descriptor)]
+        return [PoseCheck(descriptor), PlausibilityCheck(descriptor)]
+    if descriptor.kind == "robot_state":
+        return [PlausibilityCheck(descriptor)]
     return [CameraCheck(driver)] if descriptor.kind == "image" else []
 
 

@@ -1,12 +1,14 @@
 """Health checks of one stream: its link (rate, loss, gaps, lateness) and its values."""
 
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
 from dextouch.streams import Sample, StreamDescriptor
+from dextouch.streams.plausibility import implausible_values
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
@@ -42,9 +44,11 @@ MAX_SPEED_M_S = 5.0
 REST_SPEED_M_S = 0.02
 REST_NS = 1_000_000_000
 MIN_REST_SAMPLES = 40
+# Long enough for a hundred samples of most trackers, and short enough to show a change soon.
+PLAUSIBLE_NS = 5_000_000_000
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
-JUDGED_VALUES = ("tactile", "pose", "keypoints")
+JUDGED_VALUES = ("tactile", "pose", "keypoints", "robot_state")
 
 
 class LinkCheck:
@@ -220,6 +224,34 @@ class PoseCheck:
             return None
         errors_m = self._positions_m - basis @ fitted
         return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
+
+
+class PlausibilityCheck:
+    """Judges whether the values of the last 5 s can be true, by the rules that alignment has."""
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._descriptor = descriptor
+        self._blocks: deque[tuple[np.ndarray, np.ndarray]] = deque()
+
+    def __call__(self, evaluation: Evaluation) -> None:
+        """One evaluation."""
+        block, blocks = evaluation.block, self._blocks
+        if block.values is not None and len(block):
+            blocks.append((block.t_host_ns, block.values))
+        while blocks and blocks[0][0][-1] < evaluation.now_ns - PLAUSIBLE_NS:
+            blocks.popleft()
+        if not blocks:
+            return
+        t_ns, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        period_ns = self._descriptor.period_ns()
+        for one in implausible_values(self._descriptor, t_ns, values):
+            if one.cause in {"frozen", "repeated"}:
+                lasted_s = float(one.samples.sum()) * period_ns * 1e-9
+                evaluation.judge("frozen", lasted_s, one.message)
+            elif one.cause != "jump":
+                # Single jumps have a code of their own.
+                level: Literal["WARN", "ERROR"] = "ERROR" if one.whole else "WARN"
+                evaluation.findings.append(Finding("implausible", level, one.message))
 
 
 class FiniteCheck:

@@ -54,15 +54,27 @@ MIN_SILENT = 0.95
 MIN_OWN_MOVES = 10
 BLOCK = 600
 
-# Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
-REASONS = (*STATES, "absent")
-ABSENT = len(STATES)
+# Why a taxel of a take is not measured: what the calibration says, that it has no reading, that its
+# readings have nothing to do with those before, or that they lie below its tare.
+REASONS = (*STATES, "absent", "random", "below_tare")
+ABSENT, RANDOM, BELOW_TARE = (len(STATES) + number for number in range(3))
 # A cell that never moves is dead if it rests further than this from its tare.
 DEAD_OFFSET_KPA = 1.0
 MIN_SAMPLES_TO_JUDGE = 30
 # A cell without a reading in more samples than this is refused; else those samples are left out.
 MAX_MISSING = 0.1
 NO_CELL = -1
+# Readings that scatter by more, and are no nearer to the ones before than to any other.
+MIN_RANDOM_KPA = 5.0
+MIN_RANDOM_RATIO = 0.5
+# More taxels than this that are random, or below their tare: the glove or its tare is wrong.
+MAX_WRONG_TAXELS = 0.5
+# So many samples at rest show how often two readings in a row are equal.
+MIN_REST_SAMPLES = 100
+# That a reading remains equal for so long by chance has a probability below exp(-25).
+LEAST_LOG_CHANCE = 25.0
+# Full scale of a glove, as its gain has it: fingertips press with up to some 1000 kPa.
+FULL_SCALE_KPA = (50.0, 20_000.0)
 
 Record = Mapping[str, Sequence[Sequence[float]]]
 
@@ -321,6 +333,8 @@ class TactileCalibration:
         state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
+        if num_cells == NUM_RAW_TAXELS and (state == OK).any():
+            _check_full_scale(gain[cells[state == OK]], f"{glove}_gain_counts_per_kpa")
         gain = np.where(state == OK, gain[cells], 1.0)
         return cls(side, num_cells, cells, tare[cells], gain, state)
 
@@ -362,35 +376,119 @@ def unusable_taxels(
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     In addition to those that the glove's calibration refuses: cells that are constant but not at
-    their tare (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the
-    samples.
+    their tare (dead at zero, stuck elsewhere), or become so during the take; cells whose readings
+    are random, or below the tare for most of the time; and cells that are NaN in more than a tenth
+    of the samples.
 
     Args:
         calibration: of the glove.
         pieces: consecutive raw readings [T, cells] of the take.
 
     Raises:
+        InvalidInputError: more than half of the taxels are random or below their tare.
         ShapeError: not [T, cells].
     """
-    reasons, first, num_samples = calibration.state.copy(), None, 0
-    low, high = np.full(NUM_TAXELS, np.inf), np.full(NUM_TAXELS, -np.inf)
-    num_finite = np.zeros(NUM_TAXELS, dtype=np.int64)
+    reasons, take = calibration.state.copy(), _TaxelTake(calibration)
     for counts in pieces:
-        taxels = calibration.taxels(counts)
-        if not len(taxels):
-            continue
-        if first is None:
-            first = taxels[0].astype(np.float64)
-        low, high = np.minimum(low, taxels.min(axis=0)), np.maximum(high, taxels.max(axis=0))
-        num_finite += np.isfinite(taxels).sum(axis=0)
-        num_samples += len(taxels)
-    if first is None or num_samples < MIN_SAMPLES_TO_JUDGE:
+        take.add(calibration.taxels(counts).astype(np.float64))
+    if take.num_samples < MIN_SAMPLES_TO_JUDGE:
         return reasons
-    reasons[(reasons == OK) & (1.0 - num_finite / num_samples > MAX_MISSING)] = ABSENT
-    offset_kpa = np.abs(first - calibration.tare_counts) / calibration.gain_counts_per_kpa
-    silent = (reasons == OK) & (low == high) & (offset_kpa > DEAD_OFFSET_KPA)
-    reasons[silent] = np.where(first[silent] == 0, DEAD, STUCK)
+    for reason, taxels in take.faults().items():
+        reasons[(reasons == OK) & taxels] = reason
+    for reason, what, advice in (
+        (RANDOM, "have nothing to do with the ones before", "check cable, port and protocol"),
+        (BELOW_TARE, "lie below their tare", "tare the glove again"),
+    ):
+        share = float((reasons == reason)[calibration.state == OK].mean())
+        if share > MAX_WRONG_TAXELS:
+            raise InvalidInputError(
+                f"{calibration.side} glove: readings of {share:.0%} of its taxels {what}; {advice}",
+                fault=REASONS[reason],
+            )
     return reasons
+
+
+class _TaxelTake:
+    """Sums over the readings of a take, from which faults of its taxels follow."""
+
+    def __init__(self, calibration: TactileCalibration) -> None:
+        self._glove = calibration
+        self.num_samples = 0
+        self._last = np.full(NUM_TAXELS, np.nan)
+        self._low = np.full(NUM_TAXELS, np.inf)
+        self._high = -self._low
+        zeros = [np.zeros(NUM_TAXELS) for _ in range(7)]
+        self._finite, self._below, self._rest, self._equal, self._kept, *sums = zeros
+        self._steps2, self._sum = sums
+        self._sum2 = np.zeros(NUM_TAXELS)
+
+    def add(self, counts: Float64[np.ndarray, "time 320"]) -> None:
+        """The next readings."""
+        if not len(counts):
+            return
+        before = np.concatenate([self._last[None], counts[:-1]])
+        offsets_kpa = (counts - self._glove.tare_counts) / self._glove.gain_counts_per_kpa
+        equal, at_rest = counts == before, np.abs(offsets_kpa) < DEAD_OFFSET_KPA
+        self._low = np.fmin(self._low, counts.min(axis=0))
+        self._high = np.fmax(self._high, counts.max(axis=0))
+        self._finite += np.isfinite(counts).sum(axis=0)
+        self._below += (offsets_kpa < -DEAD_OFFSET_KPA).sum(axis=0)
+        self._rest += at_rest.sum(axis=0)
+        self._equal += (equal & at_rest).sum(axis=0)
+        changed = ~equal[::-1]
+        since = np.where(changed.any(axis=0), changed.argmax(axis=0), len(counts) + self._kept)
+        self._kept = since.astype(np.float64)
+        self._steps2 += np.nansum((counts - before) ** 2, axis=0)
+        self._sum += np.nansum(counts - self._glove.tare_counts, axis=0)
+        self._sum2 += np.nansum((counts - self._glove.tare_counts) ** 2, axis=0)
+        self._last = counts[-1]
+        self.num_samples += len(counts)
+
+    def faults(self) -> dict[int, Bool[np.ndarray, "320"]]:
+        """Taxels by reason; of several reasons the first one counts."""
+        gain, n = self._glove.gain_counts_per_kpa, self.num_samples
+        offset_kpa = (self._last - self._glove.tare_counts) / gain
+        variance = self._sum2 / n - (self._sum / n) ** 2
+        # Of independent readings the mean square of a step is twice the variance.
+        is_random = self._steps2 > MIN_RANDOM_RATIO * 2 * n * variance
+        is_random &= variance > (MIN_RANDOM_KPA * gain) ** 2
+        silent = (self._low == self._high) & (np.abs(offset_kpa) > DEAD_OFFSET_KPA)
+        # A taxel that ends before the take does: it keeps a reading that no pressure gives, or it
+        # has lost the noise that it had at rest.
+        rest = np.where(np.abs(offset_kpa) < DEAD_OFFSET_KPA, self._rest - self._kept, self._rest)
+        same = np.where(rest < self._rest, self._equal - self._kept, self._equal)
+        share = np.clip((same + 1) / (rest + 1), 1e-6, 1.0)
+        is_unlikely = -np.log(share) * self._kept > LEAST_LOG_CHANCE
+        ended = (rest >= MIN_REST_SAMPLES) & is_unlikely & (self._kept >= MIN_SAMPLES_TO_JUDGE)
+        ended |= (self._kept >= MIN_SAMPLES_TO_JUDGE) & (offset_kpa < -DEAD_OFFSET_KPA)
+        is_below = self._below > n / 2
+        silent |= ended & ~(is_below & (self._last != 0))
+        return {
+            ABSENT: 1.0 - self._finite / n > MAX_MISSING,
+            RANDOM: is_random,
+            DEAD: silent & (self._last == 0),
+            BELOW_TARE: is_below,
+            STUCK: silent,
+        }
+
+
+def _check_full_scale(gain_counts_per_kpa: np.ndarray, name: str) -> None:
+    """Refuse gains of our gloves that are per another unit."""
+    if (gain_counts_per_kpa <= 0).any():
+        # Refused by name where the calibration is made.
+        return
+    full_scale_kpa = FULL_SCALE_COUNTS / float(np.median(gain_counts_per_kpa))
+    low_kpa, high_kpa = FULL_SCALE_KPA
+    if low_kpa <= full_scale_kpa <= high_kpa:
+        return
+    units = {"counts/Pa": 1e-3, "counts/MPa": 1e3, "counts/psi": 6.894757}
+    alike = [u for u, f in units.items() if low_kpa <= full_scale_kpa * f <= high_kpa]
+    told = f"; these look like {alike[0]}" if alike else ""
+    raise InvalidInputError(
+        f"calibration {name!r}: makes {full_scale_kpa:.3g} kPa of full scale, expected "
+        f"{low_kpa:g} … {high_kpa:g} kPa{told}; calibrate the glove again",
+        fault="unit",
+    )
 
 
 def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:

@@ -9,6 +9,7 @@ from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor
+from dextouch.streams.plausibility import check_camera_matrix
 from dextouch.tactile import pad_forces_n
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
@@ -20,6 +21,11 @@ from services.alignment.synchronization.grid_actions import (
     GriddedStreams,
     make_actions,
     place_streams,
+)
+from services.alignment.synchronization.plausible_streams import (
+    CheckedStream,
+    check_quaternion_order,
+    checked_stream,
 )
 from services.alignment.synchronization.recorded_streams import (
     Block,
@@ -40,6 +46,7 @@ from services.alignment.synchronization.resampling import (
     refused_matrices,
     refused_stretches,
     stream_gap_ns,
+    with_causes,
 )
 
 
@@ -91,7 +98,13 @@ def build_episode(
         on_progress(progress_within("dating", number / len(recording.streams), name))
         streams[name] = date_stream(recording, name)
     streams = with_tracked_objects(streams, objects)
-    stretch = _find_stretch(recording, streams, options, on_progress)
+    checked = {
+        name: checked_stream(stream, max_gap_ns=options.max_gap_ns)
+        for name, stream in streams.items()
+    }
+    streams = {name: one.stream for name, one in checked.items()}
+    check_quaternion_order(streams)
+    stretch = _find_stretch(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded
     actions = make_actions(gridded, source.domain, source.calibration, wrist=options.wrist)
@@ -130,12 +143,12 @@ def build_episode(
 
 def _find_stretch(
     recording: RecordingReader,
-    streams: Mapping[str, DatedStream],
+    checked: Mapping[str, CheckedStream],
     options: AlignmentOptions,
     on_progress: OnProgress,
 ) -> _Stretch:
     """Load the streams that actions are made of and choose the longest stretch that all share."""
-    attributes = recording.attributes
+    attributes, streams = recording.attributes, {n: one.stream for n, one in checked.items()}
     where = f"recording {attributes.recording_id!r}"
     wanted = [*REQUIRED[attributes.domain], *COMMANDED_STREAMS]
     if attributes.domain == "human" and options.wrist == "touch":
@@ -178,11 +191,12 @@ def _find_stretch(
         start_ns = min(first_ns.values())
     refused = refused_edges(first_ns, last_ns, start_ns)
     refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
+    causes_ns = {name: one.parts_ns for name, one in checked.items()}
     return _Stretch(
         place_streams(moved, grid_ns[first:stop], max_gap_ns=options.max_gap_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),
-        refused_matrices(refused),
+        refused_matrices(with_causes(refused, causes_ns, start_ns)),
     )
 
 
@@ -270,6 +284,10 @@ def _check_lenses(recording: RecordingReader) -> None:
                 f"{where}: K_{camera} was measured on images of {size_px[0][0]:g} by "
                 f"{size_px[0][1]:g} px, but {name!r} holds {recorded[0]} by {recorded[1]}; "
                 "calibrate the camera in the mode that is recorded"
+            )
+        if f"K_{camera}" in calibration:
+            check_camera_matrix(
+                np.array(calibration[f"K_{camera}"]), recorded, where=f"{where}: K_{camera}"
             )
 
 

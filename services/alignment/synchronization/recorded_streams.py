@@ -12,7 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from jaxtyping import Float64, Int64, Shaped
+from jaxtyping import Bool, Float64, Int64, Shaped
 
 from dextouch.episodes import GOP_IMAGES, RecordingReader
 from dextouch.errors import InvalidInputError
@@ -83,7 +83,8 @@ class DatedStream:
     """One stream on the host's clock, whose values are read on demand.
 
     `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
-    matrices that the episode carries beside those of the recording.
+    matrices that the episode carries beside those of the recording. `unseen` are keypoints that are
+    not to be believed, which become NaN.
     """
 
     recording: RecordingReader
@@ -92,6 +93,7 @@ class DatedStream:
     convert: Conversion
     quality: dict[str, float] = field(default_factory=dict)
     calibration: dict[str, Matrix] = field(default_factory=dict)
+    unseen: Bool[np.ndarray, "n nodes"] | None = None
 
     @property
     def name(self) -> str:
@@ -114,7 +116,11 @@ class DatedStream:
             raw = self.recording.values(self.name, start, int(part[-1]) + 1)
             if len(raw) != len(part):
                 raw = raw[part - start]
-            yield Block(t_ns[low : low + rows], self.convert(raw))
+            values = self.convert(raw)
+            if self.unseen is not None:
+                hidden = self.unseen[first + low : first + low + len(part), :, None]
+                values = np.where(hidden, np.nan, values)
+            yield Block(t_ns[low : low + rows], values)
 
     def load(self, of: Conversion = np.asarray) -> LoadedStream:
         """All samples at once, or a function `of` them: for the streams that actions are made of.

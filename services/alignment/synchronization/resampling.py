@@ -6,7 +6,7 @@ recording's start.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -23,8 +23,9 @@ EDGE_PERIODS = 1.5
 # A stream that loses one sample has a gap of two periods, and half a period is left for jitter.
 MAX_GAP_PERIODS = 2.5
 # late_start, early_end: a stream that actions need begins later or ends earlier than the others;
-# gap: a stream has no samples there; shorter: nothing is wrong but that a longer stretch exists.
-RefusedReason = Literal["late_start", "early_end", "gap", "shorter"]
+# gap: a stream has no samples there; jump, frozen, limits: it has, but they cannot be true;
+# shorter: nothing is wrong but that a longer stretch exists.
+RefusedReason = Literal["late_start", "early_end", "gap", "jump", "frozen", "limits", "shorter"]
 _KEY = re.compile(rf"refused_({'|'.join(get_args(RefusedReason))})(?:_(\w+))?_s")
 NS_PER_S = 1e9
 
@@ -142,6 +143,30 @@ def refused_stretches(
     gaps = [part(run, "gap", name) for name, mine in valid.items() for run in runs_of(~mine)]
     good = np.logical_and.reduce(list(valid.values()))
     return gaps + [part(run, "shorter", None) for run in runs_of(good) if run != taken]
+
+
+def with_causes(
+    refused: list[RefusedPart],
+    left_out_ns: Mapping[str, Iterable[tuple[int, int, RefusedReason]]],
+    start_ns: int,
+) -> list[RefusedPart]:
+    """The refused parts with those of each stream that cannot be true, in place of its gaps there.
+
+    `left_out_ns` are on the clock of `start_ns`, the recording's start.
+    """
+    causes = [
+        _part(begin_ns, end_ns, start_ns, reason, name)
+        for name, mine in left_out_ns.items()
+        for begin_ns, end_ns, reason in mine
+    ]
+
+    def is_explained(part: RefusedPart) -> bool:
+        return part.reason == "gap" and any(
+            part.stream == one.stream and part.start_s < one.stop_s and one.start_s < part.stop_s
+            for one in causes
+        )
+
+    return [*(part for part in refused if not is_explained(part)), *causes]
 
 
 def refused_matrices(parts: list[RefusedPart]) -> dict[str, Matrix]:

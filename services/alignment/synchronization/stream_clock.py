@@ -26,6 +26,13 @@ MAX_RATE_ERROR_PPM = 20_000.0
 MIN_LATENESS_NS = 5e6
 
 
+# Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.
+MIN_UNIT_RATIO = 20.0
+UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
+# Stamps of consecutive samples that are cut to a step take several multiples of it, each as often.
+MIN_CUT_SHARE = 0.05
+
+
 @dataclass(frozen=True)
 class TimedStream:
     """Strictly increasing times on the host's clock, with the report of the clock fit.
@@ -61,9 +68,10 @@ def time_stream(
 ) -> TimedStream:
     """Fit the device's clock and compute the time of every sample.
 
-    The device's stamps are used where there are any (unless they are coarser than a quarter of
-    the period and samples are numbered), else its sequence numbers times the nominal period, else
-    the count of samples that a steady device must have sent, else the arrivals as they are.
+    The device's stamps are used where there are any (unless samples are numbered and the stamps, by
+    what is declared or by what they show, are coarser than a quarter of the period), else its
+    sequence numbers times the nominal period, else the count of samples that a steady device must
+    have sent, else the arrivals as they are.
 
     The calibrated constant path delay `latency_ns` is taken away from all times; its sigma is None
     if it was not measured.
@@ -112,8 +120,11 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     has_time = not (batch.t_device_ns == NO_DEVICE_TIME).any()
     has_sequence = not (batch.sequence == NO_SEQUENCE).any()
     period_ns = descriptor.period_ns()
-    if has_time and not (has_sequence and prefers_sequence(capabilities.tick_ns, period_ns)):
-        bits, tick_ns = capabilities.device_time_bits, capabilities.tick_ns
+    bits, tick_ns = capabilities.device_time_bits, capabilities.tick_ns
+    if has_time:
+        _check_unit(batch, period_ns)
+        tick_ns = max(tick_ns, _shown_tick_ns(batch) if has_sequence else 0)
+    if has_time and not (has_sequence and prefers_sequence(tick_ns, period_ns)):
         device_ns = _unwrap(batch.t_device_ns, bits, tick_ns, batch)
         dated = _fitted(device_ns, batch, descriptor, "device")
         # A stamp is cut down to whole ticks: on average the sample lies half a tick later. The fit
@@ -124,6 +135,43 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
         device_ns = _unwrap(numbers, capabilities.sequence_bits, period_ns, batch)
         return _fitted(device_ns, batch, descriptor, "sequence")
     return _counted(batch, period_ns)
+
+
+def _check_unit(batch: SampleBatch, period_ns: int) -> None:
+    """Refuse stamps of another unit than nanoseconds."""
+    if len(batch) < MIN_COUNTED_SAMPLES:
+        return
+    # Over many samples, since stamps of a coarse unit repeat.
+    apart = len(batch) // 2
+    device_ns = float(np.median(batch.t_device_ns[apart:] - batch.t_device_ns[:-apart])) / apart
+    host_ns = float(np.ptp(batch.t_host_ns)) / (len(batch) - 1)
+    if device_ns <= 0 or host_ns <= 0:
+        return
+    ratios = np.array([period_ns, host_ns]) / device_ns
+    if (ratios > MIN_UNIT_RATIO).all() or (ratios < 1 / MIN_UNIT_RATIO).all():
+        alike = [name for name, unit_ns in UNITS.items() if 0.5 < ratios[0] / unit_ns < 2]
+        told = f": these look like {alike[0]} taken for nanoseconds" if alike else ""
+        raise ClockFitError(
+            f"got {device_ns:.4g} ns between the device's stamps, expected {period_ns:.4g} ns "
+            f"(samples arrive every {host_ns:.4g} ns){told}; send stamps in the declared unit "
+            "(docs/device_packets.md)",
+            fault="unit",
+        )
+
+
+def _shown_tick_ns(batch: SampleBatch) -> int:
+    """The step to which stamps are cut, as those of numbered samples show it; 0 where none shows.
+
+    Floats of seconds lose digits as a device's clock runs: after a day, 32 bits leave 8 ms.
+    """
+    is_next = np.diff(batch.sequence) == 1
+    steps_ns = np.diff(batch.t_device_ns)[is_next]
+    if len(steps_ns) < MIN_COUNTED_SAMPLES:
+        return 0
+    tick_ns = int(np.gcd.reduce(steps_ns))
+    _, counts = np.unique(steps_ns, return_counts=True)
+    is_cut = len(counts) > 1 and bool(counts.max() < (1 - MIN_CUT_SHARE) * len(steps_ns))
+    return tick_ns if is_cut else 0
 
 
 def _fitted(

@@ -14,6 +14,7 @@ from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbou
 from services.acquisition.health.streams import (
     CameraCheck,
     FiniteCheck,
+    PlausibilityCheck,
     PoseCheck,
     SampleQueue,
     TrackingCheck,
@@ -264,3 +265,70 @@ def test_blocks_are_bounded_and_count_what_they_lose():
     taken = queue.take()
     assert taken.t_host_ns.tolist() == list(range(600, 1000))
     assert len(queue.take()) == 0
+
+
+class Tracker:
+    """A wrist that moves about with noise, a second of 60 poses at a time."""
+
+    def __init__(self):
+        self.judge = PlausibilityCheck(pose_descriptor("wrist_left"))
+        self.rng = np.random.default_rng(0)
+        self.second = 0
+
+    def __call__(self, change=lambda poses: poses):
+        t_s = self.second + np.arange(60) / 60
+        self.second += 1
+        poses = np.zeros((60, 7))
+        poses[:, 3] = 1
+        poses[:, :3] = 0.2 * np.sin(2 * t_s[:, None] + [0, 1, 2])
+        poses[:, :3] += 5e-4 * self.rng.standard_normal((60, 3))
+        return codes(judged(self.judge, block(t_s, change(poses)), self.second * SECOND_NS))
+
+
+def test_a_plausible_tracker_raises_nothing():
+    tracker = Tracker()
+    assert [tracker() for _ in range(15)] == [{}] * 15
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda poses: poses * ([1000] * 3 + [1] * 4), {"implausible": "ERROR"}),
+        (lambda poses: poses * 3, {"implausible": "ERROR"}),
+        (lambda poses: poses[[0] * 60], {"frozen": "WARN"}),
+        (lambda poses: poses[np.arange(60) // 2 * 2], {}),
+    ],
+    ids=["millimetres", "no quaternions", "frozen", "repeated for a second"],
+)
+def test_what_cannot_be_true_is_found_as_it_comes_and_forgotten(change, expected):
+    tracker = Tracker()
+    for _ in range(3):
+        assert tracker() == {}
+    found = [tracker(change) for _ in range(2)]
+    if expected:
+        assert found[-1].keys() == expected.keys()
+    for _ in range(12):
+        last = tracker()
+    assert last == {}
+
+
+def test_poses_that_come_twice_are_found():
+    tracker = Tracker()
+    last = {}
+    for _ in range(4):
+        last = tracker(lambda poses: poses[np.arange(60) // 2 * 2])
+    assert last == {"frozen": "ERROR"}
+
+
+def test_joints_in_degrees_are_found_as_they_come():
+    descriptor = StreamDescriptor(
+        name="joints_measured", kind="robot_state", shape=(40,), dtype="float64", unit="rad",
+        nominal_rate_hz=60,
+    )  # fmt: skip
+    t_s = np.arange(60) / 60
+    joints = 0.3 + 0.1 * np.sin(t_s[:, None] + np.arange(40))
+    for values, expected in ((joints, {}), (np.degrees(joints), {"implausible": "ERROR"})):
+        judge = PlausibilityCheck(descriptor)
+        evaluation = judged(judge, block(t_s, values), SECOND_NS)
+        assert codes(evaluation) == expected
+    assert "degrees" in evaluation.findings[0].message

@@ -57,6 +57,16 @@ def test_frozen_means_more_than_three_equal_images_in_a_row(rng):
     assert found[-1].num_frozen == 2
 
 
+def test_a_camera_that_sends_every_image_twice_is_frozen(rng):
+    some = [scene(rng) for _ in range(6)]
+    found = checked([some[number // 2 % 6] for number in range(120)])
+    assert found[-1].frozen
+    assert found[-1].num_frozen > 40
+    # One of four that comes twice is a camera in a dim room, for example.
+    found = checked([some[number * 3 // 4 % 6] for number in range(240)])
+    assert not found[-1].frozen
+
+
 def test_one_changed_pixel_in_an_edge_of_eight_is_a_new_image():
     images = [np.full((720, 1280, 3), 90, np.uint8) for _ in range(6)]
     for index, image in enumerate(images):

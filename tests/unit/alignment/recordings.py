@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.schemas import RecordingAttributes
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import SampleBatch, StreamDescriptor
 
 K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
 POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
@@ -58,3 +58,19 @@ def write_recording(
                 t_host_ns=t_ns[arrived] + START_NS,
                 t_device_ns=t_ns[arrived] + 9 * 10**11,
             )
+
+
+def stamped(true_s, stamps_ns, rate_hz):
+    """Numbered samples of a device that stamps them so; they arrive up to a millisecond later."""
+    late_ns = np.random.default_rng(0).exponential(2e5, len(true_s)).clip(max=1e6)
+    t_host_ns = START_NS + np.rint(np.asarray(true_s) * 1e9 + late_ns).astype(np.int64)
+    descriptor = StreamDescriptor(
+        name="wrist_left",
+        kind="pose",
+        shape=(7,),
+        dtype="float64",
+        unit="pose_m_wxyz",
+        nominal_rate_hz=rate_hz,
+    )
+    values = np.repeat(POSE[None], len(true_s), axis=0)
+    return SampleBatch(t_host_ns, np.asarray(stamps_ns), np.arange(len(true_s)), values), descriptor

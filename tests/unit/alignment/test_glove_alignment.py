@@ -22,7 +22,7 @@ from services.alignment.command_line import main
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 
-K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
+K_HEAD = ((10.0, 0.0, 8.0), (0.0, 10.0, 4.0), (0.0, 0.0, 1.0))
 POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
 START_NS = 10**12
 NUM_SAMPLES = 120

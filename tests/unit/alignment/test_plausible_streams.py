@@ -1,0 +1,276 @@
+"""Implausible values of a recording are left out of its episode, or refuse it, by their cause."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ClockFitError, InvalidInputError
+from dextouch.schemas import matrix_rows
+from services.alignment.calibration.tactile_tare import (
+    BELOW_TARE,
+    DEAD,
+    RANDOM,
+    REASONS,
+    STUCK,
+    TactileCalibration,
+    unusable_taxels,
+)
+from services.alignment.jobs import align_recording
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization.stream_clock import time_stream
+from tests.unit.alignment import recordings
+
+SECONDS = 6
+
+
+def moving(name, values, *, seed=0):
+    """The hands of a person who reaches forward, and the head that looks at them, with noise."""
+    rng = np.random.default_rng([seed, *name.encode()])
+    count = len(values)
+    if values.shape[1] == 40:
+        return 0.2 + 0.02 * gaussian_filter1d(rng.standard_normal((count, 40)), 30, axis=0)
+    waves = gaussian_filter1d(rng.standard_normal((count, 6)), 30, axis=0)
+    waves /= waves.std()
+    # Fingers along -z and the view along z are forward, along y of the world; palms look inward.
+    forward = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    turn = Rotation.from_matrix(forward)
+    if name == "head":
+        turn = Rotation.from_euler("x", -120, degrees=True)
+    turn = Rotation.from_rotvec(0.1 * waves[:, 3:]) * turn
+    start_m = {"head": [0, 0, 0.4], "wrist_left": [-0.2, 0.4, 0], "wrist_right": [0.2, 0.4, 0]}
+    poses = np.zeros((count, 7))
+    poses[:, :3] = start_m[name] + 0.05 * waves[:, :3] + 5e-4 * rng.standard_normal((count, 3))
+    poses[:, 3:] = turn.as_quat()[:, [3, 0, 1, 2]]
+    return poses
+
+
+def aligned(folder, fault=lambda name, values: values, **how):
+    store = EpisodeStore(folder)
+    recordings.write_recording(
+        store,
+        "take",
+        seconds=SECONDS,
+        edit=lambda name, values: fault(name, moving(name, values)),
+        **how,
+    )
+    report = align_recording(store, "take", AlignmentOptions())
+    return report, store.open(report.episode_id)
+
+
+def only(stream, fault):
+    def edit(name, values):
+        if name == stream:
+            fault(values)
+        return values
+
+    return edit
+
+
+def causes(report):
+    return [
+        (part.reason, part.stream, round(part.start_s, 2), round(part.stop_s, 2))
+        for part in report.refused_parts
+        if part.reason not in {"late_start", "early_end"}
+    ]
+
+
+def test_a_plausible_take_loses_nothing(tmp_path):
+    report, _ = aligned(tmp_path)
+    assert report.quality["num_steps_refused"] == 0
+    assert causes(report) == []
+
+
+def test_a_pose_elsewhere_is_left_out_and_the_rest_is_joined(tmp_path):
+    def jump(poses):
+        poses[300, 0] += 0.5
+
+    report, episode = aligned(tmp_path, only("wrist_left", jump))
+    assert report.quality["num_steps_refused"] == 0
+    assert report.quality["wrist_left_num_jump_samples"] == 1
+    assert causes(report) == [("jump", "wrist_left", 2.99, 3.01)]
+    poses = episode.read("wrist_left").values
+    assert np.abs(poses[:, 0] + 0.2).max() < 0.3
+
+
+def test_a_tracker_that_finds_itself_anew_parts_the_take(tmp_path):
+    def move(poses):
+        poses[200:, 1] += 0.5
+
+    report, _ = aligned(tmp_path, only("wrist_left", move))
+    assert report.quality["wrist_left_num_lasting_jumps"] == 1
+    ((other, *_), (reason, stream, start_s, stop_s)) = causes(report)
+    assert (reason, stream, other) == ("jump", "wrist_left", "shorter")
+    assert start_s < 2.0 < stop_s
+    assert 0.03 < stop_s - start_s < 0.2
+
+
+def test_a_frozen_tracker_is_no_action(tmp_path):
+    def freeze(poses):
+        poses[100:300] = poses[100]
+
+    report, episode = aligned(tmp_path, only("wrist_right", freeze))
+    assert report.quality["wrist_right_num_frozen_samples"] == 199
+    assert ("frozen", "wrist_right", 1.0, 3.0) in causes(report)
+    # Of 15 steps a second, those of the three seconds after it.
+    assert len(episode.read("action").values) in range(43, 47)
+
+
+def test_a_robot_may_stand_still_exactly(tmp_path):
+    def rest(poses):
+        steps = np.interp(np.arange(600), [0, 200, 400, 599], [0, 200, 200, 399])
+        moved = gaussian_filter1d(steps, 5)
+        moved[220:380] = moved[220]
+        smooth = gaussian_filter1d(poses, 10, axis=0)
+        poses[:] = np.stack([np.interp(moved, np.arange(600), c) for c in smooth.T], axis=1)
+
+    report, _ = aligned(tmp_path, only("wrist_right", rest))
+    assert report.quality["num_steps_refused"] == 0
+
+
+def test_a_tracker_that_repeats_each_pose_is_a_slower_one(tmp_path):
+    def repeat(poses):
+        poses[:] = poses[np.arange(len(poses)) // 3 * 3]
+
+    report, episode = aligned(tmp_path, only("head", repeat))
+    assert report.quality["num_steps_refused"] == 0
+    assert report.quality["head_num_repeated_samples"] == 400
+    assert len(episode.read("head").values) == 200
+
+
+@pytest.mark.parametrize(
+    ("stream", "factor", "said"),
+    [
+        ("wrist_left", 1000, "these look like millimetres"),
+        ("head", 100, "these look like centimetres"),
+        ("joints_measured", 180 / np.pi, "these look like degrees"),
+    ],
+)
+def test_another_unit_is_refused_by_name(tmp_path, stream, factor, said):
+    def scale(values):
+        values[:, : 3 if stream != "joints_measured" else 40] *= factor
+
+    with pytest.raises(InvalidInputError, match=f"{stream}.*{said}") as refused:
+        aligned(tmp_path, only(stream, scale))
+    assert refused.value.details["fault"] == "unit"
+    assert refused.value.details["stream"] == stream
+
+
+@pytest.mark.parametrize("stream", ["head", "wrist_left", "wrist_right"])
+def test_another_order_of_quaternions_is_refused_by_name(tmp_path, stream):
+    def swap(poses):
+        poses[:, 3:] = poses[:, [4, 5, 6, 3]]
+
+    with pytest.raises(InvalidInputError, match=f"{stream}.*x, y, z, w; expected w") as refused:
+        aligned(tmp_path, only(stream, swap))
+    assert refused.value.details["fault"] == "quaternion_order"
+
+
+def test_order_of_quaternions_of_all_trackers(tmp_path):
+    def swap(name, values):
+        if values.shape[1] == 7:
+            values[:, 3:] = values[:, [4, 5, 6, 3]]
+        return values
+
+    with pytest.raises(InvalidInputError, match="head"):
+        aligned(tmp_path, swap)
+
+
+def glove():
+    matrices = {
+        "tactile_left_tare_counts": matrix_rows(np.full((1, 360), 500.0)),
+        "tactile_left_gain_counts_per_kpa": matrix_rows(np.full((1, 360), 40.0)),
+    }
+    return matrices, TactileCalibration.from_record(matrices, "left")
+
+
+def readings(calibration, *, noise=1.0, num=1200):
+    """A noisy glove whose taxels 100 … 139 are pressed now and then."""
+    rng = np.random.default_rng(0)
+    counts = 500 + noise * rng.standard_normal((num, 360))
+    press = 3000 * np.clip(np.sin(np.arange(num) / 60), 0, 1)
+    counts[:, calibration.cells[100:140]] += press[:, None]
+    return np.rint(counts)
+
+
+def reasons_of(calibration, counts):
+    # In pieces, as a recording is read.
+    states = unusable_taxels(calibration, np.array_split(counts, 7))
+    return {REASONS[code]: np.flatnonzero(states == code) for code in set(states.tolist()) - {0}}
+
+
+def test_usable_taxels_remain_with_and_without_noise():
+    _, calibration = glove()
+    for noise in (0.0, 0.3, 1.0, 8.0):
+        assert reasons_of(calibration, readings(calibration, noise=noise)) == {}
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"), [(0, DEAD), (500, STUCK), (502, STUCK)], ids=["zero", "tare", "near it"]
+)
+@pytest.mark.parametrize("taxel", [10, 120], ids=["untouched", "pressed"])
+def test_a_taxel_that_ends_within_the_take(value, reason, taxel):
+    _, calibration = glove()
+    counts = readings(calibration)
+    counts[600:, calibration.cells[taxel]] = value
+    found = reasons_of(calibration, counts)
+    assert {name: taxels.tolist() for name, taxels in found.items()} == {REASONS[reason]: [taxel]}
+
+
+def test_taxels_of_a_glove_without_noise_rest_as_long_as_they_like():
+    _, calibration = glove()
+    counts = readings(calibration, noise=0.0)
+    counts[600:] = 500
+    assert reasons_of(calibration, counts) == {}
+
+
+def test_random_and_too_low_readings_of_some_taxels_and_of_all():
+    _, calibration = glove()
+    rng = np.random.default_rng(1)
+    counts = readings(calibration)
+    counts[:, calibration.cells[:20]] = rng.integers(0, 65536, (len(counts), 20))
+    counts[:, calibration.cells[30:34]] -= 200
+    found = reasons_of(calibration, counts)
+    assert found[REASONS[RANDOM]].tolist() == list(range(20))
+    assert found[REASONS[BELOW_TARE]].tolist() == list(range(30, 34))
+    for bad, fault in (
+        (rng.integers(0, 65536, counts.shape).astype(float), "random"),
+        (counts - 300, "below_tare"),
+    ):
+        with pytest.raises(InvalidInputError, match="left glove: readings of") as refused:
+            unusable_taxels(calibration, [bad])
+        assert refused.value.details["fault"] == fault
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "counts/Pa"), (1e3, "counts/MPa")])
+def test_gains_of_another_unit_are_refused_by_name(factor, unit):
+    matrices, _ = glove()
+    gain = np.array(matrices["tactile_left_gain_counts_per_kpa"]) * factor
+    matrices["tactile_left_gain_counts_per_kpa"] = matrix_rows(gain)
+    with pytest.raises(InvalidInputError, match=f"these look like {unit}"):
+        TactileCalibration.from_record(matrices, "left")
+
+
+@pytest.mark.parametrize("hours", [24, 100, 400])
+@pytest.mark.parametrize("rate_hz", [60, 120])
+def test_stamps_in_floats_of_seconds_are_replaced_by_sequence_numbers(rate_hz, hours):
+    sequence = np.arange(60 * rate_hz)
+    true_s = sequence / rate_hz
+    stamps_ns = np.rint(np.float32(true_s + 3600 * hours).astype(float) * 1e9).astype(np.int64)
+    batch, descriptor = recordings.stamped(true_s, stamps_ns, rate_hz)
+    timed = time_stream(batch, descriptor)
+    assert timed.report.method == "sequence"
+    assert len(timed.kept) == len(sequence)
+    error_s = timed.t_host_ns / 1e9 - (recordings.START_NS / 1e9 + true_s)
+    assert np.abs(error_s - np.median(error_s)).max() < 2e-4
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e9], ids=["us", "ms", "s"])
+def test_stamps_of_another_unit_are_refused_by_name(unit):
+    true_s = np.arange(6000) / 100
+    stamps_ns = np.rint(true_s * 1e9 / unit).astype(np.int64)
+    batch, descriptor = recordings.stamped(true_s, stamps_ns, 100)
+    with pytest.raises(ClockFitError, match="taken for nanoseconds") as refused:
+        time_stream(batch, descriptor)
+    assert refused.value.details["fault"] == "unit"

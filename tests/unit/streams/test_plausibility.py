@@ -1,0 +1,249 @@
+"""Faults of known place in movements of known noise, and movements that only look faulty."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from dextouch.errors import InvalidInputError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.streams.plausibility import (
+    check_camera_matrix,
+    implausible_joints,
+    implausible_poses,
+    implausible_repeats,
+    lasting_jumps,
+)
+
+HANDS = Path(__file__).parents[4] / "shared/data/hands/right_hand_mediapipe_first_half.npy"
+RATES_HZ = (30, 60, 120, 250)
+
+
+def movement(rate_hz, *, seed=0, seconds=8.0, noise_m=0.0005, rests=False):
+    """Times (ns) and poses [n, 7] of a tracked hand, with a standstill of 2 s if it `rests`."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds * rate_hz)
+
+    def smooth(scale):
+        waves = gaussian_filter1d(rng.standard_normal((count, 3)), 0.3 * rate_hz, axis=0)
+        return scale * waves / waves.std()
+
+    position_m, turn_rad = smooth(0.2), smooth(0.4)
+    if rests:
+        t_s = np.arange(count + 2 * rate_hz) / rate_hz
+        speed = np.interp(t_s, [2.0, 2.5, 4.5, 5.0], [1.0, 0.0, 0.0, 1.0])
+        slow = np.minimum(np.cumsum(speed), count - 1)
+        position_m, turn_rad = (
+            np.stack([np.interp(slow, np.arange(count), axis) for axis in of.T], axis=1)
+            for of in (position_m, turn_rad)
+        )
+        count = len(slow)
+    quaternions = Rotation.from_rotvec(turn_rad).as_quat()[:, [3, 0, 1, 2]]
+    poses = np.concatenate([position_m, quaternions], axis=1)
+    poses[:, :3] += [0.3, 0.5, 1.0] + noise_m * rng.standard_normal((count, 3))
+    t_ns = np.rint(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
+    return t_ns, poses
+
+
+def found(t_ns, poses, rate_hz):
+    return implausible_poses(t_ns, poses, period_ns=round(1e9 / rate_hz))
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("noise_m", [0.0, 0.0002, 0.003])
+@pytest.mark.parametrize("rests", [False, True])
+def test_movements_with_and_without_noise_and_rests_are_plausible(rate_hz, noise_m, rests):
+    for seed in range(5):
+        assert found(*movement(rate_hz, seed=seed, noise_m=noise_m, rests=rests), rate_hz) == []
+
+
+def test_a_robot_of_coarse_encoders_may_stand_still():
+    rate_hz = 100
+    t_ns, poses = movement(rate_hz, noise_m=0.0, rests=True)
+    poses = np.round(poses, 4)
+    period_ns = round(1e9 / rate_hz)
+    assert implausible_poses(t_ns, poses, period_ns=period_ns, can_rest=True) == []
+
+
+def test_the_fastest_throw_is_plausible():
+    rate_hz = 120
+    t_ns = np.rint(np.arange(240) * 1e9 / rate_hz).astype(np.int64)
+    # 8 m/s within 0.25 s, as javelins are thrown, and to a halt in the same time.
+    speed_m_s = np.interp(t_ns / 1e9, [0, 0.5, 0.75, 1.0, 2], [0, 0, 8, 0, 0])
+    poses = np.zeros((240, 7))
+    poses[:, 0], poses[:, 3] = np.cumsum(speed_m_s) / rate_hz, 1.0
+    assert [one.cause for one in found(t_ns, poses, rate_hz)] == []
+
+
+def test_lost_poses_are_none_of_its_business():
+    t_ns, poses = movement(60)
+    poses[100:110] = np.nan
+    poses[200:230, 3:] = 0
+    assert found(t_ns, poses, 60) == []
+    assert found(t_ns, np.full_like(poses, np.nan), 60) == []
+
+
+@pytest.mark.parametrize(("rate_hz", "offset_m"), [(30, 0.5), (60, 0.3), (120, 5.0), (250, 0.3)])
+@pytest.mark.parametrize("num", [1, 3])
+def test_poses_elsewhere_are_located(rate_hz, offset_m, num):
+    for seed in range(5):
+        t_ns, poses = movement(rate_hz, seed=seed)
+        direction = np.random.default_rng(seed).standard_normal(3)
+        poses[99 : 99 + num, :3] += offset_m * direction / np.linalg.norm(direction)
+        (jump,) = found(t_ns, poses, rate_hz)
+        assert jump.cause == "jump"
+        assert not jump.whole
+        assert np.flatnonzero(jump.samples).tolist() == list(range(99, 99 + num))
+
+
+@pytest.mark.parametrize(("rate_hz", "offset_m"), [(60, 0.08), (120, 0.03), (250, 0.02)])
+def test_a_pose_is_located_by_the_acceleration_that_it_needs(rate_hz, offset_m):
+    for seed in range(5):
+        t_ns, poses = movement(rate_hz, seed=seed)
+        poses[99, 1] += offset_m
+        (jump,) = found(t_ns, poses, rate_hz)
+        assert np.flatnonzero(jump.samples).tolist() == [99]
+
+
+def test_a_flipped_rotation_is_located():
+    t_ns, poses = movement(60)
+    poses[50, 3:] = poses[50, [4, 3, 6, 5]] * [1, -1, 1, -1]
+    (jump,) = found(t_ns, poses, 60)
+    assert np.flatnonzero(jump.samples).tolist() == [50]
+
+
+def test_the_sign_of_quaternions_says_nothing():
+    t_ns, poses = movement(60)
+    poses[::2, 3:] *= -1
+    assert found(t_ns, poses, 60) == []
+
+
+def test_a_tracker_that_finds_itself_anew_is_no_outlier():
+    t_ns, poses = movement(60)
+    poses[200:, :3] += [0.4, 0, 0]
+    assert found(t_ns, poses, 60) == []
+    jumps = lasting_jumps(t_ns, poses, period_ns=round(1e9 / 60))
+    assert jumps.tolist() == [200]
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")], ids=["mm", "cm"]
+)
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_other_units_are_named(rate_hz, factor, unit):
+    for seed in range(5):
+        t_ns, poses = movement(rate_hz, seed=seed)
+        poses[:, :3] *= factor
+        (one,) = found(t_ns, poses, rate_hz)
+        assert (one.cause, one.whole, one.samples.all()) == ("unit", True, True)
+        assert f"these look like {unit}" in one.message
+
+
+def test_noise_of_decimetres_is_no_unit():
+    t_ns, poses = movement(60, noise_m=0.3)
+    (one,) = found(t_ns, poses, 60)
+    assert (one.cause, one.whole) == ("speed", True)
+
+
+def test_columns_that_are_no_quaternion():
+    t_ns, poses = movement(60)
+    poses[:, 3:] = Rotation.from_quat(poses[:, 3:]).as_euler("xyz", degrees=True)[:, [0, 1, 2, 0]]
+    (one,) = found(t_ns, poses, 60)
+    assert (one.cause, one.whole) == ("norm", True)
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("noise_m", [0.0, 0.0005])
+def test_a_frozen_stream_is_located(rate_hz, noise_m):
+    for seed in range(5):
+        t_ns, poses = movement(rate_hz, seed=seed, noise_m=noise_m)
+        poses[100 : 100 + rate_hz] = poses[100]
+        frozen = [one for one in found(t_ns, poses, rate_hz) if one.cause == "frozen"]
+        assert len(frozen) == 1
+        assert np.flatnonzero(frozen[0].samples).tolist() == list(range(101, 100 + rate_hz))
+
+
+def test_a_noisy_stream_that_is_frozen_to_the_end():
+    t_ns, poses = movement(60)
+    poses[300:] = poses[300]
+    (one,) = found(t_ns, poses, 60)
+    assert (one.cause, one.samples.sum()) == ("frozen", len(poses) - 301)
+
+
+@pytest.mark.parametrize("times", [2, 3, 4])
+def test_values_that_come_several_times(times):
+    t_ns, poses = movement(120)
+    poses = poses[np.arange(len(poses)) // times * times]
+    (one,) = found(t_ns, poses, 120)
+    assert (one.cause, one.factor) == ("repeated", times)
+    assert np.array_equal(~one.samples, np.arange(len(poses)) % times == 0)
+
+
+def hands():
+    both = [RobotHand(side) for side in ("left", "right")]
+    return (
+        np.concatenate([hand.lower_rad for hand in both]),
+        np.concatenate([hand.upper_rad for hand in both]),
+    )
+
+
+def test_joints_in_degrees_beyond_their_limits_and_within_them():
+    lower, upper = hands()
+    share = gaussian_filter1d(np.random.default_rng(0).random((600, 40)), 20, axis=0)
+    joints = lower + (upper - lower) * share
+    assert implausible_joints(joints, lower, upper) == []
+    # Real hands go a little beyond.
+    assert implausible_joints(joints + 0.3 * (upper - lower) / 3, lower, upper) == []
+    (degrees,) = implausible_joints(np.degrees(joints), lower, upper)
+    assert (degrees.cause, degrees.whole) == ("unit", True)
+    assert "these look like degrees" in degrees.message
+    other = joints.copy()
+    other[:, 3] += 3
+    (limits,) = implausible_joints(other, lower, upper)
+    assert (limits.cause, limits.whole) == ("limits", True)
+    assert "joint 3 " in limits.message
+    joints[200, 7] = 9
+    (once,) = implausible_joints(joints, lower, upper)
+    assert (once.cause, once.whole, np.flatnonzero(once.samples).tolist()) == (
+        "limits",
+        False,
+        [200],
+    )
+
+
+@pytest.mark.skipif(not HANDS.is_file(), reason="no recordings in ../shared/data")
+def test_a_real_hand_is_not_frozen_until_it_is():
+    real = np.load(HANDS)
+    assert list(implausible_repeats(real)) == []
+    for nodes in (slice(5, 9), slice(1, 5)):
+        assert list(implausible_repeats(real[:, nodes])) == []
+    index = real[:, 5:9].copy()
+    index[100:160] = index[100]
+    (one,) = implausible_repeats(index)
+    assert (one.cause, np.flatnonzero(one.samples).tolist()) == ("frozen", list(range(101, 160)))
+    (thrice,) = implausible_repeats(real[np.arange(309) // 3 * 3])
+    assert thrice.factor == 3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {(0, 2): 700.0},
+        {(1, 2): -3.0},
+        {(0, 0): 5.0},
+        {(0, 0): 1500.0},
+        {(2, 2): 0.0},
+        {(0, 0): 1e9},
+    ],
+    ids=["right of it", "above it", "short", "unequal", "form", "long"],
+)
+def test_camera_matrices_that_no_lens_has(change):
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    check_camera_matrix(K, (640, 480), where="K_head")
+    for place, value in change.items():
+        K[place] = value
+    with pytest.raises(InvalidInputError, match="K_head: got focal lengths") as refused:
+        check_camera_matrix(K, (640, 480), where="K_head")
+    assert refused.value.details["fault"] == "camera_matrix"
