@@ -197,9 +197,14 @@ def state_scores(
     for rollout in rollouts:
         about, rubric = store.open(rollout.episode_id).attributes, rubrics[rollout.task]
         was_noted = about.event_times_s or (about.success is False and not is_rollout(about))
-        if about.origin == "twin" and was_noted and rubric.is_seen_by_twin:
-            holds = rubric.holds_in_twin(about.event_times_s)
-            found[rollout.episode_id] = rubric.score(holds)
+        if about.origin != "twin" or not was_noted:
+            continue
+        # The twin notes when a milestone was first reached, so every criterion counts as latched.
+        names = (one.milestone for one in rubric.criteria if one.milestone is not None)
+        reached = {name: float(name in about.event_times_s) for name in names}
+        score = rubric.score_by_milestones(reached)
+        if score is not None:
+            found[rollout.episode_id] = score
     return found
 
 
