@@ -359,7 +359,7 @@ def _metadata(
         settings={
             "shape": shape.model_dump(mode="json"),
             "training": settings.model_dump(),
-            "instructions": instructions_of(everything),
+            "instructions": instructions_of((e.task, e.instruction) for e in everything),
             "threshold": DECISION_THRESHOLD,
         },
         metrics={

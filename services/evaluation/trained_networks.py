@@ -152,22 +152,9 @@ def optimized(
             yield budget
 
 
-@runtime_checkable
-class Instructed(Protocol):
-    """Anything with a task and its instruction."""
-
-    @property
-    def task(self) -> str:
-        """Name of the task."""
-
-    @property
-    def instruction(self) -> str:
-        """Instruction of the task."""
-
-
-def instructions_of(demonstrations: Iterable[Instructed]) -> dict[str, str]:
-    """Instruction of every task, from its first episode."""
+def instructions_of(tasks: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """The first instruction of every task, from tasks and instructions of episodes."""
     found: dict[str, str] = {}
-    for item in demonstrations:
-        found.setdefault(item.task, item.instruction)
+    for task, instruction in tasks:
+        found.setdefault(task, instruction)
     return found

@@ -286,7 +286,7 @@ def train_cloned_policy(
             settings={
                 "shape": shape.model_dump(),
                 "training": settings.model_dump(),
-                "instructions": instructions_of(episodes),
+                "instructions": instructions_of((e.task, e.instruction) for e in episodes),
                 "share_of_training": share,
             },
             metrics={
