@@ -269,7 +269,7 @@ def train_cloned_policy(
     shape = CloningShape(tasks=tasks, image_size_px=episodes[0].moments[0].image.shape[0])
     training, held_out = split_by_scene(episodes, held_out_share=settings.held_out_share)
     learned, tested = decisions_of(training, shape), decisions_of(held_out, shape)
-    network = shape.network()
+    network = CloningNetwork(shape)
     _fit_statistics(network, learned)
 
     def checkpoint(cpu_s: float, share: float) -> Checkpoint:

@@ -14,11 +14,11 @@ from services.evaluation.policies.behaviour_cloning import (
     ChunkCodec,
     CloningInput,
     CloningShape,
-    SpatialSoftmax,
     cloning_batch,
     from_world,
     half_size,
     in_world,
+    spatial_softmax,
 )
 from services.evaluation.policies.cloning_training import (
     CloningEpisode,
@@ -202,7 +202,7 @@ def test_codec_keeps_what_its_components_span():
     basis = rng.normal(size=(3, 16 * 67))
     offsets = 5.0 * rng.normal(size=(2, 2, 16 * 67))[tasks, slots]
     chunks = torch.tensor(rng.normal(size=(40, 3)) @ basis + offsets).reshape(40, 16, 67).float()
-    codec = ChunkCodec(num_tasks=2, num_slots=3, num_components=3)
+    codec = ChunkCodec(CloningShape(tasks=("a", "b"), num_components=3, horizon_steps=16))
     codec.fit(chunks, tasks, slots)
     coefficients = codec.encode(chunks, tasks, slots)
     back = codec.decode(coefficients, tasks, slots)
@@ -215,7 +215,7 @@ def test_spatial_softmax_finds_the_peak():
     maps = torch.zeros(1, 2, 9, 9)
     maps[0, 0, 0, 8] = 50.0
     maps[0, 1, 4, 4] = 50.0
-    places = SpatialSoftmax()(maps)
+    places = spatial_softmax(maps)
     torch.testing.assert_close(places, torch.tensor([[1.0, 0.0, -1.0, 0.0]]), atol=1e-4, rtol=0)
 
 
