@@ -4,7 +4,7 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 (for the metrics in the checkpoint).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -209,7 +209,11 @@ class ClassifierSets:
         development: Sequence[EndingEpisode] = (),
         held_out: Sequence[EndingEpisode] = (),
     ) -> "ClassifierSets":
-        """The given sets; missing ones are taken from a share of the scenes of `episodes`."""
+        """The given sets; missing ones are taken from a share of the scenes of `episodes`.
+
+        Raises:
+            ConflictError: a held-out or development episode starts like a training episode.
+        """
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
             training, tested = split_by_scene(training, held_out_share=settings.held_out_share)
@@ -217,29 +221,18 @@ class ClassifierSets:
             training, calibrated = split_by_scene(
                 training, held_out_share=settings.development_share, salt="development "
             )
-        return cls(training, calibrated, tested)
+        sets = cls(training, calibrated, tested)
+        learned = {e.start_digest for e in training}
+        for others, trained_on in ((calibrated, learned), (tested, sets.training_starts)):
+            digests = (e.start_digest for e in others)
+            what = "the success classifier"
+            refuse_training_starts(digests, trained_on=trained_on, what=what)
+        return sets
 
     @property
     def training_starts(self) -> tuple[str, ...]:
         """Digests of the starts of the weights' training or the calibration."""
         return tuple(sorted({e.start_digest for e in (*self.training, *self.development)}))
-
-    def check(self) -> None:
-        """Raise if two sets share a start.
-
-        Raises:
-            ConflictError: a held-out or development episode starts like a training episode.
-        """
-        learned = {e.start_digest for e in self.training}
-        for others, trained_on in (
-            (self.development, learned),
-            (self.held_out, self.training_starts),
-        ):
-            refuse_training_starts(
-                (e.start_digest for e in others),
-                trained_on=trained_on,
-                what="the success classifier",
-            )
 
     def check_measurable(self) -> None:
         """Check before training that every task can be measured.
@@ -285,7 +278,6 @@ def train_success_classifier(
     """
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
-    sets.check()
     shape = ClassifierShape(
         tasks=tuple(sorted({e.task for e in sets.training})),
         image_size_px=_image_size_px(sets.training),
@@ -305,7 +297,9 @@ def train_success_classifier(
     network.eval()
     metadata = _metadata(sets, settings, shape, command, cpu_s)
     plain = Checkpoint(metadata, network_tensors(network))
-    return _measured(_calibrated(plain, sets, settings), sets)
+    calibrated = _calibrated(plain, sets.development, settings)
+    figures = held_out_figures(SuccessClassifier(calibrated), sets.held_out)
+    return _with(calibrated, "metrics", figures)
 
 
 def calibrate_success_classifier(
@@ -332,7 +326,7 @@ def calibrate_success_classifier(
         "settings": {**metadata.settings, "calibrated_by": command},
     }
     checkpoint = replace(base, metadata=metadata.model_copy(update=known))
-    return _calibrated(checkpoint, ClassifierSets((), episodes, ()), settings)
+    return _calibrated(checkpoint, episodes, settings)
 
 
 def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
@@ -373,41 +367,31 @@ def _metadata(
 
 
 def _calibrated(
-    checkpoint: Checkpoint, sets: ClassifierSets, settings: ClassifierSettings
+    checkpoint: Checkpoint, development: Sequence[EndingEpisode], settings: ClassifierSettings
 ) -> Checkpoint:
     """The checkpoint with all that is fitted to the development episodes."""
     probe = SuccessClassifier(checkpoint)
-    calibrations = fit_calibrations(probe, sets.development, risk=settings.risk)
-    calibrated = _with_settings(
-        checkpoint,
-        calibration={name: one.model_dump() for name, one in calibrations.items()},
-        told_milestones=classifiable_milestones(probe, sets.development),
-    )
+    calibrations = fit_calibrations(probe, development, risk=settings.risk)
+    fitted = {
+        "calibration": {name: one.model_dump() for name, one in calibrations.items()},
+        "told_milestones": classifiable_milestones(probe, development),
+    }
+    calibrated = _with(checkpoint, "settings", fitted)
     combinations = fit_combinations(
         SuccessClassifier(calibrated),
-        sets.development,
+        development,
         risk=settings.imagined_risk,
         margin=settings.contradiction_margin,
     )
-    return _with_settings(
-        calibrated, combination={name: one.model_dump() for name, one in combinations.items()}
-    )
+    joined = {name: one.model_dump() for name, one in combinations.items()}
+    return _with(calibrated, "settings", {"combination": joined})
 
 
-def _with_settings(checkpoint: Checkpoint, **added: object) -> Checkpoint:
+def _with(checkpoint: Checkpoint, part: str, added: Mapping[str, object]) -> Checkpoint:
+    """The checkpoint with more settings or metrics, as `part` says."""
     metadata = checkpoint.metadata
-    settings = {**metadata.settings, **added}
-    return replace(checkpoint, metadata=metadata.model_copy(update={"settings": settings}))
-
-
-def _measured(checkpoint: Checkpoint, sets: ClassifierSets) -> Checkpoint:
-    """The checkpoint with its metrics on the held-out episodes."""
-    figures = held_out_figures(SuccessClassifier(checkpoint), sets.held_out)
-    metadata = checkpoint.metadata
-    return replace(
-        checkpoint,
-        metadata=metadata.model_copy(update={"metrics": {**metadata.metrics, **figures}}),
-    )
+    update = {part: {**getattr(metadata, part), **added}}
+    return replace(checkpoint, metadata=metadata.model_copy(update=update))
 
 
 _Order = tuple[TaskNetwork, Labelled, ClassifierSettings, str]
