@@ -63,9 +63,11 @@ def action_chunk(
     """
     rows = _array(answer, where)
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != ACTION_DIM:
+        found = type(answer).__name__
+        if rows.dtype.kind != "O":
+            found += f" of shape {list(rows.shape)} and {rows.dtype}"
         raise ShapeError(
-            f"{where} returned {_described(answer, rows)}, expected an array [K, {ACTION_DIM}] of "
-            "real numbers"
+            f"{where} returned {found}, expected an array [K, {ACTION_DIM}] of real numbers"
         )
     if not 0 < len(rows) <= world.max_chunk_steps or len(rows) % world.chunk_multiple:
         raise ShapeError(
@@ -86,12 +88,6 @@ def _array(answer: object, where: str) -> np.ndarray:
             f"{where} returned {type(answer).__name__}, which does not convert to an array "
             f"({error}), expected [K, {ACTION_DIM}]"
         ) from error
-
-
-def _described(answer: object, rows: np.ndarray) -> str:
-    if rows.dtype.kind == "O":
-        return f"{type(answer).__name__}"
-    return f"{type(answer).__name__} of shape {list(rows.shape)} and {rows.dtype}"
 
 
 @dataclass(frozen=True)
