@@ -201,15 +201,8 @@ def chance_of_correlation(
     """One-sided p value of Pearson's r over all assignments of policies, within each task.
 
     Exact up to `MAX_PERMUTATIONS` assignments; beyond, that many are drawn and the true one is
-    counted among them.
-
-    Args:
-        real: mean scores [policies] of each task.
-        imagined: mean scores of the same policies.
-        generator: source of drawn assignments.
-
-    Returns:
-        The p value; NaN where the correlation is undefined.
+    counted among them. `real` and `imagined` are mean scores [policies] of each task; NaN where
+    their correlation is undefined.
     """
     flat = np.concatenate(real)
     if min(map(len, real)) < policy.MIN_POLICIES:

@@ -76,12 +76,8 @@ def fit_calibration(
 
     Platt scaling with his targets (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit finite
     for endings that are separated without error (Platt 1999), and a weak prior towards the
-    network's own odds for small samples.
-
-    Args:
-        log_odds: [n] log odds from the network.
-        success: [n] outcomes.
-        risk: allowed share of errors among the decided endings.
+    network's own odds for small samples. `log_odds` [n] are those of the network, `success` [n] the
+    outcomes; `risk` is the allowed share of errors among the decided endings.
 
     Raises:
         InvalidInputError: only one outcome, or a risk outside 0 … 1.
@@ -116,12 +112,9 @@ def fit_combination(
     the risk, so it decides as many endings as possible. Where fewer than `LEAST_DECIDED` would be
     decided, twice the risk is allowed; where no band keeps that, nothing is decided.
 
-    Args:
-        probe: [n] calibrated probabilities of the classifier.
-        world: [n] the world's own probabilities.
-        success: [n] outcomes.
-        risk: allowed share of errors among the decided endings.
-        margin: of `Combination`.
+    `probe` [n] are calibrated probabilities of the classifier, `world` [n] the world's own, and
+    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings, and
+    `margin` that of `Combination`.
 
     Raises:
         InvalidInputError: no endings, or arrays of different lengths.

@@ -138,15 +138,10 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
 
 
 def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str], what: str) -> None:
-    """Raise if a start of the evaluation was trained on.
-
-    Args:
-        digests: digests of the evaluation's starts.
-        trained_on: digests of the first observations of the training episodes.
-        what: the trained network, for the error message.
+    """Refuse an evaluation whose starts have digests of starts that a network was trained on.
 
     Raises:
-        ConflictError: a start of the evaluation was trained on.
+        ConflictError: there are such starts; `what` is the network.
     """
     shared = sorted(set(digests) & set(trained_on))
     if shared:

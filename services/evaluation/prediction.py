@@ -174,11 +174,7 @@ def measure_prediction(
 ) -> PredictionResult:
     """Errors of predicted futures of scenes that the world was not trained on.
 
-    Args:
-        world: to measure.
-        scenes: recorded futures.
-        metrics: of `METRICS` or `all_metrics`.
-        baselines: names of `BASELINES`; others are not computed.
+    `metrics` are some of `METRICS` or `all_metrics`, and `baselines` names of `BASELINES`.
 
     Raises:
         InvalidInputError: no scene.

@@ -8,12 +8,7 @@ from dextouch.command_line import ProgressLines
 
 
 class Progress:
-    """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds.
-
-    Args:
-        title: name of the job.
-        total: number of steps.
-    """
+    """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds."""
 
     def __init__(self, title: str, total: int) -> None:
         console = Console(stderr=True)

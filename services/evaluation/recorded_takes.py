@@ -69,11 +69,8 @@ def read_takes(
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
 
-    Args:
-        stores: stores to read.
-        tasks: tasks to read; empty for all.
-        splits: splits of their scenes; empty for all.
-        most: takes a task, the first by their ids; None for all.
+    `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
+    read, None for all.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.

@@ -40,11 +40,9 @@ class Interval:
 
 
 def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
-    """Probability that a success scores above a failure; ties count half.
+    """Probability that a success scores above a failure, by scores and outcomes [n].
 
-    Args:
-        scores: [n], higher for more certain success.
-        success: [n] outcomes.
+    Ties count half.
 
     Raises:
         InvalidInputError: only successes, or only failures.

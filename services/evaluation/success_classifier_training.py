@@ -100,11 +100,7 @@ def labelled_endings(
 
     Every episode contributes its end and the step before; an early ending, as a failure with a
     tenth of the weight of all failures; and a middle ending where its milestones are known.
-
-    Args:
-        episodes: episodes with known success.
-        shape: shape of the probe.
-        imagined_share: weight of a task's imagined endings relative to its true ones.
+    `imagined_share` is the weight of a task's imagined endings relative to its true ones.
 
     Raises:
         InvalidInputError: a task has only one outcome.
@@ -261,16 +257,10 @@ def train_success_classifier(
 ) -> Checkpoint:
     """Train a probe to predict success from the end of a rollout.
 
-    Args:
-        episodes: true and imagined episodes with known success.
-        settings: training settings.
-        command: command to store in the checkpoint.
-        development: episodes to calibrate on; default: a share of the scenes of `episodes`.
-        held_out: episodes to evaluate on; default: a share of the scenes of `episodes`.
-        jobs: processes, each of which trains one task at a time; the weights do not depend on it.
-
-    Returns:
-        Weights and calibration; the metadata holds the metrics on held-out episodes.
+    `development` are the episodes to calibrate on, and `held_out` those of the metrics in the
+    metadata; by default each is a share of the scenes of `episodes`, true and imagined ones. Each
+    of `jobs` processes trains one task at a time; the weights do not depend on their number. The
+    checkpoint stores the `command`.
 
     Raises:
         ConflictError: a held-out or development episode starts like a training episode.
@@ -311,11 +301,9 @@ def calibrate_success_classifier(
 ) -> Checkpoint:
     """Fit the probabilities and the bands of a trained probe anew, for another world model.
 
-    Args:
-        base: its weights and metrics are kept.
-        episodes: true and imagined ones of known success, that the weights were not trained on.
-        settings: allowed risks; all others have no effect.
-        command: command to store in the settings of the checkpoint, as `calibrated_by`.
+    The weights and metrics of `base` are kept; they were not trained on the episodes, true and
+    imagined ones. Of the settings only the allowed risks have an effect; those of the checkpoint
+    store the `command` as `calibrated_by`.
     """
     metadata = base.metadata
     names = {*metadata.training_episodes, *(e.episode_id for e in episodes)}
@@ -449,13 +437,9 @@ def some_parts(
     settings: ClassifierSettings,
     generator: torch.Generator,
 ) -> ClassifierBatch:
-    """Add noise to the poses, and drop poses or images at random.
+    """Add noise to the poses of examples of one task, and drop poses or images at random.
 
-    Args:
-        batch: examples of one task.
-        object_std: [features], deviation of the task's pose features, the unit of the noise.
-        settings: dropout shares and noise level.
-        generator: source of randomness.
+    `object_std` [features] is the deviation of the task's pose features, the unit of the noise.
     """
     drawn = torch.rand(len(batch.task), generator=generator)
     both = batch.has_image & batch.has_objects

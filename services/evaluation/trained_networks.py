@@ -131,13 +131,8 @@ def optimized(
 ) -> Iterator[Budget]:
     """Train a network; yields the used budget after each step.
 
-    Args:
-        network: module to train.
-        loss: loss of a batch drawn with the generator.
-        settings: seed, learning rate and weight decay.
-        limits: largest number of steps, and CPU seconds.
-        title: name beside the progress bar.
-        max_gradient_norm: norm that gradients are clipped to; None: not clipped.
+    `loss` is that of a batch drawn with the generator; `limits` are the largest number of steps,
+    and CPU seconds. Gradients are clipped to `max_gradient_norm`, unless it is None.
     """
     num_steps, max_cpu_s = limits
     generator = torch.Generator().manual_seed(settings.seed)

@@ -317,9 +317,6 @@ class BehaviourCloningPolicy:
     The only state between `reset` calls is the rollout's first image and anchor. Of an observation
     it needs the last step only (`looks`).
 
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
-
     Raises:
         InvalidInputError: the weights do not match the shape in the metadata.
     """

@@ -52,10 +52,8 @@ def action_chunk(
 ) -> Float64[np.ndarray, "steps 67"]:
     """Validate the return value of a policy's `act` as an action chunk of a world.
 
-    Args:
-        answer: array, nested list or tensor [K, 67] of any kind of real number.
-        world: world that the chunk is for.
-        where: policy, task, seed and chunk, for error messages.
+    `answer` is an array, nested list or tensor [K, 67] of any kind of real number; `where` names
+    policy, task, seed and chunk in error messages.
 
     Raises:
         ShapeError: wrong shape or dtype, or a K that the world does not accept.
@@ -117,9 +115,6 @@ class PolicySource:
 
     def load(self, arguments: Mapping[str, Any]) -> Policy:
         """Import the module, also from the current directory, and call the factory.
-
-        Args:
-            arguments: keyword arguments of the factory.
 
         Raises:
             NotFoundError: no such module.

@@ -56,17 +56,11 @@ def token_of(episode_id: str) -> str:
 
 
 class RatingQueue:
-    """Assigns rollouts to raters.
+    """Assigns rollouts to raters, until each has been rated by `raters_per_rollout` people.
 
     Rollouts with the fewest raters come first; ties are broken by an order specific to the rater.
     After every `1 / repeat_share` rollouts a rater is shown one again that they rated at least
     `REPEAT_GAP` marks ago. A repeated request without a mark returns the same rollout.
-
-    Args:
-        rollouts: to be rated.
-        marks: those given so far.
-        raters_per_rollout: number of people who rate each rollout.
-        repeat_share: share of rollouts that a rater sees twice.
     """
 
     def __init__(
@@ -137,12 +131,7 @@ def _order(rater: str, episode_id: str) -> str:
 def rated_rollouts(
     store: EpisodeStore, tasks: Collection[str], *, study: str | None = None
 ) -> list[RatedRollout]:
-    """Rollouts of a store that have head images; what people recorded is none.
-
-    Args:
-        store: of episodes.
-        tasks: tasks with a rubric; episodes of others are skipped.
-        study: the study whose rollouts are rated; None for all rollouts.
+    """Rollouts of some tasks that have head images, of one study or all; takes of people are none.
 
     Raises:
         InvalidInputError: nothing to rate.

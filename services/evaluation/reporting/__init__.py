@@ -49,13 +49,7 @@ __all__ = [
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
-    """Write the page atomically.
-
-    Args:
-        report: figures; NaN and None are shown as "undefined".
-        pictures: arrays to draw.
-        path: HTML file; its folder is created.
-    """
+    """Write the page atomically; NaN and None are shown as "undefined"."""
     environment = Environment(
         loader=PackageLoader("services.evaluation.reporting"),
         autoescape=select_autoescape(["j2"], default=True),

@@ -80,11 +80,7 @@ class _Read:
 
 
 class StudyFolders:
-    """Studies in the subfolders of a folder.
-
-    Args:
-        root: folder that holds a folder for each study.
-    """
+    """Studies in the subfolders of a folder."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
