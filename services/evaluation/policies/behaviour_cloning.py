@@ -232,40 +232,14 @@ class CloningNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class CloningInput:
-    """Input of the policy at one step."""
+    """Input of the policy at one step, beside images."""
 
-    first_image: UInt8[np.ndarray, "h w 3"]
-    image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: np.ndarray
     anchor: AnchorPoses
     reached: Float64[np.ndarray, "67"]
     reached_is_measured: bool
     step: int
     task: str
-
-
-def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> CloningBatch:
-    """Network tensors of inputs, for training and acting alike.
-
-    Raises:
-        UnknownNameError: a task that the network was not trained for.
-        InvalidInputError: images of another size.
-    """
-    size = (shape.image_size_px, shape.image_size_px, 3)
-    for item in inputs:
-        if item.task not in shape.tasks:
-            raise UnknownNameError("task of the cloned policy", item.task, list(shape.tasks))
-        if item.image.shape != size or item.first_image.shape != size:
-            raise InvalidInputError(
-                f"cloned policy: got images {item.first_image.shape} and {item.image.shape}, "
-                f"expected {size}"
-            )
-    return CloningBatch(
-        scaled_images(torch.from_numpy(np.stack([i.first_image for i in inputs]))),
-        torch.arange(len(inputs)),
-        scaled_images(torch.from_numpy(np.stack([half_size(i.image) for i in inputs]))),
-        *cloning_state(inputs, shape),
-    )
 
 
 def half_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "half_h half_w 3"]:
@@ -364,11 +338,12 @@ class BehaviourCloningPolicy:
         if HEAD_CAMERA not in observation.images:
             raise UnknownNameError("camera", HEAD_CAMERA, list(observation.images))
         image = observation.images[HEAD_CAMERA][-1]
+        size = (self.shape.image_size_px, self.shape.image_size_px, 3)
+        if image.shape != size:
+            raise InvalidInputError(f"cloned policy: got images {image.shape}, expected {size}")
         if self._first_image is None:
             self._first_image = observation.images[HEAD_CAMERA][0]
         moment = CloningInput(
-            self._first_image,
-            image,
             observation.tactile_kpa[-1],
             self._start.anchor,
             observation.action_reached[-1],
@@ -377,7 +352,12 @@ class BehaviourCloningPolicy:
             self._start.task,
         )
         with torch.no_grad():
-            batch = cloning_batch([moment], self.shape)
+            batch = CloningBatch(
+                scaled_images(torch.from_numpy(self._first_image[None])),
+                torch.zeros(1, dtype=torch.long),
+                scaled_images(torch.from_numpy(half_size(image)[None])),
+                *cloning_state([moment], self.shape),
+            )
             bound = MAX_DEVIATIONS * self._network.coefficient_scale
             coefficients = self._network(batch).clamp(-bound, bound)
             chunk = self._network.codec.decode(coefficients, batch.task, batch.slot)[0]

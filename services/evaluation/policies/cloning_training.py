@@ -223,10 +223,9 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
                 frame.append(len(newest) - 1)
                 inputs.append(
                     CloningInput(
-                        item.moments[0].image, moment.image, moment.tactile_kpa, item.anchor,
-                        reached, measured, step, item.task,
+                        moment.tactile_kpa, item.anchor, reached, measured, step, item.task
                     )
-                )  # fmt: skip
+                )
         begins.append(len(inputs))
     counts = torch.tensor(begins).diff()
     return Decisions(

@@ -12,9 +12,7 @@ from dextouch.hands.actions import AnchorPoses, pose_to_9d
 from services.evaluation.policies.behaviour_cloning import (
     BehaviourCloningPolicy,
     ChunkCodec,
-    CloningInput,
     CloningShape,
-    cloning_batch,
     from_world,
     half_size,
     in_world,
@@ -140,16 +138,11 @@ def test_half_an_image_holds_the_means_of_its_pixels():
 
 def test_an_answer_does_not_depend_on_the_others_of_a_batch(policy_checkpoint):
     policy = BehaviourCloningPolicy(policy_checkpoint)
-    moments = [
-        CloningInput(
-            item.moments[0].image, item.moments[step].image, item.moments[step].tactile_kpa,
-            item.anchor, item.measured[step], step == 0, step, item.task,
-        )
-        for item in episodes(range(3)) for step in (0, 32)
-    ]  # fmt: skip
+    decisions = decisions_of(episodes(range(3)), policy.shape)
+    index = torch.arange(0, len(decisions), 8)
     with torch.no_grad():
-        together = policy._network(cloning_batch(moments, policy.shape))
-        alone = [policy._network(cloning_batch([moment], policy.shape)) for moment in moments]
+        together = policy._network(decisions.batch(index))
+        alone = [policy._network(decisions.batch(one[None])) for one in index]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-4, atol=1e-4)
 
 
