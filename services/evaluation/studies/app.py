@@ -180,12 +180,8 @@ class RolloutQuery(FrozenModel):
 
     def matches(self, rollout: StudyRollout) -> bool:
         """Whether a rollout is asked for."""
-        pairs = (
-            (self.world, rollout.world),
-            (self.task, rollout.task),
-            (self.policy, rollout.policy),
-        )
-        is_named = all(wanted is None or wanted == found for wanted, found in pairs)
+        names = ("world", "task", "policy")
+        is_named = all(getattr(self, name) in (None, getattr(rollout, name)) for name in names)
         return is_named and (rollout.disagrees or not self.disagreements)
 
 
