@@ -157,15 +157,10 @@ def undecided_note(row: Mapping[str, Any], name: str) -> str:
 
 def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
     """Seconds of every stage."""
-    longest = max((float(s["seconds"]) for s in stages), default=1.0) or 1.0
-    return [
-        Bar(
-            str(s["name"]).replace("_", " ").capitalize(),
-            float(s["seconds"]),
-            float(s["seconds"]) / longest,
-        )
-        for s in stages
-    ]
+    names = [str(stage["name"]).replace("_", " ").capitalize() for stage in stages]
+    seconds = [float(stage["seconds"]) for stage in stages]
+    longest = max(seconds, default=1.0) or 1.0
+    return [Bar(name, took, took / longest) for name, took in zip(names, seconds, strict=True)]
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
