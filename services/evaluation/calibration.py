@@ -263,7 +263,7 @@ def milestone_areas(
         mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
         if not mine:
             continue
-        odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
+        odds = probe.log_odds([_as_seen(e.final) for e in mine])
         for index, name in enumerate(names):
             outcomes = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
             if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
@@ -327,11 +327,11 @@ def final_endings(
     """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
     mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
     success = np.array([e.success for e in mine], dtype=bool)
-    return [_as_seen(e.final, kind) for e in mine], success
+    return [_as_seen(e.final) for e in mine], success
 
 
-def _as_seen(ending: Ending, kind: str) -> Ending:
-    return replace(ending, object_poses=None) if kind == TRUE and not ending.imagined else ending
+def _as_seen(ending: Ending) -> Ending:
+    return ending if ending.imagined else replace(ending, object_poses=None)
 
 
 def _with_poses_only(
