@@ -5,6 +5,7 @@ the world model, their actions show how far its verdicts can be trusted; policie
 same first observations are scored by the same judge.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -77,10 +78,10 @@ def read_takes(
     """
     readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
     takes: list[RecordedTake] = []
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for reader in readers:
         task = reader.attributes.task
-        counts[task] = counts.get(task, 0) + 1
+        counts[task] += 1
         if most is None or counts[task] <= most:
             takes.append(_read_take(reader, number=len(takes)))
     return takes
