@@ -353,7 +353,8 @@ class BehaviourCloningPolicy:
         )
         with torch.no_grad():
             batch = CloningBatch(
-                scaled_images(torch.from_numpy(self._first_image[None])),
+                # A copy, since images of observations may be read-only.
+                scaled_images(torch.tensor(self._first_image[None])),
                 torch.zeros(1, dtype=torch.long),
                 scaled_images(torch.from_numpy(half_size(image)[None])),
                 *cloning_state([moment], self.shape),
