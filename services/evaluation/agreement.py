@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.metrics import policy
 from services.evaluation.statistics import (
     Interval,
@@ -101,16 +100,8 @@ def task_agreement(
 ) -> tuple[Agreement, Draws]:
     """Agreement of one task, and the draws that its intervals are computed from.
 
-    Args:
-        policies: names, in the order of the scores.
-        scores: of at least two policies from at least two starts.
-        generator: source of draws and permutations.
-
-    Raises:
-        ShapeError: names and scores differ in number.
-        InvalidInputError: too few policies or starts.
+    Scores are those of the named policies, at least two, from at least two starts.
     """
-    _check_names(policies, scores)
     real, imagined = (known_mean(rollouts, axis=1) for rollouts in scores.by_rollout())
     draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
     without = {
@@ -132,16 +123,8 @@ def pooled_agreement(
     A pooled correlation also rewards separating easy from hard tasks; read it together with those
     of the tasks. It is undefined for fewer than three policies, since their tasks alone would
     decide it. Permutations assign policies within each task only, and `without` omits a policy in
-    every task.
-
-    Args:
-        policies: names, the same in every task.
-        tasks: scores of each task.
-        draws: those of `task_agreement`.
-        generator: source of permutations.
+    every task. `policies` are the same in every task, and `draws` those of `task_agreement`.
     """
-    for scores in tasks:
-        _check_names(policies, scores)
     means = [[known_mean(rollouts, axis=1) for rollouts in scores.by_rollout()] for scores in tasks]
     real, imagined = (np.array([pair[side] for pair in means]) for side in (0, 1))
     joined = Draws(
@@ -153,13 +136,6 @@ def pooled_agreement(
     }
     chance = chance_of_correlation(list(real), list(imagined), generator)
     return Agreement(_figures(real, imagined, joined), without, chance)
-
-
-def _check_names(policies: Sequence[str], scores: MatchedScores) -> None:
-    if len(policies) != scores.num_policies:
-        raise ShapeError(
-            f"agreement: got {len(policies)} names and scores of {scores.num_policies} policies"
-        )
 
 
 def _joined(draws: Sequence[ScoreDraws]) -> ScoreDraws:
@@ -225,15 +201,8 @@ def chance_of_correlation(
     """One-sided p value of Pearson's r over all assignments of policies, within each task.
 
     Exact up to `MAX_PERMUTATIONS` assignments; beyond, that many are drawn and the true one is
-    counted among them.
-
-    Args:
-        real: mean scores [policies] of each task.
-        imagined: mean scores of the same policies.
-        generator: source of drawn assignments.
-
-    Returns:
-        The p value; NaN where the correlation is undefined.
+    counted among them. `real` and `imagined` are mean scores [policies] of each task; NaN where
+    their correlation is undefined.
     """
     flat = np.concatenate(real)
     if min(map(len, real)) < policy.MIN_POLICIES:
@@ -270,12 +239,7 @@ def paired_differences(
 
     The interval is that of Bonett and Price (2012) for paired rates, which adds one difference of
     +1 and one of −1; for graded scores in 0 … 1 the same two are added.
-
-    Raises:
-        InvalidInputError: no starts.
     """
-    if rollouts.shape[1] < 1:
-        raise InvalidInputError("paired differences: got no starts, expected at least one")
     found = []
     for first, second in itertools.combinations(range(len(policies)), 2):
         paired = rollouts[first] - rollouts[second]

@@ -76,12 +76,8 @@ def fit_calibration(
 
     Platt scaling with his targets (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit finite
     for endings that are separated without error (Platt 1999), and a weak prior towards the
-    network's own odds for small samples.
-
-    Args:
-        log_odds: [n] log odds from the network.
-        success: [n] outcomes.
-        risk: allowed share of errors among the decided endings.
+    network's own odds for small samples. `log_odds` [n] are those of the network, `success` [n] the
+    outcomes; `risk` is the allowed share of errors among the decided endings.
 
     Raises:
         InvalidInputError: only one outcome, or a risk outside 0 … 1.
@@ -116,12 +112,9 @@ def fit_combination(
     the risk, so it decides as many endings as possible. Where fewer than `LEAST_DECIDED` would be
     decided, twice the risk is allowed; where no band keeps that, nothing is decided.
 
-    Args:
-        probe: [n] calibrated probabilities of the classifier.
-        world: [n] the world's own probabilities.
-        success: [n] outcomes.
-        risk: allowed share of errors among the decided endings.
-        margin: of `Combination`.
+    `probe` [n] are calibrated probabilities of the classifier, `world` [n] the world's own, and
+    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings, and
+    `margin` that of `Combination`.
 
     Raises:
         InvalidInputError: no endings, or arrays of different lengths.
@@ -270,7 +263,7 @@ def milestone_areas(
         mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
         if not mine:
             continue
-        odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
+        odds = probe.log_odds([_as_seen(e.final) for e in mine])
         for index, name in enumerate(names):
             outcomes = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
             if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
@@ -334,11 +327,11 @@ def final_endings(
     """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
     mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
     success = np.array([e.success for e in mine], dtype=bool)
-    return [_as_seen(e.final, kind) for e in mine], success
+    return [_as_seen(e.final) for e in mine], success
 
 
-def _as_seen(ending: Ending, kind: str) -> Ending:
-    return replace(ending, object_poses=None) if kind == TRUE and not ending.imagined else ending
+def _as_seen(ending: Ending) -> Ending:
+    return ending if ending.imagined else replace(ending, object_poses=None)
 
 
 def _with_poses_only(

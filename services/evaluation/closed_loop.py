@@ -75,16 +75,9 @@ def evaluate(
 ) -> ClosedLoopReport:
     """Roll out every policy from every start in every world.
 
-    Args:
-        real: the world that reports success itself.
-        imagined: worlds to compare with it, by their names in the report; may be empty.
-        policies: by their names in the report.
-        plan: tasks, seeds and length.
-        probe: classifier of imagined success.
-        keep: called with every outcome as soon as it is known.
-
-    Returns:
-        The scores, and the rollouts that failed with their errors.
+    The real world reports success itself; imagined worlds, of which there may be none, and policies
+    are given by their names in the report. `keep` is called with every outcome as soon as it is
+    known.
 
     Raises:
         ConflictError: a start was trained on.
@@ -168,14 +161,9 @@ class PlayedRollout:
 class RolloutRunner:
     """Runs rollouts one at a time; not thread-safe, as its connections are not.
 
-    Args:
-        worlds: the real world and the imagined ones.
-        probe: success classifier of all worlds that have none of their own.
-        num_steps: steps of a rollout on the model grid.
-        shows_all: whether the head camera's images of all steps are requested. Otherwise worlds
-            render only the images that the policy uses, and the ending.
-        own_probes: success classifiers that were calibrated for single worlds, by world.
-        rubrics: by task.
+    `own_probes` are success classifiers that were calibrated for single worlds, by world; `probe`
+    judges all others. With `shows_all` the head camera's images of all steps are requested;
+    otherwise worlds render only the images that the policy uses, and the ending.
     """
 
     worlds: StudyWorlds
@@ -193,17 +181,9 @@ class RolloutRunner:
         world: str,
         repeat: int = 0,
     ) -> tuple[Outcome, PlayedRollout | None]:
-        """Play and score one rollout; an error becomes a failure with its reason.
+        """Outcome of one rollout of a policy, and what happened unless it failed.
 
-        Args:
-            start: where it begins.
-            actor: the policy.
-            policy: its name.
-            world: name of the world.
-            repeat: number of the repeat; imagined worlds give each its own noise.
-
-        Returns:
-            Its outcome, and what happened unless it failed.
+        An error becomes a failure with its reason. Imagined worlds give each repeat its own noise.
         """
         if isinstance(start, FailedStart):
             return rollout_failure(start.error, start, policy, world, repeat), None
@@ -296,12 +276,8 @@ class RolloutRunner:
     ) -> Iterator[Observation]:
         """Advance by a chunk; images, which take most of the time, only where they are needed.
 
-        Args:
-            rollout: the rollout.
-            chunk: actions to execute.
-            left: steps to the end of the rollout, including this chunk.
-            looks: attribute of the policy; see `dextouch.clients.Policy`.
-            multiple: of the world's chunks.
+        `left` is the number of steps to the end of the rollout, including this chunk, `looks` the
+        attribute of the policy (`dextouch.clients.Policy`), `multiple` that of the world's chunks.
         """
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or looks is True or (looks and is_last):

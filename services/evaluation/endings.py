@@ -113,11 +113,7 @@ class Ending:
     ) -> "Ending":
         """Ending shown by the last observation of a rollout.
 
-        Args:
-            observation: the last one.
-            task: of the rollout.
-            imagined: whether a world model imagined it.
-            uncertainty: of the whole rollout; None if it has no observation but this one.
+        `uncertainty` is that of the whole rollout; None if it has no observation but this one.
 
         Raises:
             InvalidInputError: fewer than three steps.
@@ -194,11 +190,9 @@ class EndingEpisode:
 
 
 def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX) -> EndingEpisode:
-    """Endings of one stored robot episode; only the steps shown are decoded.
+    """Endings of one stored robot episode that has what is `JUDGED`.
 
-    Args:
-        reader: the episode; it must have what is `JUDGED`.
-        image_px: side that the middle square of larger images is scaled to.
+    Only the steps shown are decoded; the middle square of larger images is scaled to `image_px`.
 
     Raises:
         InvalidInputError: the outcome is unknown.
@@ -261,11 +255,8 @@ def read_ending_episodes(
 ) -> list[EndingEpisode]:
     """Read the robot episodes of some stores that can be judged, with their endings.
 
-    Args:
-        stores: stores to read; true and imagined episodes may be mixed.
-        tasks: tasks to read; empty for all.
-        splits: splits of their scenes; empty for all.
-        image_px: side that the middle square of larger images is scaled to.
+    True and imagined episodes may be mixed. `tasks` and `splits` of scenes are empty for all; the
+    middle square of larger images is scaled to `image_px`.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.

@@ -131,11 +131,6 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
     """
     image = np.ascontiguousarray(head_image, dtype=np.uint8)
     tactile = np.ascontiguousarray(tactile_kpa, dtype="<f4")
-    if image.ndim != 3 or tactile.shape != (2, 320):
-        raise InvalidInputError(
-            f"start: got image {image.shape} and tactile {tactile.shape}, "
-            "expected one image [h, w, 3] and [2, 320]"
-        )
     digest = hashlib.sha256(repr((image.shape, tactile.shape)).encode())
     digest.update(image.tobytes())
     digest.update(tactile.tobytes())
@@ -143,15 +138,10 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
 
 
 def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str], what: str) -> None:
-    """Raise if a start of the evaluation was trained on.
-
-    Args:
-        digests: digests of the evaluation's starts.
-        trained_on: digests of the first observations of the training episodes.
-        what: the trained network, for the error message.
+    """Refuse an evaluation whose starts have digests of starts that a network was trained on.
 
     Raises:
-        ConflictError: a start of the evaluation was trained on.
+        ConflictError: there are such starts; `what` is the network.
     """
     shared = sorted(set(digests) & set(trained_on))
     if shared:

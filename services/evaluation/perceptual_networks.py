@@ -306,8 +306,7 @@ _WEIGHTED: Final[tuple[tuple[str, str, Better, Of, tuple[str, ...], _Measure | s
 def weighted_metrics(folder: Path | None) -> list[Metric]:
     """Prediction metrics that need pretrained networks, by their own definitions or not at all.
 
-    Args:
-        folder: of weights; metrics whose weights it does not have say so.
+    Metrics whose weights are not in the folder say so.
     """
     networks = None if folder is None else PerceptualNetworks(folder)
     found = []

@@ -7,6 +7,7 @@ over windows of one chunk, or over whole open-loop rollouts.
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +32,6 @@ from services.evaluation.prediction_scenes import (
     standing_still,
     trajectory_accuracy,
     warped,
-    with_instruction,
 )
 from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
@@ -44,40 +44,26 @@ _PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
 Figures = dict[str, dict[str, float | None]]
 
 
-def _of_images(function: Callable[..., float]) -> Callable[[Pairs], float]:
+def _of_images(function: Callable[..., float], pairs: Pairs) -> float:
     """Mean over images."""
-
-    def measure(pairs: Pairs) -> float:
-        counts = [len(future.images) for _, future in pairs]
-        values = [
-            function(predicted=future.images, true=scene.truth.images) for scene, future in pairs
-        ]
-        return float(np.average(values, weights=counts))
-
-    return measure
+    counts = [len(future.images) for _, future in pairs]
+    values = [function(predicted=future.images, true=one.truth.images) for one, future in pairs]
+    return float(np.average(values, weights=counts))
 
 
-def _of_touch(function: Callable[..., float]) -> Callable[[Pairs], float]:
+def _of_touch(function: Callable[..., float], pairs: Pairs) -> float:
     """Over all steps, hands and taxels together."""
-
-    def measure(pairs: Pairs) -> float:
-        return function(
-            predicted_kpa=np.concatenate([future.tactile_kpa for _, future in pairs]),
-            true_kpa=np.concatenate([scene.truth.tactile_kpa for scene, _ in pairs]),
-        )
-
-    return measure
+    return function(
+        predicted_kpa=np.concatenate([future.tactile_kpa for _, future in pairs]),
+        true_kpa=np.concatenate([scene.truth.tactile_kpa for scene, _ in pairs]),
+    )
 
 
-def _of_geometry(function: Callable[..., float]) -> Callable[[Pairs], float]:
+def _of_geometry(function: Callable[..., float], pairs: Pairs) -> float:
     """Over the scenes whose true geometry is known."""
-
-    def measure(pairs: Pairs) -> float:
-        return function(
-            [(one.geometry, future.images) for one, future in pairs if one.geometry is not None]
-        )
-
-    return measure
+    return function(
+        [(one.geometry, future.images) for one, future in pairs if one.geometry is not None]
+    )
 
 
 def _object_error(pairs: Pairs) -> float:
@@ -96,39 +82,41 @@ def _object_error(pairs: Pairs) -> float:
 
 # A new one needs its name in `prediction_names`, too, which command lines read without networks.
 METRICS: Final = {metric.name: metric for metric in (
-    Metric("psnr", "PSNR", "dB", "higher", "images", _of_images(image_metrics.psnr),
+    Metric("psnr", "PSNR", "dB", "higher", "images", partial(_of_images, image_metrics.psnr),
            "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100"),
-    Metric("ssim", "SSIM", "", "higher", "images", _of_images(image_metrics.ssim),
+    Metric("ssim", "SSIM", "", "higher", "images", partial(_of_images, image_metrics.ssim),
            "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones"),
     Metric("trajectory_accuracy", "Trajectory Accuracy", "", "higher", "geometry",
-           _of_geometry(trajectory_accuracy),
+           partial(_of_geometry, trajectory_accuracy),
            "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
            "a tolerance of 5 % of the image's width; 1 for equal trajectories"),
     Metric("geometry_error", "Geometry Error", "", "lower", "geometry",
-           _of_geometry(geometry_error),
+           partial(_of_geometry, geometry_error),
            "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
            "scale"),
     Metric("tactile_psnr", "PSNR of taxels", "dB", "higher", "touch",
-           _of_touch(tactile_metrics.psnr),
+           partial(_of_touch, tactile_metrics.psnr),
            f"of the error over all taxels together, with a peak of {_PEAK}"),
     Metric("tactile_ssim", "SSIM of taxels", "", "higher", "touch",
-           _of_touch(tactile_metrics.ssim),
+           partial(_of_touch, tactile_metrics.ssim),
            f"windows of 4 by 4 taxels in each pad, range 0 … {_PEAK}; 1 for equal pads"),
-    Metric("tactile_mse", "MSE", "kPa²", "lower", "touch", _of_touch(tactile_metrics.mse),
+    Metric("tactile_mse", "MSE", "kPa²", "lower", "touch",
+           partial(_of_touch, tactile_metrics.mse),
            "mean squared error over all taxels"),
-    Metric("tactile_mae", "MAE", "kPa", "lower", "touch", _of_touch(tactile_metrics.mae),
+    Metric("tactile_mae", "MAE", "kPa", "lower", "touch",
+           partial(_of_touch, tactile_metrics.mae),
            "mean absolute error over all taxels"),
     Metric("contact_mae", "Contact-MAE", "kPa", "lower", "touch",
-           _of_touch(tactile_metrics.contact_mae),
+           partial(_of_touch, tactile_metrics.contact_mae),
            "mean absolute error over taxels in true contact (at least 2 kPa)"),
     Metric("contact_iou", "Contact-IoU", "", "higher", "touch",
-           _of_touch(tactile_metrics.contact_iou),
+           partial(_of_touch, tactile_metrics.contact_iou),
            "intersection over union of taxels in contact; 1 if neither side has any"),
     Metric("contact_f1", "Contact-F1", "", "higher", "touch",
-           _of_touch(tactile_metrics.contact_f1),
+           partial(_of_touch, tactile_metrics.contact_f1),
            "F1 of taxels in contact; 1 if neither side has any"),
     Metric("pad_contact_f1", "Contact-F1 of pads", "", "higher", "touch",
-           _of_touch(tactile_metrics.pad_contact_f1),
+           partial(_of_touch, tactile_metrics.pad_contact_f1),
            "F1 of fingertips and palms in contact; 1 if neither side has any"),
     Metric("object_error", "Object error", "mm", "lower", "objects", _object_error,
            "median error at the last step of objects that moved by 1 cm or more, whose true poses "
@@ -186,11 +174,7 @@ def measure_prediction(
 ) -> PredictionResult:
     """Errors of predicted futures of scenes that the world was not trained on.
 
-    Args:
-        world: to measure.
-        scenes: recorded futures.
-        metrics: of `METRICS` or `all_metrics`.
-        baselines: names of `BASELINES`; others are not computed.
+    `metrics` are some of `METRICS` or `all_metrics`, and `baselines` names of `BASELINES`.
 
     Raises:
         InvalidInputError: no scene.
@@ -252,7 +236,7 @@ def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene
         sentence = "" if source == "no_instruction" else other_instruction(scene, scenes)
         if sentence is None:
             return "no other task has another instruction"
-        scene = with_instruction(scene, sentence)
+        scene = replace(scene, start=replace(scene.start, instruction=sentence))
     return imagine(world, scene, actions)
 
 

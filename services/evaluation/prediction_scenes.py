@@ -1,7 +1,7 @@
 """Recorded futures that predictions of a world are compared with, their geometry, and baselines."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -298,11 +298,6 @@ def other_instruction(scene: Scene, scenes: Sequence[Scene]) -> str | None:
     others = tasks[tasks.index(scene.start.task) + 1 :] + tasks[: tasks.index(scene.start.task)]
     sentences = [of_task[task] for task in others if of_task[task] != scene.start.instruction]
     return sentences[0] if sentences else None
-
-
-def with_instruction(scene: Scene, sentence: str) -> Scene:
-    """The scene, begun with another instruction."""
-    return replace(scene, start=replace(scene.start, instruction=sentence))
 
 
 def standing_still(scene: Scene, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:

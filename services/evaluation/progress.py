@@ -1,7 +1,5 @@
 """Progress of a long job on standard error: a bar on a terminal, lines elsewhere."""
 
-from types import TracebackType
-
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
@@ -10,23 +8,14 @@ from dextouch.command_line import ProgressLines
 
 
 class Progress:
-    """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds.
-
-    Args:
-        title: name of the job.
-        total: number of steps.
-    """
+    """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds."""
 
     def __init__(self, title: str, total: int) -> None:
         console = Console(stderr=True)
         self._lines = ProgressLines(title)
         self._total, self._done = total, 0
-        columns = (
-            TextColumn(title),
-            BarColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-        )
+        text = TextColumn("{task.fields[text]}")
+        columns = (TextColumn(title), BarColumn(), text, TimeRemainingColumn())
         self._bar = RichProgress(*columns, console=console, disable=not console.is_terminal)
         self._task = self._bar.add_task(title, total=total, text="")
 
@@ -34,12 +23,7 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
     def advance(self, **figures: float) -> None:

@@ -5,6 +5,7 @@ the world model, their actions show how far its verdicts can be trusted; policie
 same first observations are scored by the same judge.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -69,21 +70,18 @@ def read_takes(
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
 
-    Args:
-        stores: stores to read.
-        tasks: tasks to read; empty for all.
-        splits: splits of their scenes; empty for all.
-        most: takes a task, the first by their ids; None for all.
+    `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
+    read, None for all.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.
     """
     readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
     takes: list[RecordedTake] = []
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for reader in readers:
         task = reader.attributes.task
-        counts[task] = counts.get(task, 0) + 1
+        counts[task] += 1
         if most is None or counts[task] <= most:
             takes.append(_read_take(reader, number=len(takes)))
     return takes

@@ -387,13 +387,7 @@ def undefined_by(num_policies: int) -> str:
 def task_comments(
     rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], world: str
 ) -> list[str]:
-    """Sentences about one task.
-
-    Args:
-        rows: rows of the task's policies, from `ClosedLoopReport.policy_rows`.
-        agreement: figures of the task, from `ClosedLoopReport.agreement`.
-        world: name of the imagined world.
-    """
+    """Sentences about one task, from its rows of `policy_rows` and its figures of `agreement`."""
     both = f"both worlds (real and {world})"
     undecided = _undecided(rows, agreement["not_comparable"], world)
     if agreement["num_starts"] == 0:

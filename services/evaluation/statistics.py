@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError
 from dextouch.metrics.policy import MIN_POLICIES
 
 # Of all intervals of evaluations; texts and documents say 95 %.
@@ -40,11 +40,9 @@ class Interval:
 
 
 def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
-    """Probability that a success scores above a failure; ties count half.
+    """Probability that a success scores above a failure, by scores and outcomes [n].
 
-    Args:
-        scores: [n], higher for more certain success.
-        success: [n] outcomes.
+    Ties count half.
 
     Raises:
         InvalidInputError: only successes, or only failures.
@@ -99,16 +97,9 @@ def wilson_interval(successes: int | float, trials: int) -> Interval:
 def bootstrap_mean_interval(
     values: np.ndarray, generator: np.random.Generator, *, num_draws: int = 1000
 ) -> Interval:
-    """95 % percentile interval of the mean of independent values [n].
-
-    Raises:
-        ShapeError: not one axis with at least one value.
-    """
-    checked = np.asarray(values, dtype=np.float64)
-    if checked.ndim != 1 or len(checked) == 0:
-        raise ShapeError(f"bootstrap: got shape {checked.shape}, expected [n ≥ 1]")
-    drawn = generator.integers(0, len(checked), (num_draws, len(checked)))
-    return central_interval(checked[drawn].mean(axis=1))
+    """95 % percentile interval of the mean of independent values [n ≥ 1]."""
+    drawn = generator.integers(0, len(values), (num_draws, len(values)))
+    return central_interval(values[drawn].mean(axis=1))
 
 
 def central_interval(draws: np.ndarray) -> Interval:
@@ -130,10 +121,6 @@ def start_counts(num_starts: int, generator: np.random.Generator, *, num_draws: 
 
     All rollouts of a start are drawn together, since they share its objects and errors.
     """
-    if num_starts < 1 or num_draws < 1:
-        raise ShapeError(
-            f"bootstrap: got {num_starts} starts and {num_draws} draws, expected at least one each"
-        )
     drawn = generator.integers(0, num_starts, (num_draws, num_starts))
     counts = np.zeros((num_draws, num_starts))
     np.add.at(counts, (np.arange(num_draws)[:, None], drawn), 1.0)
@@ -177,47 +164,10 @@ class MatchedScores:
     `real` and `imagined` are [policies, starts, raters]; an absent rater is NaN. Every real rollout
     has at least one; an imagined one without any is undecided and counts in no mean, and every
     policy has one that is not. Success is a score of one rater, 0 or 1.
-
-    Raises:
-        ShapeError: different policies or starts, or nothing to compare.
-        InvalidInputError: a score outside 0 … 1, a real rollout that nobody rated, or a policy
-            without any imagined score.
     """
 
     real: Float64[np.ndarray, "_ _ _"]
     imagined: Float64[np.ndarray, "_ _ _"]
-
-    def __post_init__(self) -> None:
-        shapes = self.real.shape, self.imagined.shape
-        if shapes[0][:2] != shapes[1][:2] or 0 in (*shapes[0], *shapes[1]):
-            raise ShapeError(
-                f"scores: got shapes {shapes[0]} and {shapes[1]}, expected [policies, starts, "
-                "raters] with the same policies and starts, at least one each"
-            )
-        for world, scores in (("real", self.real), ("imagined", self.imagined)):
-            known = np.isfinite(scores)
-            rated = known.any(axis=2)
-            if world == "real" and not rated.all():
-                policy, start = np.argwhere(~rated)[0]
-                raise InvalidInputError(
-                    f"scores: policy {policy} from start {start} in the real world has no "
-                    "score; leave the start out in both worlds"
-                )
-            if not rated.any(axis=1).all():
-                raise InvalidInputError(
-                    f"scores: policy {np.argmin(rated.any(axis=1))} has no imagined score; leave "
-                    "the policy out in both worlds"
-                )
-            if ((scores[known] < 0) | (scores[known] > 1)).any():
-                raise InvalidInputError(
-                    f"scores of the {world} world: got {np.nanmin(scores)} … {np.nanmax(scores)}, "
-                    "expected 0 … 1; divide points by the rubric's maximum"
-                )
-
-    @property
-    def num_policies(self) -> int:
-        """Number of policies."""
-        return len(self.real)
 
     def by_rollout(
         self,
@@ -289,15 +239,9 @@ def posterior_scores(
     integrated out; spreads and correlation are integrated over a grid, so nothing is iterated and
     nothing has to converge. Draws are clipped to 0 … 1.
 
-    Raises:
-        InvalidInputError: fewer than two policies or two starts.
+    There are at least two policies and two starts.
     """
-    num_policies, num_starts = scores.real.shape[:2]
-    if min(num_policies, num_starts) < 2:
-        raise InvalidInputError(
-            f"posterior of scores: got {num_policies} policies and {num_starts} starts, expected "
-            "at least two of each"
-        )
+    num_policies = len(scores.real)
     rollouts = np.concatenate(scores.by_rollout())
     observed, noise = known_mean(rollouts, axis=1), noise_covariance(rollouts)
     grid = _Grid.of(num_policies, observed, noise)

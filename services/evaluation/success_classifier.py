@@ -282,9 +282,6 @@ class Verdict:
 class SuccessClassifier:
     """A trained probe.
 
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
-
     Raises:
         InvalidInputError: the weights do not match the shape in the metadata.
     """
@@ -401,11 +398,8 @@ class SuccessClassifier:
     def _judged(self, ending: Ending, probability: float) -> tuple[float, str | None]:
         """Probability of success by all that is known, and why nothing is decided from it.
 
-        The bands are those of the checkpoint, fitted by `calibration`.
-
-        Args:
-            ending: what is judged.
-            probability: calibrated, of the probe alone.
+        The bands are those of the checkpoint, fitted by `calibration`; `probability` is the
+        calibrated one of the probe alone.
         """
         band = self.calibration(ending.task, imagined=ending.imagined).band
         contradiction = unknown_size = None

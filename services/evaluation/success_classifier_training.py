@@ -4,7 +4,7 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 (for the metrics in the checkpoint).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -100,11 +100,7 @@ def labelled_endings(
 
     Every episode contributes its end and the step before; an early ending, as a failure with a
     tenth of the weight of all failures; and a middle ending where its milestones are known.
-
-    Args:
-        episodes: episodes with known success.
-        shape: shape of the probe.
-        imagined_share: weight of a task's imagined endings relative to its true ones.
+    `imagined_share` is the weight of a task's imagined endings relative to its true ones.
 
     Raises:
         InvalidInputError: a task has only one outcome.
@@ -209,7 +205,11 @@ class ClassifierSets:
         development: Sequence[EndingEpisode] = (),
         held_out: Sequence[EndingEpisode] = (),
     ) -> "ClassifierSets":
-        """The given sets; missing ones are taken from a share of the scenes of `episodes`."""
+        """The given sets; missing ones are taken from a share of the scenes of `episodes`.
+
+        Raises:
+            ConflictError: a held-out or development episode starts like a training episode.
+        """
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
             training, tested = split_by_scene(training, held_out_share=settings.held_out_share)
@@ -217,29 +217,18 @@ class ClassifierSets:
             training, calibrated = split_by_scene(
                 training, held_out_share=settings.development_share, salt="development "
             )
-        return cls(training, calibrated, tested)
+        sets = cls(training, calibrated, tested)
+        learned = {e.start_digest for e in training}
+        for others, trained_on in ((calibrated, learned), (tested, sets.training_starts)):
+            digests = (e.start_digest for e in others)
+            what = "the success classifier"
+            refuse_training_starts(digests, trained_on=trained_on, what=what)
+        return sets
 
     @property
     def training_starts(self) -> tuple[str, ...]:
         """Digests of the starts of the weights' training or the calibration."""
         return tuple(sorted({e.start_digest for e in (*self.training, *self.development)}))
-
-    def check(self) -> None:
-        """Raise if two sets share a start.
-
-        Raises:
-            ConflictError: a held-out or development episode starts like a training episode.
-        """
-        learned = {e.start_digest for e in self.training}
-        for others, trained_on in (
-            (self.development, learned),
-            (self.held_out, self.training_starts),
-        ):
-            refuse_training_starts(
-                (e.start_digest for e in others),
-                trained_on=trained_on,
-                what="the success classifier",
-            )
 
     def check_measurable(self) -> None:
         """Check before training that every task can be measured.
@@ -268,16 +257,10 @@ def train_success_classifier(
 ) -> Checkpoint:
     """Train a probe to predict success from the end of a rollout.
 
-    Args:
-        episodes: true and imagined episodes with known success.
-        settings: training settings.
-        command: command to store in the checkpoint.
-        development: episodes to calibrate on; default: a share of the scenes of `episodes`.
-        held_out: episodes to evaluate on; default: a share of the scenes of `episodes`.
-        jobs: processes, each of which trains one task at a time; the weights do not depend on it.
-
-    Returns:
-        Weights and calibration; the metadata holds the metrics on held-out episodes.
+    `development` are the episodes to calibrate on, and `held_out` those of the metrics in the
+    metadata; by default each is a share of the scenes of `episodes`, true and imagined ones. Each
+    of `jobs` processes trains one task at a time; the weights do not depend on their number. The
+    checkpoint stores the `command`.
 
     Raises:
         ConflictError: a held-out or development episode starts like a training episode.
@@ -285,7 +268,6 @@ def train_success_classifier(
     """
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
-    sets.check()
     shape = ClassifierShape(
         tasks=tuple(sorted({e.task for e in sets.training})),
         image_size_px=_image_size_px(sets.training),
@@ -305,7 +287,9 @@ def train_success_classifier(
     network.eval()
     metadata = _metadata(sets, settings, shape, command, cpu_s)
     plain = Checkpoint(metadata, network_tensors(network))
-    return _measured(_calibrated(plain, sets, settings), sets)
+    calibrated = _calibrated(plain, sets.development, settings)
+    figures = held_out_figures(SuccessClassifier(calibrated), sets.held_out)
+    return _with(calibrated, "metrics", figures)
 
 
 def calibrate_success_classifier(
@@ -317,11 +301,9 @@ def calibrate_success_classifier(
 ) -> Checkpoint:
     """Fit the probabilities and the bands of a trained probe anew, for another world model.
 
-    Args:
-        base: its weights and metrics are kept.
-        episodes: true and imagined ones of known success, that the weights were not trained on.
-        settings: allowed risks; all others have no effect.
-        command: command to store in the settings of the checkpoint, as `calibrated_by`.
+    The weights and metrics of `base` are kept; they were not trained on the episodes, true and
+    imagined ones. Of the settings only the allowed risks have an effect; those of the checkpoint
+    store the `command` as `calibrated_by`.
     """
     metadata = base.metadata
     names = {*metadata.training_episodes, *(e.episode_id for e in episodes)}
@@ -332,7 +314,7 @@ def calibrate_success_classifier(
         "settings": {**metadata.settings, "calibrated_by": command},
     }
     checkpoint = replace(base, metadata=metadata.model_copy(update=known))
-    return _calibrated(checkpoint, ClassifierSets((), episodes, ()), settings)
+    return _calibrated(checkpoint, episodes, settings)
 
 
 def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
@@ -359,7 +341,7 @@ def _metadata(
         settings={
             "shape": shape.model_dump(mode="json"),
             "training": settings.model_dump(),
-            "instructions": instructions_of(everything),
+            "instructions": instructions_of((e.task, e.instruction) for e in everything),
             "threshold": DECISION_THRESHOLD,
         },
         metrics={
@@ -373,41 +355,31 @@ def _metadata(
 
 
 def _calibrated(
-    checkpoint: Checkpoint, sets: ClassifierSets, settings: ClassifierSettings
+    checkpoint: Checkpoint, development: Sequence[EndingEpisode], settings: ClassifierSettings
 ) -> Checkpoint:
     """The checkpoint with all that is fitted to the development episodes."""
     probe = SuccessClassifier(checkpoint)
-    calibrations = fit_calibrations(probe, sets.development, risk=settings.risk)
-    calibrated = _with_settings(
-        checkpoint,
-        calibration={name: one.model_dump() for name, one in calibrations.items()},
-        told_milestones=classifiable_milestones(probe, sets.development),
-    )
+    calibrations = fit_calibrations(probe, development, risk=settings.risk)
+    fitted = {
+        "calibration": {name: one.model_dump() for name, one in calibrations.items()},
+        "told_milestones": classifiable_milestones(probe, development),
+    }
+    calibrated = _with(checkpoint, "settings", fitted)
     combinations = fit_combinations(
         SuccessClassifier(calibrated),
-        sets.development,
+        development,
         risk=settings.imagined_risk,
         margin=settings.contradiction_margin,
     )
-    return _with_settings(
-        calibrated, combination={name: one.model_dump() for name, one in combinations.items()}
-    )
+    joined = {name: one.model_dump() for name, one in combinations.items()}
+    return _with(calibrated, "settings", {"combination": joined})
 
 
-def _with_settings(checkpoint: Checkpoint, **added: object) -> Checkpoint:
+def _with(checkpoint: Checkpoint, part: str, added: Mapping[str, object]) -> Checkpoint:
+    """The checkpoint with more settings or metrics, as `part` says."""
     metadata = checkpoint.metadata
-    settings = {**metadata.settings, **added}
-    return replace(checkpoint, metadata=metadata.model_copy(update={"settings": settings}))
-
-
-def _measured(checkpoint: Checkpoint, sets: ClassifierSets) -> Checkpoint:
-    """The checkpoint with its metrics on the held-out episodes."""
-    figures = held_out_figures(SuccessClassifier(checkpoint), sets.held_out)
-    metadata = checkpoint.metadata
-    return replace(
-        checkpoint,
-        metadata=metadata.model_copy(update={"metrics": {**metadata.metrics, **figures}}),
-    )
+    update = {part: {**getattr(metadata, part), **added}}
+    return replace(checkpoint, metadata=metadata.model_copy(update=update))
 
 
 _Order = tuple[TaskNetwork, Labelled, ClassifierSettings, str]
@@ -465,13 +437,9 @@ def some_parts(
     settings: ClassifierSettings,
     generator: torch.Generator,
 ) -> ClassifierBatch:
-    """Add noise to the poses, and drop poses or images at random.
+    """Add noise to the poses of examples of one task, and drop poses or images at random.
 
-    Args:
-        batch: examples of one task.
-        object_std: [features], deviation of the task's pose features, the unit of the noise.
-        settings: dropout shares and noise level.
-        generator: source of randomness.
+    `object_std` [features] is the deviation of the task's pose features, the unit of the noise.
     """
     drawn = torch.rand(len(batch.task), generator=generator)
     both = batch.has_image & batch.has_objects

@@ -131,13 +131,8 @@ def optimized(
 ) -> Iterator[Budget]:
     """Train a network; yields the used budget after each step.
 
-    Args:
-        network: module to train.
-        loss: loss of a batch drawn with the generator.
-        settings: seed, learning rate and weight decay.
-        limits: largest number of steps, and CPU seconds.
-        title: name beside the progress bar.
-        max_gradient_norm: norm that gradients are clipped to; None: not clipped.
+    `loss` is that of a batch drawn with the generator; `limits` are the largest number of steps,
+    and CPU seconds. Gradients are clipped to `max_gradient_norm`, unless it is None.
     """
     num_steps, max_cpu_s = limits
     generator = torch.Generator().manual_seed(settings.seed)
@@ -152,22 +147,9 @@ def optimized(
             yield budget
 
 
-@runtime_checkable
-class Instructed(Protocol):
-    """Anything with a task and its instruction."""
-
-    @property
-    def task(self) -> str:
-        """Name of the task."""
-
-    @property
-    def instruction(self) -> str:
-        """Instruction of the task."""
-
-
-def instructions_of(demonstrations: Iterable[Instructed]) -> dict[str, str]:
-    """Instruction of every task, from its first episode."""
+def instructions_of(tasks: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """The first instruction of every task, from tasks and instructions of episodes."""
     found: dict[str, str] = {}
-    for item in demonstrations:
-        found.setdefault(item.task, item.instruction)
+    for task, instruction in tasks:
+        found.setdefault(task, instruction)
     return found

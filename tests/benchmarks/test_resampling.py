@@ -70,11 +70,6 @@ def test_draws_without_both_outcomes_are_undefined():
     assert np.isnan(mmrv_of_draws(np.ones((2, 1)), np.ones((2, 1)))).all()
 
 
-def test_no_starts_are_refused():
-    with pytest.raises(ShapeError, match="0 starts"):
-        start_counts(0, np.random.default_rng(0), num_draws=5)
-
-
 def test_an_interval_of_mostly_undefined_draws_is_none():
     draws = np.full(10, np.nan)
     draws[:5] = 0.5

@@ -45,6 +45,21 @@ _CHANNELS = (16, 24, 24)
 _TASK_FEATURES = 8
 
 
+class CloningShape(FrozenModel):
+    """Shape of the network; stored in the checkpoint."""
+
+    tasks: tuple[str, ...]
+    num_components: int = 48
+    hidden: int = 256
+    horizon_steps: int = 80
+    image_size_px: int = 64
+
+    @property
+    def num_slots(self) -> int:
+        """Time slots with a mean chunk of their own."""
+        return self.horizon_steps // SLOT_STEPS + 1
+
+
 @dataclass(frozen=True)
 class CloningBatch:
     """Inputs of the network; all images are in −0.5 … 0.5.
@@ -83,18 +98,14 @@ def phase_features(step: np.ndarray, *, horizon_steps: int) -> np.ndarray:
     return np.concatenate([np.sin(octaves), np.cos(octaves)], axis=1)
 
 
-class SpatialSoftmax(nn.Module):
-    """Expected image position, [n, 2c] in −1 … 1, of each of the feature maps [n, c, h, w]."""
-
-    def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        """Expected column and row of every channel."""
-        num, channels, height, width = maps.shape
-        attention = maps.reshape(num, channels, -1).softmax(dim=-1).reshape(maps.shape)
-        columns = torch.linspace(-1, 1, width)
-        rows = torch.linspace(-1, 1, height)
-        return torch.cat(
-            [(attention.sum(2) * columns).sum(-1), (attention.sum(3) * rows).sum(-1)], dim=1
-        )
+def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
+    """Expected columns and rows, [n, 2c] in −1 … 1, of each of the feature maps [n, c, h, w]."""
+    attention = maps.flatten(2).softmax(dim=-1).reshape(maps.shape)
+    columns = torch.linspace(-1, 1, maps.shape[3])
+    rows = torch.linspace(-1, 1, maps.shape[2])
+    return torch.cat(
+        [(attention.sum(2) * columns).sum(-1), (attention.sum(3) * rows).sum(-1)], dim=1
+    )
 
 
 class ChunkCodec(nn.Module):
@@ -109,10 +120,10 @@ class ChunkCodec(nn.Module):
     basis: torch.Tensor
     weights: torch.Tensor
 
-    def __init__(self, *, num_tasks: int, num_slots: int, num_components: int) -> None:
+    def __init__(self, shape: CloningShape) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(num_tasks, num_slots, CHUNK_SIZE))
-        self.register_buffer("basis", torch.zeros(num_components, CHUNK_SIZE))
+        self.register_buffer("mean", torch.zeros(len(shape.tasks), shape.num_slots, CHUNK_SIZE))
+        self.register_buffer("basis", torch.zeros(shape.num_components, CHUNK_SIZE))
         self.register_buffer("weights", torch.tensor(action_weights(), dtype=torch.float32))
 
     def fit(self, chunks: torch.Tensor, tasks: torch.Tensor, slots: torch.Tensor) -> None:
@@ -163,7 +174,6 @@ class CloningEye(nn.Module):
         self.fine = nn.Conv2d(second, third, 3, padding=1)
         # The relevant features depend on the task.
         self.wanted = nn.Linear(_TASK_FEATURES, first + second)
-        self.places = SpatialSoftmax()
 
     def forward(self, images: torch.Tensor, task: torch.Tensor) -> torch.Tensor:
         """Features [n, 48] of images [n, 3, h, w], for task features [n, 8]."""
@@ -171,7 +181,7 @@ class CloningEye(nn.Module):
         images = images.contiguous(memory_format=torch.channels_last)
         maps = torch.relu(self.coarse(images) + biases[0])
         maps = torch.relu(self.middle(maps) + biases[1])
-        return torch.as_tensor(self.places(self.fine(maps).float()))
+        return spatial_softmax(self.fine(maps).float())
 
 
 class CloningNetwork(nn.Module):
@@ -181,23 +191,21 @@ class CloningNetwork(nn.Module):
     pose_scale: torch.Tensor
     coefficient_scale: torch.Tensor
 
-    def __init__(self, *, num_tasks: int, num_slots: int, num_components: int, hidden: int) -> None:
+    def __init__(self, shape: CloningShape) -> None:
         super().__init__()
-        self.codec = ChunkCodec(
-            num_tasks=num_tasks, num_slots=num_slots, num_components=num_components
-        )
+        self.codec = ChunkCodec(shape)
         self.register_buffer("pose_mean", torch.zeros(NUM_POSE_FEATURES))
         self.register_buffer("pose_scale", torch.ones(NUM_POSE_FEATURES))
-        self.register_buffer("coefficient_scale", torch.ones(num_components))
-        self.task = nn.Embedding(num_tasks, _TASK_FEATURES)
+        self.register_buffer("coefficient_scale", torch.ones(shape.num_components))
+        self.task = nn.Embedding(len(shape.tasks), _TASK_FEATURES)
         self.first_eye = CloningEye()
         self.newest_eye = CloningEye()
         self.head = nn.Sequential(
-            nn.Linear(2 * CloningEye.num_features + STATE_DIM + _TASK_FEATURES, hidden),
+            nn.Linear(2 * CloningEye.num_features + STATE_DIM + _TASK_FEATURES, shape.hidden),
             nn.ReLU(),
-            nn.Linear(hidden, hidden),
+            nn.Linear(shape.hidden, shape.hidden),
             nn.ReLU(),
-            nn.Linear(hidden, num_components),
+            nn.Linear(shape.hidden, shape.num_components),
         )
 
     def forward(self, batch: CloningBatch) -> torch.Tensor:
@@ -222,66 +230,16 @@ class CloningNetwork(nn.Module):
         return state[:, _POSES]
 
 
-class CloningShape(FrozenModel):
-    """Shape of the network; stored in the checkpoint."""
-
-    tasks: tuple[str, ...]
-    num_components: int = 48
-    hidden: int = 256
-    horizon_steps: int = 80
-    image_size_px: int = 64
-
-    def network(self) -> CloningNetwork:
-        """Untrained network of this shape."""
-        return CloningNetwork(
-            num_tasks=len(self.tasks),
-            num_slots=self.num_slots,
-            num_components=self.num_components,
-            hidden=self.hidden,
-        )
-
-    @property
-    def num_slots(self) -> int:
-        """Time slots with a mean chunk of their own."""
-        return self.horizon_steps // SLOT_STEPS + 1
-
-
 @dataclass(frozen=True)
 class CloningInput:
-    """Input of the policy at one step."""
+    """Input of the policy at one step, beside images."""
 
-    first_image: UInt8[np.ndarray, "h w 3"]
-    image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: np.ndarray
     anchor: AnchorPoses
     reached: Float64[np.ndarray, "67"]
     reached_is_measured: bool
     step: int
     task: str
-
-
-def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> CloningBatch:
-    """Network tensors of inputs, for training and acting alike.
-
-    Raises:
-        UnknownNameError: a task that the network was not trained for.
-        InvalidInputError: images of another size.
-    """
-    size = (shape.image_size_px, shape.image_size_px, 3)
-    for item in inputs:
-        if item.task not in shape.tasks:
-            raise UnknownNameError("task of the cloned policy", item.task, list(shape.tasks))
-        if item.image.shape != size or item.first_image.shape != size:
-            raise InvalidInputError(
-                f"cloned policy: got images {item.first_image.shape} and {item.image.shape}, "
-                f"expected {size}"
-            )
-    return CloningBatch(
-        scaled_images(torch.from_numpy(np.stack([i.first_image for i in inputs]))),
-        torch.arange(len(inputs)),
-        scaled_images(torch.from_numpy(np.stack([half_size(i.image) for i in inputs]))),
-        *cloning_state(inputs, shape),
-    )
 
 
 def half_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "half_h half_w 3"]:
@@ -333,9 +291,6 @@ class BehaviourCloningPolicy:
     The only state between `reset` calls is the rollout's first image and anchor. Of an observation
     it needs the last step only (`looks`).
 
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
-
     Raises:
         InvalidInputError: the weights do not match the shape in the metadata.
     """
@@ -345,7 +300,7 @@ class BehaviourCloningPolicy:
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata
         self.shape = CloningShape.model_validate(checkpoint.metadata.settings["shape"])
-        self._network = self.shape.network()
+        self._network = CloningNetwork(self.shape)
         load_network(self._network, checkpoint)
         self._start: PolicyStart | None = None
         self._first_image: np.ndarray | None = None
@@ -383,11 +338,12 @@ class BehaviourCloningPolicy:
         if HEAD_CAMERA not in observation.images:
             raise UnknownNameError("camera", HEAD_CAMERA, list(observation.images))
         image = observation.images[HEAD_CAMERA][-1]
+        size = (self.shape.image_size_px, self.shape.image_size_px, 3)
+        if image.shape != size:
+            raise InvalidInputError(f"cloned policy: got images {image.shape}, expected {size}")
         if self._first_image is None:
             self._first_image = observation.images[HEAD_CAMERA][0]
         moment = CloningInput(
-            self._first_image,
-            image,
             observation.tactile_kpa[-1],
             self._start.anchor,
             observation.action_reached[-1],
@@ -396,7 +352,13 @@ class BehaviourCloningPolicy:
             self._start.task,
         )
         with torch.no_grad():
-            batch = cloning_batch([moment], self.shape)
+            batch = CloningBatch(
+                # A copy, since images of observations may be read-only.
+                scaled_images(torch.tensor(self._first_image[None])),
+                torch.zeros(1, dtype=torch.long),
+                scaled_images(torch.from_numpy(half_size(image)[None])),
+                *cloning_state([moment], self.shape),
+            )
             bound = MAX_DEVIATIONS * self._network.coefficient_scale
             coefficients = self._network(batch).clamp(-bound, bound)
             chunk = self._network.codec.decode(coefficients, batch.task, batch.slot)[0]

@@ -97,11 +97,10 @@ class CloningEpisode:
 def read_cloning_episode(
     reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
 ) -> CloningEpisode:
-    """Read one robot episode; only images at decision steps are decoded.
+    """Read one robot episode that has what is `IMITATED`.
 
-    Args:
-        reader: the episode; it must have what is `IMITATED`.
-        image_px: side that the middle square of larger images is scaled to.
+    Only images at decision steps are decoded, and the middle square of larger ones is scaled to
+    `image_px`.
 
     Raises:
         InvalidInputError: the outcome is unknown.
@@ -136,12 +135,8 @@ def read_cloning_episodes(
 ) -> list[CloningEpisode]:
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
-    Args:
-        stores: stores to read.
-        tasks: tasks to read; empty for all.
-        splits: splits of the scenes; empty for all.
-        image_px: side that the middle square of larger images is scaled to.
-        imagined: whether imagined episodes are read instead of true ones.
+    `tasks` and `splits` of scenes are empty for all; the middle square of larger images is scaled
+    to `image_px`. With `imagined`, imagined episodes are read instead of true ones.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.
@@ -228,10 +223,9 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
                 frame.append(len(newest) - 1)
                 inputs.append(
                     CloningInput(
-                        item.moments[0].image, moment.image, moment.tactile_kpa, item.anchor,
-                        reached, measured, step, item.task,
+                        moment.tactile_kpa, item.anchor, reached, measured, step, item.task
                     )
-                )  # fmt: skip
+                )
         begins.append(len(inputs))
     counts = torch.tensor(begins).diff()
     return Decisions(
@@ -252,24 +246,18 @@ def train_cloned_policy(
     command: str,
     early_at: float | None = None,
 ) -> tuple[Checkpoint, Checkpoint | None]:
-    """Train a policy on successful episodes.
+    """The policy trained on successful episodes and, if requested, an early one.
 
-    Args:
-        episodes: episodes to imitate; failed ones are skipped.
-        settings: training settings.
-        command: command that repeats the training.
-        early_at: fraction of the training after which the early policy is saved.
-
-    Returns:
-        The final policy and, if requested, the early one; their metadata hold the held-out error
-        and that of the mean chunk.
+    Failed episodes are skipped. The early policy is that after the share `early_at` of the
+    training. Metadata hold the held-out error, that of the mean chunk, and the `command` that
+    repeats the training.
     """
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
     shape = CloningShape(tasks=tasks, image_size_px=episodes[0].moments[0].image.shape[0])
     training, held_out = split_by_scene(episodes, held_out_share=settings.held_out_share)
     learned, tested = decisions_of(training, shape), decisions_of(held_out, shape)
-    network = shape.network()
+    network = CloningNetwork(shape)
     _fit_statistics(network, learned)
 
     def checkpoint(cpu_s: float, share: float) -> Checkpoint:
@@ -286,7 +274,7 @@ def train_cloned_policy(
             settings={
                 "shape": shape.model_dump(),
                 "training": settings.model_dump(),
-                "instructions": instructions_of(episodes),
+                "instructions": instructions_of((e.task, e.instruction) for e in episodes),
                 "share_of_training": share,
             },
             metrics={

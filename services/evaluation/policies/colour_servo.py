@@ -184,14 +184,7 @@ class ColourServo:
         if self._place_m is None or chunk_index >= len(plan):
             return np.tile(now, (CHUNK_STEPS, 1))
         keys = _GIVE_UP if self._gave_up else plan[chunk_index]
-        return self._chunk(now, keys, thing)
-
-    def _chunk(
-        self, now: Float64[np.ndarray, "67"], keys: tuple[Key, ...], thing: Thing
-    ) -> Float64[np.ndarray, "16 67"]:
-        """Linear interpolation between keys, from the last action sent."""
-        assert self._start is not None  # noqa: S101 - act has checked both
-        assert self._place_m is not None  # noqa: S101
+        # Linear interpolation between keys, from the last action sent.
         anchor = self._start.anchor
         still = poses_from_actions(np.tile(now, (CHUNK_STEPS, 1)), anchor)
         R_start = anchor.T_world_wrist_right[:3, :3]

@@ -52,10 +52,8 @@ def action_chunk(
 ) -> Float64[np.ndarray, "steps 67"]:
     """Validate the return value of a policy's `act` as an action chunk of a world.
 
-    Args:
-        answer: array, nested list or tensor [K, 67] of any kind of real number.
-        world: world that the chunk is for.
-        where: policy, task, seed and chunk, for error messages.
+    `answer` is an array, nested list or tensor [K, 67] of any kind of real number; `where` names
+    policy, task, seed and chunk in error messages.
 
     Raises:
         ShapeError: wrong shape or dtype, or a K that the world does not accept.
@@ -63,9 +61,11 @@ def action_chunk(
     """
     rows = _array(answer, where)
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != ACTION_DIM:
+        found = type(answer).__name__
+        if rows.dtype.kind != "O":
+            found += f" of shape {list(rows.shape)} and {rows.dtype}"
         raise ShapeError(
-            f"{where} returned {_described(answer, rows)}, expected an array [K, {ACTION_DIM}] of "
-            "real numbers"
+            f"{where} returned {found}, expected an array [K, {ACTION_DIM}] of real numbers"
         )
     if not 0 < len(rows) <= world.max_chunk_steps or len(rows) % world.chunk_multiple:
         raise ShapeError(
@@ -86,12 +86,6 @@ def _array(answer: object, where: str) -> np.ndarray:
             f"{where} returned {type(answer).__name__}, which does not convert to an array "
             f"({error}), expected [K, {ACTION_DIM}]"
         ) from error
-
-
-def _described(answer: object, rows: np.ndarray) -> str:
-    if rows.dtype.kind == "O":
-        return f"{type(answer).__name__}"
-    return f"{type(answer).__name__} of shape {list(rows.shape)} and {rows.dtype}"
 
 
 @dataclass(frozen=True)
@@ -121,9 +115,6 @@ class PolicySource:
 
     def load(self, arguments: Mapping[str, Any]) -> Policy:
         """Import the module, also from the current directory, and call the factory.
-
-        Args:
-            arguments: keyword arguments of the factory.
 
         Raises:
             NotFoundError: no such module.

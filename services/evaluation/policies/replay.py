@@ -9,7 +9,7 @@ from dextouch.clients import PolicyStart
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.hands.actions import check_actions
-from dextouch.schemas import Observation
+from dextouch.schemas import CHUNK_STEPS, Observation
 
 
 class ReplayPolicy:
@@ -18,15 +18,11 @@ class ReplayPolicy:
     Args:
         actions: commanded actions [T, 67] of steps 1 … T for every (task, seed), relative to the
             measured poses of step 0.
-        chunk_steps: length of its chunks, a multiple of 4.
     """
 
     looks = False
 
-    def __init__(
-        self, actions: Mapping[tuple[str, int], np.ndarray], *, chunk_steps: int = 16
-    ) -> None:
-        self.chunk_steps = _multiple_of_four(chunk_steps, "replay policy")
+    def __init__(self, actions: Mapping[tuple[str, int], np.ndarray]) -> None:
         self._actions = {
             (task, seed): check_actions(rows, where=f"replay of {task!r}, seed {seed}")
             for (task, seed), rows in actions.items()
@@ -73,26 +69,21 @@ class ReplayPolicy:
             )
         self._playing = self._actions[key]
 
-    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+    def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """Actions of the steps after the newest one; the last action is repeated at the end."""
         if self._playing is None:
             raise InvalidInputError("replay policy: act before reset; call reset with the start")
         step = observation.first_step + len(observation) - 1
-        wanted = np.arange(step, step + self.chunk_steps)
+        wanted = np.arange(step, step + CHUNK_STEPS)
         return self._playing[np.minimum(wanted, len(self._playing) - 1)]
 
 
 class HoldPolicy:
-    """The weakest baseline: keeps the pose of the first observation.
-
-    Args:
-        chunk_steps: length of its chunks, a multiple of 4.
-    """
+    """The weakest baseline: keeps the pose of the first observation."""
 
     looks = False
 
-    def __init__(self, *, chunk_steps: int = 16) -> None:
-        self.chunk_steps = _multiple_of_four(chunk_steps, "hold policy")
+    def __init__(self) -> None:
         self._pose: np.ndarray | None = None
 
     def reset(self, start: PolicyStart) -> None:
@@ -100,16 +91,8 @@ class HoldPolicy:
         del start
         self._pose = None
 
-    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+    def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """Repeat the pose of the first observation."""
         if self._pose is None:
             self._pose = np.array(observation.action_reached[-1])
-        return np.tile(self._pose, (self.chunk_steps, 1))
-
-
-def _multiple_of_four(chunk_steps: int, what: str) -> int:
-    if chunk_steps < 4 or chunk_steps % 4:
-        raise InvalidInputError(
-            f"{what}: got chunks of {chunk_steps} steps, expected a multiple of 4"
-        )
-    return chunk_steps
+        return np.tile(self._pose, (CHUNK_STEPS, 1))

@@ -22,11 +22,10 @@ def report_main(argv: Sequence[str]) -> int:
     write_result(settings.json_path, report, allow_nan=False)
     print(f"{report['num_marks']} marks of {len(report['rollouts'])} rollouts")
     for task, found in report["tasks"].items():
-        alpha, icc = (
+        score, alpha, icc = (
             value if value == UNDEFINED else f"{value:.2f}"
-            for value in (found["alpha"], found["icc_2k"])
+            for value in (found["score"], found["alpha"], found["icc_2k"])
         )
-        score = found["score"] if found["score"] == UNDEFINED else f"{found['score']:.2f}"
         print(
             f"{task}: score {score} over {found['num_rollouts']} rollouts, "
             f"{found['num_raters']} raters, alpha {alpha}, ICC(2,k) {icc}"

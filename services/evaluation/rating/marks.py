@@ -10,11 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from dextouch.errors import InvalidInputError, StorageError, UnknownNameError
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import first_problems
 
 RaterName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 # A rater sees every rollout once, and a few rollouts a second time.
@@ -198,11 +199,6 @@ class Rubric(FrozenModel):
         """Points of a rollout that meets every criterion."""
         return sum(criterion.points for criterion in self.criteria)
 
-    @property
-    def is_seen_by_twin(self) -> bool:
-        """Whether every criterion has a milestone of the twin."""
-        return all(criterion.milestone is not None for criterion in self.criteria)
-
     def score(self, holds: Mapping[str, bool | float], *, is_inconsistent: bool = False) -> float:
         """Score of a rollout in 0 … 1: its points as a share of the maximum.
 
@@ -245,19 +241,8 @@ class Rubric(FrozenModel):
         }
         return self.score(known) if len(known) == len(self.criteria) else None
 
-    def holds_in_twin(self, event_times_s: Mapping[str, float]) -> dict[str, bool]:
-        """Whether each criterion holds in a rollout of the twin, by the times of its milestones.
 
-        The twin records when a milestone was first reached, so every criterion counts as latched.
-
-        Raises:
-            InvalidInputError: a criterion without a milestone, which only people can mark.
-        """
-        if unseen := [one.name for one in self.criteria if one.milestone is None]:
-            raise InvalidInputError(
-                f"rubric: {', '.join(unseen)} has no milestone of the twin; expected raters' marks"
-            )
-        return {one.name: one.milestone in event_times_s for one in self.criteria}
+_RUBRICS: Final = TypeAdapter(dict[str, Rubric])
 
 
 def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
@@ -271,15 +256,10 @@ def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(f"rubrics {path}: cannot be read ({error})") from error
-    rubrics = {}
-    for task, table in tables.items():
-        try:
-            rubrics[task] = Rubric.model_validate(table)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in (task, *first["loc"]))
-            raise InvalidInputError(f"rubrics {path}: {where}: {first['msg']}") from error
-    return rubrics
+    try:
+        return _RUBRICS.validate_python(tables)
+    except ValidationError as error:
+        raise InvalidInputError(f"rubrics {path}: {first_problems(error)}") from error
 
 
 def rubric_of(task: str, rubrics: Mapping[str, Rubric]) -> Rubric:

@@ -56,17 +56,11 @@ def token_of(episode_id: str) -> str:
 
 
 class RatingQueue:
-    """Assigns rollouts to raters.
+    """Assigns rollouts to raters, until each has been rated by `raters_per_rollout` people.
 
     Rollouts with the fewest raters come first; ties are broken by an order specific to the rater.
     After every `1 / repeat_share` rollouts a rater is shown one again that they rated at least
     `REPEAT_GAP` marks ago. A repeated request without a mark returns the same rollout.
-
-    Args:
-        rollouts: to be rated.
-        marks: those given so far.
-        raters_per_rollout: number of people who rate each rollout.
-        repeat_share: share of rollouts that a rater sees twice.
     """
 
     def __init__(
@@ -137,12 +131,7 @@ def _order(rater: str, episode_id: str) -> str:
 def rated_rollouts(
     store: EpisodeStore, tasks: Collection[str], *, study: str | None = None
 ) -> list[RatedRollout]:
-    """Rollouts of a store that have head images; what people recorded is none.
-
-    Args:
-        store: of episodes.
-        tasks: tasks with a rubric; episodes of others are skipped.
-        study: the study whose rollouts are rated; None for all rollouts.
+    """Rollouts of some tasks that have head images, of one study or all; takes of people are none.
 
     Raises:
         InvalidInputError: nothing to rate.
@@ -197,9 +186,14 @@ def state_scores(
     for rollout in rollouts:
         about, rubric = store.open(rollout.episode_id).attributes, rubrics[rollout.task]
         was_noted = about.event_times_s or (about.success is False and not is_rollout(about))
-        if about.origin == "twin" and was_noted and rubric.is_seen_by_twin:
-            holds = rubric.holds_in_twin(about.event_times_s)
-            found[rollout.episode_id] = rubric.score(holds)
+        if about.origin != "twin" or not was_noted:
+            continue
+        # The twin notes when a milestone was first reached, so every criterion counts as latched.
+        names = (one.milestone for one in rubric.criteria if one.milestone is not None)
+        reached = {name: float(name in about.event_times_s) for name in names}
+        score = rubric.score_by_milestones(reached)
+        if score is not None:
+            found[rollout.episode_id] = score
     return found
 
 

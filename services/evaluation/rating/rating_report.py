@@ -13,7 +13,6 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
 from services.evaluation.rating.marks import FIRST, REPEAT, Mark, Rubric, StoredMark, rubric_of
 from services.evaluation.statistics import (
     Interval,
@@ -51,11 +50,8 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
 
     Returns:
         Alpha; NaN where it is undefined: no rollout with two ratings, or all ratings equal.
-
-    Raises:
-        InvalidInputError: an infinite rating.
     """
-    known = _checked(ratings)
+    known = np.isfinite(ratings)
     rows = known.sum(axis=1) >= 2
     values, known = np.where(known, ratings, 0.0)[rows], known[rows]
     pooled = values[known]
@@ -89,11 +85,8 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
 
     Returns:
         The coefficient; NaN for fewer than two raters or two complete rollouts, or without spread.
-
-    Raises:
-        InvalidInputError: an infinite rating.
     """
-    complete = ratings[_checked(ratings).all(axis=1)]
+    complete = ratings[np.isfinite(ratings).all(axis=1)]
     num_rollouts, num_raters = complete.shape
     if min(num_rollouts, num_raters) < 2:
         return math.nan
@@ -112,15 +105,8 @@ def rater_biases(
     ratings: Float64[np.ndarray, "_ _"],
     generator: np.random.Generator,
 ) -> list[RaterBias]:
-    """Bias of each rater who shares rollouts with others, with a bootstrap over rollouts.
-
-    Raises:
-        ShapeError: names and ratings differ in number.
-        InvalidInputError: an infinite rating.
-    """
-    known = _checked(ratings)
-    if len(raters) != ratings.shape[1]:
-        raise ShapeError(f"ratings: got {len(raters)} names for {ratings.shape[1]} raters")
+    """Bias of each rater who shares rollouts with others, with a bootstrap over rollouts."""
+    known = np.isfinite(ratings)
     found = []
     for column, rater in enumerate(raters):
         others = np.delete(ratings, column, axis=1)
@@ -132,12 +118,6 @@ def rater_biases(
         interval = central_interval(counts @ apart / len(apart))
         found.append(RaterBias(rater, float(apart.mean()), interval, len(apart)))
     return found
-
-
-def _checked(ratings: np.ndarray) -> np.ndarray:
-    if np.isinf(ratings).any():
-        raise InvalidInputError("ratings: got an infinite rating; expected numbers, NaN if missing")
-    return np.isfinite(ratings)
 
 
 def rating_report(
@@ -152,7 +132,7 @@ def rating_report(
 
     Args:
         marks: those that count (`MarkLog.latest`).
-        task_of: task of each episode id; marks of others are skipped and counted.
+        task_of: task of each episode id; marks of others are skipped.
         rubrics: by task.
         state_scores: true scores by episode id, where they are known.
     """

@@ -49,26 +49,7 @@ __all__ = [
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
-    """Write the page atomically.
-
-    Args:
-        report: figures; NaN and None are shown as "undefined".
-        pictures: arrays to draw.
-        path: HTML file; its folder is created.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(render_report(report, pictures), encoding="utf-8")
-    unfinished.replace(path)
-
-
-def _visible(value: object) -> object:
-    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
-    return printable(value, lines=True) if type(value) is str else value
-
-
-def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
-    """Render the page as text."""
+    """Write the page atomically; NaN and None are shown as "undefined"."""
     environment = Environment(
         loader=PackageLoader("services.evaluation.reporting"),
         autoescape=select_autoescape(["j2"], default=True),
@@ -78,7 +59,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         lstrip_blocks=True,
     )
     environment.filters["figure"] = figure
-    return environment.get_template("report.html.j2").render(
+    text = environment.get_template("report.html.j2").render(
         title=report.get("title", "DexTouch report"),
         about=report.get("about", {}),
         tiles=tiles(report),
@@ -98,3 +79,12 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         strips=strips(pictures),
         raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),
     )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
+
+
+def _visible(value: object) -> object:
+    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
+    return printable(value, lines=True) if type(value) is str else value

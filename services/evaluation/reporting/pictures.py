@@ -336,8 +336,10 @@ def action_charts(actions: ActionPicture | None) -> list[NamedChart]:
         fingers: list[Line] = []
         for kind, rows in kinds.items():
             dashed = kind == "commanded"
-            translation_cm = 100 * _wrist_m(rows, side)
-            flexion_deg = np.degrees(_flexion_rad(rows, side))
+            parts = unpack_action(rows)
+            translation_cm = 100 * getattr(parts, f"wrist_{side}")[:, :3]
+            joints_rad = getattr(parts, f"joints_{side}_rad").reshape(-1, 5, 4)
+            flexion_deg = np.degrees(joints_rad[:, :, _FLEXION_HINGES].mean(axis=2))
             wrist += _lines(("x", "y", "z"), actions.times_s, translation_cm, dashed=dashed)
             fingers += _lines(FINGERS, actions.times_s, flexion_deg, dashed=dashed)
         svg = line_chart(wrist, x_label="time (s)", y_label="from its start (cm)")
@@ -355,17 +357,6 @@ def _lines(
         Line(f"{name}, {kind}", times_s, columns[:, k], style=k, dashed=dashed)
         for k, name in enumerate(names)
     ]
-
-
-def _wrist_m(actions: np.ndarray, side: str) -> np.ndarray:
-    parts = unpack_action(actions)
-    return (parts.wrist_left if side == "left" else parts.wrist_right)[:, :3]
-
-
-def _flexion_rad(actions: np.ndarray, side: str) -> np.ndarray:
-    parts = unpack_action(actions)
-    joints = parts.joints_left_rad if side == "left" else parts.joints_right_rad
-    return np.asarray(joints.reshape(-1, 5, 4)[:, :, _FLEXION_HINGES].mean(axis=2))
 
 
 def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:

@@ -30,48 +30,24 @@ AGREEMENT: tuple[tuple[str, str], ...] = (
 # Image baselines that the model must beat; the camera motion is known to all but the copy.
 IMAGE_RIVALS = ("psnr_copy", "psnr_warp", "psnr_hands_still")
 _FAILURE_FIELDS = ("policy", "world", "error", "message", "traceback")
-# Title, unit, direction, and the bars (key and name).
-COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
-    (
-        "Images, PSNR",
-        "dB",
-        "more is better",
-        (
-            ("psnr", "world model"),
-            ("psnr_copy", "copy the first image"),
-            ("psnr_warp", "first image, warped by the camera motion"),
-            ("psnr_hands_still", "model, only the head moves"),
-            ("psnr_hold", "model, nothing moves"),
-            ("psnr_other_take", "model, another scene's actions"),
-            ("psnr_codec", "codec alone (limit)"),
-        ),
-    ),
-    (
-        "Touch, mean squared error",
-        "kPa²",
-        "less is better",
-        (
-            ("tactile_mse", "world model"),
-            ("tactile_mse_copy", "copy the first touch"),
-            ("tactile_mse_zero", "predict no touch"),
-            ("tactile_mse_hands_still", "model, only the head moves"),
-            ("tactile_mse_hold", "model, nothing moves"),
-            ("tactile_mse_other_take", "model, another scene's actions"),
-        ),
-    ),
-    (
-        "Contact, F1",
-        "",
-        "more is better",
-        (
-            ("contact_f1", "world model"),
-            ("contact_f1_copy", "copy the first touch"),
-            ("contact_f1_hands_still", "model, only the head moves"),
-            ("contact_f1_hold", "model, nothing moves"),
-            ("contact_f1_other_take", "model, another scene's actions"),
-        ),
-    ),
-)
+# Bars beside those of the world model and of a copy of the first image or touch.
+_RIVALS: Final = {
+    "warp": "first image, warped by the camera motion",
+    "zero": "predict no touch",
+    "hands_still": "model, only the head moves",
+    "hold": "model, nothing moves",
+    "other_take": "model, another scene's actions",
+    "codec": "codec alone (limit)",
+}
+_OF_IMAGES: Final = ("warp", "hands_still", "hold", "other_take", "codec")
+_OF_CONTACT: Final = ("hands_still", "hold", "other_take")
+# Title, unit, direction, metric, what the copy repeats, and the other bars.
+COMPARISONS: tuple[tuple[str, str, str, str, str, tuple[str, ...]], ...] = (
+    ("Images, PSNR", "dB", "more is better", "psnr", "image", _OF_IMAGES),
+    ("Touch, mean squared error", "kPa²", "less is better", "tactile_mse", "touch",
+     ("zero", *_OF_CONTACT)),
+    ("Contact, F1", "", "more is better", "contact_f1", "touch", _OF_CONTACT),
+)  # fmt: skip
 _ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -181,26 +157,23 @@ def undecided_note(row: Mapping[str, Any], name: str) -> str:
 
 def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
     """Seconds of every stage."""
-    longest = max((float(s["seconds"]) for s in stages), default=1.0) or 1.0
-    return [
-        Bar(
-            str(s["name"]).replace("_", " ").capitalize(),
-            float(s["seconds"]),
-            float(s["seconds"]) / longest,
-        )
-        for s in stages
-    ]
+    names = [str(stage["name"]).replace("_", " ").capitalize() for stage in stages]
+    seconds = [float(stage["seconds"]) for stage in stages]
+    longest = max(seconds, default=1.0) or 1.0
+    return [Bar(name, took, took / longest) for name, took in zip(names, seconds, strict=True)]
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
     """World model compared with its baselines."""
     groups = []
-    for title, unit, note, entries in COMPARISONS:
-        known = [
-            (name, float(figures[key])) for key, name in entries if is_number(figures.get(key))
-        ]
-        if not known or known[0][0] != entries[0][1]:
+    for title, unit, note, metric, copied, rivals in COMPARISONS:
+        if not is_number(figures.get(metric)):
             continue
+        names = {metric: "world model", f"{metric}_copy": f"copy the first {copied}"}
+        names |= {f"{metric}_{rival}": _RIVALS[rival] for rival in rivals}
+        known = [
+            (name, float(figures[k])) for k, name in names.items() if is_number(figures.get(k))
+        ]
         longest = max(value for _, value in known) or 1.0
         bars = [Bar(n, v, max(0.0, v / longest), main=i == 0) for i, (n, v) in enumerate(known)]
         groups.append(BarGroup(title, unit, note, bars))

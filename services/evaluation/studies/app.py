@@ -80,11 +80,7 @@ class _Read:
 
 
 class StudyFolders:
-    """Studies in the subfolders of a folder.
-
-    Args:
-        root: folder that holds a folder for each study.
-    """
+    """Studies in the subfolders of a folder."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -184,12 +180,8 @@ class RolloutQuery(FrozenModel):
 
     def matches(self, rollout: StudyRollout) -> bool:
         """Whether a rollout is asked for."""
-        pairs = (
-            (self.world, rollout.world),
-            (self.task, rollout.task),
-            (self.policy, rollout.policy),
-        )
-        is_named = all(wanted is None or wanted == found for wanted, found in pairs)
+        names = ("world", "task", "policy")
+        is_named = all(getattr(self, name) in (None, getattr(rollout, name)) for name in names)
         return is_named and (rollout.disagrees or not self.disagreements)
 
 

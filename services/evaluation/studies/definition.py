@@ -20,6 +20,13 @@ MAX_STARTS: Final = 2_000
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
+def _expect_one(choice: FrozenModel, *names: str) -> None:
+    given = [name for name in names if getattr(choice, name)]
+    if len(given) != 1:
+        expected = f"{', '.join(names[:-1])} and {names[-1]}"
+        raise ValueError(f"got {', '.join(given) or 'none'}, expected exactly one of {expected}")
+
+
 class WorldChoice(FrozenModel):
     """A world: one served at a URL, or one that the study serves while it runs.
 
@@ -38,12 +45,7 @@ class WorldChoice(FrozenModel):
 
     @model_validator(mode="after")
     def _is_one(self) -> "WorldChoice":
-        given = [name for name in ("url", "checkpoint", "builtin") if getattr(self, name)]
-        if len(given) != 1:
-            raise ValueError(
-                f"got {', '.join(given) or 'none'}, expected exactly one of url, checkpoint and "
-                "builtin"
-            )
+        _expect_one(self, "url", "checkpoint", "builtin")
         if (self.url is None) == (self.world is not None):
             raise ValueError("`world` names a world of the service at `url`; give both or neither")
         return self
@@ -66,12 +68,7 @@ class PolicyChoice(FrozenModel):
 
     @model_validator(mode="after")
     def _is_one(self) -> "PolicyChoice":
-        given = [n for n in ("factory", "builtin", "replay", "script") if getattr(self, n)]
-        if len(given) != 1:
-            raise ValueError(
-                f"got {', '.join(given) or 'none'}, expected exactly one of factory, builtin, "
-                "replay and script"
-            )
+        _expect_one(self, "factory", "builtin", "replay", "script")
         if self.arguments and not self.factory:
             raise ValueError("`arguments` belong to `factory`")
         if self.checkpoint and (self.builtin is None or checkpoint_of(self.builtin) is None):

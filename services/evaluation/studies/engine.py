@@ -69,11 +69,8 @@ def run_study(
     Equal definitions give equal reports, however often the study was interrupted and however many
     rollouts were in flight, if worlds and policies are deterministic.
 
-    Args:
-        definition: of the study.
-        results: of earlier runs; every outcome is added as soon as it is known.
-        parts: worlds, policies and probe.
-        retry_failed: whether failed rollouts are run again.
+    Every outcome is added to the results of earlier runs as soon as it is known. With
+    `retry_failed`, failed rollouts are run again.
 
     Raises:
         ConflictError: a start was trained on, or the study is being run already.
@@ -104,14 +101,10 @@ def run_rollouts(
     parts: StudyParts,
     keep: Callable[[Outcome], None],
 ) -> None:
-    """Run some rollouts of a study; its starts are those of `definition`.
+    """Run some rollouts of a study; `keep` is called with each outcome as soon as it is known.
 
-    Args:
-        definition: whose tasks and seeds are those of the rollouts; the study's, or a part of it.
-        missing: rollouts to run.
-        header: of the whole study.
-        parts: worlds, policies and probe.
-        keep: is called with each outcome, as soon as it is known.
+    `definition` is the study's or a part of it, with the tasks and seeds of the rollouts; `header`
+    is that of the whole study.
 
     Raises:
         ConflictError: a start was trained on.
@@ -222,11 +215,7 @@ class _Workers:
 
 
 class PolicyFactory:
-    """Creates the policies of a study; data that all share is read once.
-
-    Args:
-        definition: of the study.
-        demonstrator: creates the policy of a `script`.
+    """Creates the policies of a study, `demonstrator` those of scripts; shared data is read once.
 
     Raises:
         UnknownNameError: a script or task that the twin does not know.

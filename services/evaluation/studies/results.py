@@ -104,7 +104,12 @@ class StudyResults:
         except OSError as error:
             raise StorageError(f"results {path}: {error}; choose another --folder") from error
         found = cls.read(folder)
-        _refuse_others(path, found.header.digests, header.digests)
+        old, new = found.header.digests, header.digests
+        if changed := [name for name in {**old, **new} if old.get(name) != new.get(name)]:
+            raise ConflictError(
+                f"results {path}: belong to another study ({', '.join(changed)} changed); "
+                "choose another --folder, or delete this one"
+            )
         return found
 
     @classmethod
@@ -232,15 +237,6 @@ def rollout_episode_id(header: StudyHeader, cell: PlannedRollout) -> str:
 
 def _line(row: Mapping[str, object]) -> bytes:
     return json.dumps(row, allow_nan=False).encode() + b"\n"
-
-
-def _refuse_others(path: Path, old: Mapping[str, str], new: Mapping[str, str]) -> None:
-    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    if changed:
-        raise ConflictError(
-            f"results {path}: belong to another study ({', '.join(changed)} changed); "
-            "choose another --folder, or delete this one"
-        )
 
 
 def keep_rollout(

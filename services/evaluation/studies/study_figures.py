@@ -295,14 +295,9 @@ def _agreed(
 
 
 def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, Any]:
-    """Write all reports beside the results.
+    """Write all reports beside the results of a study, finished or not, and return the figures.
 
-    Args:
-        results: of a study, finished or not.
-        json_path: also write the figures here; see `write_result`.
-
-    Returns:
-        The figures of report.json.
+    The figures are those of report.json; they are written to `json_path`, too (`write_result`).
     """
     folder = results.path.parent
     definition = StudyDefinition.model_validate(results.header.definition)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dextouch.errors import InvalidInputError, ShapeError
 from services.evaluation.agreement import (
     FIGURES,
     MAX_PERMUTATIONS,
@@ -298,28 +297,3 @@ def test_pooled_agreement_joins_tasks():
     assert pooled.figures["pearson"].value == pytest.approx(np.corrcoef(real, imagined)[0, 1])
     assert set(pooled.without) == set("abc")
     assert pooled.chance <= 4 / 36
-
-
-@pytest.mark.parametrize(
-    ("real", "imagined", "error", "message"),
-    [
-        (np.zeros((2, 3, 1)), np.zeros((2, 4, 1)), ShapeError, "same policies and starts"),
-        (np.zeros((0, 3, 1)), np.zeros((0, 3, 1)), ShapeError, "at least one"),
-        (np.full((2, 3, 1), np.nan), np.zeros((2, 3, 1)), InvalidInputError, "has no score"),
-        (np.zeros((2, 3, 1)), np.full((2, 3, 1), np.nan), InvalidInputError, "no imagined score"),
-        (np.full((2, 3, 1), 4.0), np.zeros((2, 3, 1)), InvalidInputError, "rubric's maximum"),
-    ],
-)
-def test_scores_that_cannot_be_compared_are_refused(real, imagined, error, message):
-    with pytest.raises(error, match=message):
-        MatchedScores(real, imagined)
-
-
-def test_a_single_policy_has_no_posterior():
-    one = MatchedScores(np.ones((1, 5, 1)), np.ones((1, 5, 1)))
-    with pytest.raises(InvalidInputError, match="at least two"):
-        posterior_scores(one, rng())
-    with pytest.raises(ShapeError, match="2 names"):
-        task_agreement("ab", one, rng())
-    with pytest.raises(InvalidInputError, match="no starts"):
-        paired_differences("ab", np.zeros((2, 0)), rng())

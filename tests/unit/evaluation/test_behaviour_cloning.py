@@ -12,13 +12,11 @@ from dextouch.hands.actions import AnchorPoses, pose_to_9d
 from services.evaluation.policies.behaviour_cloning import (
     BehaviourCloningPolicy,
     ChunkCodec,
-    CloningInput,
     CloningShape,
-    SpatialSoftmax,
-    cloning_batch,
     from_world,
     half_size,
     in_world,
+    spatial_softmax,
 )
 from services.evaluation.policies.cloning_training import (
     CloningEpisode,
@@ -140,16 +138,11 @@ def test_half_an_image_holds_the_means_of_its_pixels():
 
 def test_an_answer_does_not_depend_on_the_others_of_a_batch(policy_checkpoint):
     policy = BehaviourCloningPolicy(policy_checkpoint)
-    moments = [
-        CloningInput(
-            item.moments[0].image, item.moments[step].image, item.moments[step].tactile_kpa,
-            item.anchor, item.measured[step], step == 0, step, item.task,
-        )
-        for item in episodes(range(3)) for step in (0, 32)
-    ]  # fmt: skip
+    decisions = decisions_of(episodes(range(3)), policy.shape)
+    index = torch.arange(0, len(decisions), 8)
     with torch.no_grad():
-        together = policy._network(cloning_batch(moments, policy.shape))
-        alone = [policy._network(cloning_batch([moment], policy.shape)) for moment in moments]
+        together = policy._network(decisions.batch(index))
+        alone = [policy._network(decisions.batch(one[None])) for one in index]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-4, atol=1e-4)
 
 
@@ -202,7 +195,7 @@ def test_codec_keeps_what_its_components_span():
     basis = rng.normal(size=(3, 16 * 67))
     offsets = 5.0 * rng.normal(size=(2, 2, 16 * 67))[tasks, slots]
     chunks = torch.tensor(rng.normal(size=(40, 3)) @ basis + offsets).reshape(40, 16, 67).float()
-    codec = ChunkCodec(num_tasks=2, num_slots=3, num_components=3)
+    codec = ChunkCodec(CloningShape(tasks=("a", "b"), num_components=3, horizon_steps=16))
     codec.fit(chunks, tasks, slots)
     coefficients = codec.encode(chunks, tasks, slots)
     back = codec.decode(coefficients, tasks, slots)
@@ -215,7 +208,7 @@ def test_spatial_softmax_finds_the_peak():
     maps = torch.zeros(1, 2, 9, 9)
     maps[0, 0, 0, 8] = 50.0
     maps[0, 1, 4, 4] = 50.0
-    places = SpatialSoftmax()(maps)
+    places = spatial_softmax(maps)
     torch.testing.assert_close(places, torch.tensor([[1.0, 0.0, -1.0, 0.0]]), atol=1e-4, rtol=0)
 
 

@@ -190,5 +190,3 @@ def test_starts_are_told_apart_by_image_and_touch():
     refuse_training_starts([digest], trained_on=["something else"], what="a probe")
     with pytest.raises(ConflictError, match="1 starts were trained on by a probe"):
         refuse_training_starts([digest], trained_on=[digest], what="a probe")
-    with pytest.raises(InvalidInputError, match="expected one image"):
-        start_digest(item.images[:2], taxels)

@@ -52,10 +52,3 @@ def test_replay_needs_its_episode():
 def test_replay_refuses_broken_actions():
     with pytest.raises(NonFiniteError, match="seed 3"):
         ReplayPolicy({("reach", 3): np.full((16, 67), np.nan)})
-
-
-@pytest.mark.parametrize("steps", [0, 2, 6])
-def test_chunks_are_multiples_of_four(steps):
-    for build in (HoldPolicy, lambda **kind: ReplayPolicy({}, **kind)):
-        with pytest.raises(InvalidInputError, match="multiple of 4"):
-            build(chunk_steps=steps)
