@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from dextouch.errors import NonFiniteError, ShapeError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
@@ -89,33 +88,6 @@ class SceneStates:
     def take(self, rows: Int64[np.ndarray, " m"] | slice) -> "SceneStates":
         """Select states, in the order of `rows`."""
         return SceneStates(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def check(self, num_slots: int) -> None:
-        """Refuse states that cannot be drawn.
-
-        Raises:
-            ShapeError: arrays of another shape, or another number of object slots.
-            NonFiniteError: NaN or infinity.
-        """
-        expected = {
-            "Ts_world_camera": (4, 4),
-            "Ts_world_wrist": (2, 4, 4),
-            "joints_rad": (2, 20),
-            "object_poses": (num_slots, 7),
-            "object_present": (num_slots,),
-        }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array.shape[1:] != shape:
-                raise ShapeError(
-                    f"scene states: {name} is {array.shape[1:]}, expected {shape} for {num_slots} "
-                    "boxes"
-                )
-            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
-            if len(bad):
-                raise NonFiniteError(
-                    f"scene state {bad[0]}: {name} contains NaN or infinity; expected finite values"
-                )
 
 
 def joined(parts: Sequence[Arrays]) -> Arrays:
