@@ -24,8 +24,9 @@ from services.world_model.network.attention import (
     left_joint_signs,
 )
 from services.world_model.network.conditioning import ActionNormalizer, SceneEncoder
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import blots, build_inputs, pose_raster
-from services.world_model.network.instruction import NO_WORD, hash_words
+from services.world_model.network.instruction import NO_WORD, instruction_ids
 from services.world_model.training.dataset import cut_window
 
 # The rotation columns of both wrists and the head camera in a 67-D action.
@@ -240,8 +241,9 @@ def test_foreign_shapes_names_and_numbers_are_refused(request_, tiny_config):
 
 
 def test_words_are_hashed_alike_and_padded():
-    words = hash_words("Stand the BOTTLE, upright!", 64)
-    assert torch.equal(words, hash_words("stand the bottle upright", 64))
+    config = NetworkConfig(num_word_buckets=64)
+    words = instruction_ids("Stand the BOTTLE, upright!", config)
+    assert torch.equal(words, instruction_ids("stand the bottle upright", config))
     assert (words != NO_WORD).sum() == 4
-    assert (hash_words("", 64) == NO_WORD).all()
-    assert (hash_words("x " * 100, 64) != NO_WORD).all()
+    assert (instruction_ids("", config) == NO_WORD).all()
+    assert (instruction_ids("x " * 100, config) != NO_WORD).all()
