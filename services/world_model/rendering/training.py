@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import (
     Budget,
@@ -36,7 +36,7 @@ OnProgress = Callable[[float, int, float], None]
 
 @dataclass(frozen=True)
 class SceneClip:
-    """Images of one episode at `steps`, with the ground-truth state at each of them.
+    """At least two images of one episode at `steps`, with the ground-truth state at each of them.
 
     `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
     """
@@ -46,14 +46,6 @@ class SceneClip:
     states: SceneStates
     K_head: Float64[np.ndarray, "3 3"]
     boxes_m: Float64[np.ndarray, "k 6"]
-
-    def __post_init__(self) -> None:
-        lengths = {len(self.steps), len(self.images), len(self.states)}
-        if len(lengths) > 1 or len(self.steps) < 2:
-            raise ShapeError(
-                f"scene clip: got {len(self.steps)} steps, {len(self.images)} images and "
-                f"{len(self.states)} states, expected equal numbers of at least two"
-            )
 
     def __len__(self) -> int:
         return len(self.steps)
