@@ -137,13 +137,6 @@ def implied_noise(
     return clean + (noisy - clean) / t.view(-1, *[1] * (clean.ndim - 1))
 
 
-def velocity(
-    clean: Float32[Tensor, "batch ..."], noise: Float32[Tensor, "batch ..."]
-) -> Float32[Tensor, "batch ..."]:
-    """Velocity of the straight path from data to noise: ε - x_0."""
-    return noise - clean
-
-
 def clean_from_velocity(
     noisy: Float32[Tensor, "batch ..."],
     velocity: Float32[Tensor, "batch ..."],

@@ -25,7 +25,6 @@ from services.world_model.network.flow_matching import (
     implied_noise,
     sampling_times,
     training_times,
-    velocity,
 )
 from services.world_model.network.inputs import ModelInputs, PredictionRequest, build_inputs
 from services.world_model.network.model import (
@@ -111,9 +110,8 @@ def losses(
         )
     target = clean
     if model.config.prediction == "velocity":
-        target = JointLatents(
-            velocity(clean.video, noise.video), velocity(clean.tactile, noise.tactile)
-        )
+        # Of the straight path from data to noise.
+        target = JointLatents(noise.video - clean.video, noise.tactile - clean.tactile)
     with products_in(options.precision, device.type):
         guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
