@@ -99,9 +99,18 @@ class StateWorld(BatchWorld[StateRollout]):
 
     Args:
         checkpoint: loaded, from `read_state_checkpoint`.
+
+    Raises:
+        InvalidInputError: weights that are not float32.
     """
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
+        others = {weight.dtype for weight in checkpoint.dynamics.parameters()} - {torch.float32}
+        if others:
+            raise InvalidInputError(
+                f"state model {checkpoint.metadata.name}: got weights of "
+                f"{', '.join(sorted(map(str, others)))}, expected float32"
+            )
         self._dynamics = checkpoint.dynamics
         self._dynamics.trace()
         self._renderer = Renderer(checkpoint.renderer)
