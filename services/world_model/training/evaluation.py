@@ -21,7 +21,7 @@ from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,
     Window,
-    cut_window,
+    WindowPosition,
     stack_windows,
 )
 
@@ -158,7 +158,7 @@ def _in_batches(
 
 def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
     available: ActionKind = kind if kind in episode.actions else "measured"
-    return cut_window(episode, start, num_steps, action_kind=available)
+    return episode.cut(WindowPosition(0, start, num_steps, available))
 
 
 def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
