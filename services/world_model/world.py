@@ -33,6 +33,7 @@ from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.starts import (
+    ObservedStart,
     SceneReader,
     checked_chunk,
     checked_selectors,
@@ -48,18 +49,13 @@ _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
 
 
 @dataclass(frozen=True)
-class ModelState:
-    """State of a rollout; `reached` is relative to `anchor`, the poses of step 0."""
+class ModelState(ObservedStart):
+    """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0."""
 
-    image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
-    reached: Float64[np.ndarray, "67"]
-    anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
     instruction: str
     action_kind: ActionKind
     step: int
-    task: str = ""
+    task: str
 
 
 class ModelWorld(BatchWorld[ModelState]):
@@ -127,11 +123,7 @@ class ModelWorld(BatchWorld[ModelState]):
         """
         first = observed_start(start, tasks=self._description.tasks)
         state = ModelState(
-            image=first.image,
-            tactile_kpa=first.tactile_kpa,
-            reached=first.reached,
-            anchor=first.anchor,
-            K_head=first.K_head,
+            **vars(first),
             instruction=start.instruction,
             action_kind=start.action_kind,
             step=0,
