@@ -18,6 +18,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
+from services.world_model.dynamics.trees import combined, mapped
 from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
@@ -94,24 +95,16 @@ def losses(
     first = _with_noise(model.first_latents(inputs), options.context_noise, generator, processes)
     num_windows, shift = len(inputs) * processes.count, model.config.training_time_shift
     t = processes.own(training_times(num_windows, shift=shift, generator=generator)).to(device)
-    noise = JointLatents(
-        processes.randn(clean.video.shape, generator).to(device),
-        processes.randn(clean.tactile.shape, generator).to(device),
-    )
+    noise = mapped(clean, lambda one: processes.randn(one.shape, generator).to(device))
     if options.own_noisy:
         noisy, t = own_noisy(model, inputs, first, noise, generator)
-        noise = JointLatents(
-            implied_noise(noisy.video, clean.video, t),
-            implied_noise(noisy.tactile, clean.tactile, t),
-        )
+        noise = combined([noisy, clean], lambda pair: implied_noise(*pair, t))
     else:
-        noisy = JointLatents(
-            add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
-        )
+        noisy = combined([clean, noise], lambda pair: add_noise(*pair, t))
     target = clean
     if model.config.prediction == "velocity":
         # Of the straight path from data to noise.
-        target = JointLatents(noise.video - clean.video, noise.tactile - clean.tactile)
+        target = combined([noise, clean], lambda pair: pair[0] - pair[1])
     with products_in(options.precision, device.type):
         guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
@@ -157,7 +150,7 @@ def _with_noise(
         noise = processes.randn(latents.shape, generator).to(latents.device)
         return latents + context_noise * amount.to(noise.device) * processes.std(latents) * noise
 
-    return FirstLatents(shaken(first.video), shaken(first.tactile))
+    return mapped(first, shaken)
 
 
 def own_context(
@@ -185,10 +178,9 @@ def own_context(
             batch.tactile_kpa[:, : middle + 1],
             batch.tactile_valid[:, : middle + 1],
         )
-    one = model.noise(middle + 1, generator)
-    noise = JointLatents(
-        processes.randn([len(firsts), *one.video.shape[1:]], generator),
-        processes.randn([len(firsts), *one.tactile.shape[1:]], generator),
+    noise = mapped(
+        model.noise(middle + 1, generator),
+        lambda one: processes.randn([len(firsts), *one.shape[1:]], generator),
     )
     inputs = build_inputs(firsts, model.config)
     future = model.predict(inputs, noise, sampling=Sampling(keep_context=False), all_images=False)
