@@ -5,6 +5,7 @@ import json
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -474,9 +475,24 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
     Robot episodes are split before a subset of them is taken, so that every subset has the same
     held-out episodes. These are never human if human stores are given.
     """
-    trained, heldout = _load_robot(settings)
+    px = settings.network.image_px
+    read = partial(
+        index_episodes if settings.streaming else load_episodes,
+        splits=settings.splits,
+        image_px=px,
+    )
+    domain: Domain | None = "robot" if settings.human else None
+    trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
+    if settings.heldout is not None:
+        heldout = load_episodes(settings.heldout, domain=domain, image_px=px)
+    else:
+        trained, stored = _split(trained, settings)
+        heldout = [one.load() if isinstance(one, StoredEpisode) else one for one in stored]
     trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
-    together = [*trained, *_load_human(settings)]
+    people: list[TrainingEpisode] = []
+    for url in settings.human if settings.human_episodes != 0 else ():
+        people += read(url, domain="human")
+    together = [*trained, *subset_by_hash(people, settings.human_episodes, what="human")]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     counts = Counter(episode.episode_id for episode in together)
     if len(rates_hz) > 1 or len(counts) < len(together):
@@ -489,33 +505,11 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
     return together, heldout
 
 
-def _load_robot(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    domain: Domain | None = "robot" if settings.human else None
-    url, splits, px = settings.episodes, settings.splits, settings.network.image_px
-    read = index_episodes if settings.streaming else load_episodes
-    episodes: Sequence[TrainingEpisode] = read(url, splits=splits, domain=domain, image_px=px)
-    if settings.heldout is not None:
-        return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
-    trained, heldout = _split(episodes, settings)
-    return trained, [one.load() if isinstance(one, StoredEpisode) else one for one in heldout]
-
-
 def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
     if settings.tokenizer is None:
         return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
     stored = read_tokenizer(settings.tokenizer)
     return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
-
-
-def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
-    if settings.human_episodes == 0:
-        return []
-    read = index_episodes if settings.streaming else load_episodes
-    found: list[TrainingEpisode] = []
-    for url in settings.human:
-        px = settings.network.image_px
-        found += read(url, splits=settings.splits, domain="human", image_px=px)
-    return subset_by_hash(found, settings.human_episodes, what="human")
 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
