@@ -97,9 +97,6 @@ class StateWorld(BatchWorld[StateRollout]):
 
     Deterministic: the seeds of chunks have no effect.
 
-    Args:
-        checkpoint: loaded, from `read_state_checkpoint`.
-
     Raises:
         InvalidInputError: weights that are not float32.
     """

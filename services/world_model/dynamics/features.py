@@ -76,12 +76,9 @@ class HandMotion:
 def hand_motion(
     actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
 ) -> HandMotion:
-    """Motion of both hands under the given actions.
+    """Motion of both hands under actions relative to `anchor`.
 
-    Args:
-        actions: relative to `anchor`.
-        anchor: T_world poses that the actions are relative to.
-        validated: the actions were returned by `check_actions` and are not checked again.
+    With `validated`, `check_actions` has returned the actions, and they are not checked again.
 
     Raises:
         DegenerateRotationError: the actions contain a degenerate rotation.

@@ -121,9 +121,7 @@ def by_pad(
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    Args:
-        tactile_kpa: of all taxels.
-        reduce: such as `np.mean`, called with an axis.
+    `reduce` takes the taxels of a pad and an axis, such as `np.mean`.
     """
     tips, palm = split_pads(tactile_kpa)
     pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
@@ -196,12 +194,7 @@ class ImaginedSteps(_Run):
 
 
 class DynamicsModel(nn.Module):
-    """Ensemble of start readers and cores trained from different seeds, with a shared touch codec.
-
-    Args:
-        config: configuration of every member.
-        num_members: size of the ensemble, at least one.
-    """
+    """Ensemble of start readers and cores from different seeds, with a shared touch codec."""
 
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
         super().__init__()

@@ -137,11 +137,9 @@ class TextFeatures:
         self._known: dict[str, Tensor] = {}
 
     def use(self, folder: Path | None, cache: Path | None = None) -> None:
-        """Choose where unknown texts are looked up.
+        """Choose the folder of the pretrained model, whose text encoder unknown texts are given to.
 
-        Args:
-            folder: folder of the pretrained model with its text encoder.
-            cache: folder in which features are kept as safetensors; None for memory only.
+        Features are kept as safetensors in the folder `cache`; without one, in memory only.
         """
         self._folder, self._cache, self._encoder = folder, cache, None
 

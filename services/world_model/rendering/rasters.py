@@ -210,11 +210,7 @@ def positions_at_start(
 ) -> Float64[np.ndarray, "hits 2"]:
     """Start image pixels of the hit points; far outside for points behind the start camera.
 
-    Args:
-        hits: from `cast_boxes`.
-        Ts_start_box: pose of each box in the start camera, at the start.
-        half_m: half sizes of the boxes.
-        K: intrinsics of the start camera.
+    `Ts_start_box` are the boxes' poses at the start in the start camera, and `K` its intrinsics.
     """
     x, y, z = hits.local.T
     scaled = (K[:, None] @ Ts_start_box[..., :3, :]).transpose(2, 3, 0, 1)
@@ -312,15 +308,15 @@ def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
 
 
 def project_hands(
-    base_world: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray, *, middle_only: bool = False
+    base_world: Float64[np.ndarray, "n 2 22 3"],
+    K: Float64[np.ndarray, "n 3 3"],
+    T_world_camera: Float64[np.ndarray, "n 4 4"],
+    *,
+    middle_only: bool = False,
 ) -> HandPoints:
     """Project all points of both hands into a camera.
 
-    Args:
-        base_world: [n, 2, 22, 3] from `base_points_world`.
-        K: [n, 3, 3] in pixels.
-        T_world_camera: [n, 4, 4].
-        middle_only: put every point on the centre line of its bone.
+    With `middle_only`, every point is put on the centre line of its bone.
     """
     ribbons = _ribbons()
     base = apply(invert(T_world_camera)[:, None], base_world)

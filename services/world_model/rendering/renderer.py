@@ -51,10 +51,8 @@ class Drawing:
 class Renderer:
     """Draws head camera images of states; equal inputs give equal bytes.
 
-    Args:
-        network: trained weights; they are copied.
-        uses_bfloat16: run convolutions in bfloat16; default: if that is clearly faster on this
-            processor, which is timed once in a process.
+    The network is copied. By default, convolutions run in bfloat16 if that is clearly faster on
+    this processor, which is timed once in a process.
     """
 
     def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
