@@ -260,13 +260,7 @@ def make_training_data(
 ) -> dict[str, int]:
     """Record one episode per seed, task and domain; existing episodes are kept.
 
-    Args:
-        store: folder of the store.
-        seeds: seeds of the scenes.
-        mix: kinds of takes.
-        workers: where they are recorded; default: one process per core.
-        scope: tasks, domains and streams.
-        policy: policy that acts instead of the scripts; `mix` is then ignored.
+    By default, each core records one at a time. A policy acts instead of the scripts of `mix`.
 
     Returns:
         Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,

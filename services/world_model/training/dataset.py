@@ -399,10 +399,8 @@ def read_batches(
 ) -> Generator[WindowBatch, None, None]:
     """Batches at these places, in order, independent of the number of processes.
 
-    Args:
-        episodes: episodes that the places refer to.
-        places: places of each batch; may be endless and is read ahead.
-        num_workers: reader processes, which end with the iterator; 0 reads in this process.
+    Places may be endless and are read ahead. Reader processes end with the iterator; without any,
+    this process reads.
     """
     loader = DataLoader(
         _Windows(episodes),

@@ -26,11 +26,6 @@ def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> li
 
     A larger subset of the same episodes contains every smaller one.
 
-    Args:
-        episodes: to choose from.
-        count: how many.
-        what: what they are, for the message.
-
     Raises:
         InvalidInputError: there are fewer; `what` names them.
     """
@@ -55,10 +50,7 @@ def check_tasks(
 ) -> None:
     """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`).
 
-    Args:
-        episodes: trained on and held out.
-        settings: of the run.
-        known: tasks that the initial checkpoint was trained on.
+    `known` are those that the initial checkpoint was trained on.
 
     Raises:
         InvalidInputError: a task is both human and robot, or is known already.
@@ -91,15 +83,11 @@ def training_sets(
     inherited: Sequence[TrainingSet] = (),
     ancestor: str | None = None,
 ) -> tuple[TrainingSet, ...]:
-    """The episodes of a run by domain, after those of its ancestors.
+    """The episodes of a run by domain, after the inherited ones of its ancestors.
 
-    Args:
-        trained: episodes of training.
-        heldout: episodes of evaluation.
-        human_share: share of human episodes in what is drawn; None if it follows from their number.
-        image_px: side that images are scaled to, as `data_hash` wants it.
-        inherited: sets of the initial checkpoint.
-        ancestor: its digest.
+    `ancestor` is the digest of the initial checkpoint. `human_share` of what is drawn is human;
+    None: as their number says. `image_px` is the side that images are scaled to, as `data_hash`
+    wants it.
     """
     found = [
         one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})

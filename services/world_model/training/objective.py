@@ -80,13 +80,8 @@ def losses(
 ) -> Losses:
     """Errors of the prediction at random times.
 
-    Args:
-        model: the network.
-        batch: the true windows.
-        generator: source of times and noise.
-        options: what counts, and in which precision.
-        processes: processes whose batches together are the whole one; losses are this process's
-            contributions to it, which have the whole one's loss as their mean.
+    The batches of all `processes` together are the whole one. Losses are this process's
+    contributions to it, which have the whole one's loss as their mean.
     """
     device = model.device
     inputs = build_inputs(batch.requests, model.config).to(device)

@@ -58,13 +58,8 @@ def train_reader(
 ) -> StartReader:
     """Train a reader of objects from single steps, both first and later ones.
 
-    Args:
-        table: training episodes; only labelled ones are used.
-        config: of the dynamics model.
-        settings: number of steps and so on.
-        seed: seed of weights and sampling.
-        on_step: called with the step and its loss.
-        initial: reader to start from; its weights are changed.
+    Only labelled episodes are used. The weights of `initial` are changed. `on_step` is called with
+    each step and its loss.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -266,14 +261,9 @@ def train_averaged(
     weight_decay: float,
     on_step: OnStep | None = None,
 ) -> Network:
-    """Train a network and return it with the moving average of its weights.
+    """Train a network in place, and return the moving average of its weights.
 
-    Args:
-        network: its weights are changed.
-        loss: loss of a fresh batch.
-        settings: number of steps, learning rate and decay of the average.
-        weight_decay: AdamW weight decay.
-        on_step: called with the step and its loss.
+    `loss` draws a fresh batch. `on_step` is called with each step and its loss.
     """
     options = OptimizerOptions(
         settings.learning_rate, weight_decay, warmup_steps=_WARMUP_STEPS, schedule=_to_a_hundredth

@@ -266,11 +266,8 @@ def scene_table(
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
-    Args:
-        episodes: at least one.
-        config: of the dynamics model.
-        labelled: for each episode, whether its object poses are trained on; default: all.
-        human_share: share of human episodes in what is drawn; None if it follows from their number.
+    `labelled` says of each whether its object poses are trained on; by default all. `human_share`
+    of what is drawn is human; None: as their number says.
 
     Raises:
         InvalidInputError: no image of the first step, none later that all episodes have, too short
