@@ -148,13 +148,7 @@ class SceneTable:
     def drawn(
         self, able: Int64[Tensor, " rows"], count: int, generator: torch.Generator
     ) -> Int64[Tensor, " count"]:
-        """Random episodes of some, a share of them human if there are both.
-
-        Args:
-            able: indices of the episodes to draw from.
-            count: how many to draw, with replacement.
-            generator: source of randomness.
-        """
+        """Random episodes of some, maybe repeated; a share of them human if there are both."""
         is_human, share = self.human[able], self.human_share
         num_human = is_human.sum()
         if bool(share.isnan()) or not 0 < int(num_human) < len(able):

@@ -56,11 +56,7 @@ _NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
 class SceneGrid(EpisodeGrid):
     """An episode on the model grid whose objects a file may list, and people may have clicked.
 
-    Args:
-        reader: the episode.
-        image_px: as of `EpisodeGrid`.
-        objects: its task's objects as a file lists them; None if it does not.
-        clicked: poses at the first step from clicks; None without any.
+    `objects` are its task's in a file that lists them, `clicked` poses at the first step.
     """
 
     def __init__(
@@ -166,18 +162,11 @@ def load_scene_episodes(
 ) -> list[SceneGrid]:
     """Episodes of stores that a state model can learn from, store by store.
 
-    Args:
-        urls: URLs of the stores.
-        tasks: tasks to load; empty for all.
-        splits: splits of the scenes; empty for all.
-        image_px: side that the middle square of larger images is scaled to; None leaves images as
-            they are.
-        clicks: objects of tasks, and clicks on them; those in the stores are used as well.
-        domain: whose hands act; None for people and robots.
+    All tasks, all splits, and people and robots, unless some are named. The middle square of images
+    that are larger than `image_px` is scaled to it. Clicks in the stores are used beside `clicks`.
 
     Raises:
-        NotFoundError: as `select_episodes`.
-        ConflictError: as `select_episodes`.
+        NotFoundError, ConflictError: as `select_episodes`.
         InvalidInputError: as `clicked_poses`.
     """
     stores = [EpisodeStore(url) for url in urls]
@@ -403,12 +392,7 @@ def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
 def configured(
     data: StateData, settings: StateTrainSettings, base: Base | None = None
 ) -> DynamicsConfig:
-    """The configuration of a model of some episodes.
-
-    Args:
-        data: the episodes.
-        settings: of the training.
-        base: model that it starts from.
+    """The configuration of a model of some episodes, which may start from another model.
 
     Raises:
         InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or

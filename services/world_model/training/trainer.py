@@ -141,8 +141,7 @@ class TrainingRun:
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
         """Fit everything in closed form: codecs, action statistics, residual scales.
 
-        Args:
-            tokenizer: pretrained tokenizer to use instead of fitting one.
+        A pretrained tokenizer is taken instead of fitting one.
         """
         model, config = self.model, self.settings.network
         if model.device.type != "cpu":
@@ -232,9 +231,8 @@ class TrainingRun:
     ) -> list[TrainingProgress]:
         """Train until the budget or the number of steps is used up; returns the loss log.
 
-        Args:
-            on_progress: called with every entry of the log.
-            on_step: called with the run after every step.
+        `on_progress` is called with every entry of the log, `on_step` with the run after every
+        step.
         """
         budget = self.budget
         budget.start()

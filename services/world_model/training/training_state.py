@@ -72,12 +72,7 @@ class TrainingState:
 
 
 class StateFiles:
-    """State of the run with this output; all its processes must call each method.
-
-    Args:
-        output: checkpoint that the run will write.
-        processes: processes of the run.
-    """
+    """State of the run that will write this output; all its processes must call each method."""
 
     def __init__(self, output: Path, processes: Processes) -> None:
         self._file = state_path(output)
@@ -104,9 +99,7 @@ class StateFiles:
     def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
         """Read the state of a run with these settings and data.
 
-        Args:
-            identity: from `identity_of`.
-            own: a tensor of the same name, shape and sharding for every tensor of the state.
+        `own` has a tensor of the same name, shape and sharding for every tensor of the state.
 
         Raises:
             ConflictError: the state has other settings or data; they are named.

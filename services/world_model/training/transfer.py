@@ -25,9 +25,6 @@ _SUCCESS = "success."
 class Base:
     """A trained state model that another one starts from.
 
-    Args:
-        path: its checkpoint.
-
     Raises:
         NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
     """
@@ -38,9 +35,7 @@ class Base:
     def configured(self, config: DynamicsConfig, *, keeps_tasks: bool) -> DynamicsConfig:
         """A configuration with the shape of the base's networks, for the tasks of another one.
 
-        Args:
-            config: of the episodes.
-            keeps_tasks: whether the tasks stay the base's, of which the episodes have some.
+        With `keeps_tasks`, they stay the base's, of which the episodes have some.
 
         Raises:
             InvalidInputError: images of another size.
