@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TypeAlias, TypeVar
 
 from dextouch.episodes import EpisodeGrid, data_hash
-from dextouch.errors import InvalidInputError
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import TrainingSet
 from services.world_model.settings import DataSettings
@@ -43,6 +43,20 @@ def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> li
 
     chosen = sorted(range(len(episodes)), key=place)[:count]
     return [episodes[index] for index in sorted(chosen)]
+
+
+def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[float]) -> None:
+    """Check that the episodes of a training have one model rate, and are in one store each.
+
+    Raises:
+        ConflictError: they are not.
+    """
+    twice = [name for name, count in Counter(ids).items() if count > 1]
+    if twice or len(rates_hz) > 1:
+        raise ConflictError(
+            f"training: the episodes of {', '.join(urls)} have model rates of {sorted(rates_hz)} "
+            f"Hz, and {twice[:3]} are in two stores; expected one rate, and each episode once"
+        )
 
 
 def check_tasks(

@@ -34,14 +34,14 @@ from dextouch.episodes import (
     split_by_scene,
     touched_objects,
 )
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.domains import check_tasks, subset_by_hash
+from services.world_model.training.domains import check_stores, check_tasks, subset_by_hash
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 
@@ -271,7 +271,8 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     """
     clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
     heldout_urls = () if settings.heldout is None else (settings.heldout,)
-    _check_clicked(clicks, (*settings.episodes, *settings.human, *heldout_urls))
+    urls = (*settings.episodes, *settings.human, *heldout_urls)
+    _check_clicked(clicks, urls)
     load = partial(
         load_scene_episodes, tasks=settings.tasks, image_px=settings.image_px, clicks=clicks
     )
@@ -294,7 +295,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
                 "--heldout store, or a larger --heldout-share"
             )
     data = StateData(training, heldout)
-    _check_together(data)
+    _check_together(data, urls)
     _correct_grips(data.episodes)
     return data
 
@@ -340,7 +341,7 @@ def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[
     return kept
 
 
-def _check_together(data: StateData) -> None:
+def _check_together(data: StateData, urls: Sequence[str]) -> None:
     """Check what holds for all stores of a run; each is read for itself."""
     both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
     if both:
@@ -348,14 +349,8 @@ def _check_together(data: StateData) -> None:
             f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
             "ones; use another --heldout store"
         )
-    counts = Counter(episode.episode_id for episode in data.episodes)
-    twice = [name for name, count in counts.items() if count > 1]
-    rates_hz = sorted({episode.about.model_rate_hz for episode in data.episodes})
-    if twice or len(rates_hz) > 1:
-        raise ConflictError(
-            f"training: the episodes have model rates of {rates_hz} Hz, and {twice[:3]} are in two "
-            "stores; expected one rate, and each episode once"
-        )
+    ids = [episode.episode_id for episode in data.episodes]
+    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:

@@ -2,7 +2,7 @@
 
 import copy
 import json
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from functools import partial
@@ -51,7 +51,12 @@ from services.world_model.training.dataset import (
     read_batches,
 )
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.domains import check_tasks, subset_by_hash, training_sets
+from services.world_model.training.domains import (
+    check_stores,
+    check_tasks,
+    subset_by_hash,
+    training_sets,
+)
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import LossOptions, losses, own_context
 from services.world_model.training.tokenizer_trainer import (
@@ -474,11 +479,8 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
     held-out episodes. These are never human if human stores are given.
     """
     px = settings.network.image_px
-    read = partial(
-        index_episodes if settings.streaming else load_episodes,
-        splits=settings.splits,
-        image_px=px,
-    )
+    how = index_episodes if settings.streaming else load_episodes
+    read = partial(how, splits=settings.splits, image_px=px)
     domain: Domain | None = "robot" if settings.human else None
     trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
     if settings.heldout is not None:
@@ -492,14 +494,8 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
         people += read(url, domain="human")
     together = [*trained, *subset_by_hash(people, settings.human_episodes, what="human")]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
-    counts = Counter(episode.episode_id for episode in together)
-    if len(rates_hz) > 1 or len(counts) < len(together):
-        twice = [name for name, count in counts.items() if count > 1]
-        raise ConflictError(
-            f"training: the episodes of {', '.join([settings.episodes, *settings.human])} have "
-            f"model rates of {sorted(rates_hz)} Hz, and {twice[:3]} are in two stores; expected "
-            "one rate, and each episode once"
-        )
+    ids = [episode.episode_id for episode in together]
+    check_stores([settings.episodes, *settings.human], ids, rates_hz)
     return together, heldout
 
 
