@@ -434,10 +434,7 @@ def memory_from_arrays(
 
 def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
     """The memory of one rollout with zeros: names, shapes and types of a snapshot."""
-    objects = MAX_OBJECTS
-
-    def zeros(*shape: int) -> Tensor:
-        return torch.zeros(shape)
+    objects, zeros = MAX_OBJECTS, torch.zeros
 
     def poses(*batch: int) -> ObjectPoses:
         return ObjectPoses(
@@ -450,7 +447,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         size=zeros(members, 1, objects, 2),
         touch=zeros(members, 1, 2, config.touch_channels),
         pads_kpa=zeros(members, 1, NUM_PADS),
-        task=torch.zeros((members, 1), dtype=torch.int64),
+        task=zeros(members, 1, dtype=torch.int64),
         commanded=zeros(members, 1),
         instruction=zeros(members, 1, config.instruction_size),
     )
@@ -469,7 +466,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         tactile_kpa=zeros(1, 2, NUM_TAXELS),
         success=zeros(members, 1),
         points_m=zeros(1, 2, NUM_POINTS, 3),
-        num_still=torch.zeros(1, dtype=torch.int64),
+        num_still=zeros(1, dtype=torch.int64),
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 from torch import Tensor
 
-from services.world_model.dynamics.trees import Traced
+from services.world_model.dynamics.trees import Traced, mapped
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     DrawingInputs,
@@ -116,10 +116,7 @@ class Renderer:
             return self._paint(inputs) if len(changed) == 1 else self._network(inputs)
         images = inputs.fine[:, :3].clone()
         if bool(changed.any()):
-            some = DrawingInputs(
-                inputs.fine[changed], inputs.coarse[changed], inputs.change[changed]
-            )
-            images[changed] = self._network(some)
+            images[changed] = self._network(mapped(inputs, lambda planes: planes[changed]))
         return images
 
     def _prepared(self, drawing: Drawing) -> PreparedScenes:
