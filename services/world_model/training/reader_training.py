@@ -71,7 +71,8 @@ def train_reader(
     is_known = _knows_some(table, config)
     # Later steps of each episode, in their order; of further ones nothing is known, they have no
     # image or lie behind its end.
-    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
+    places = [table.image_steps.index(step) for step in later]
+    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, places]
     reached &= is_known[:, later]
     counts = reached.sum(1)
     order = torch.argsort(~reached, dim=1, stable=True)
@@ -98,11 +99,6 @@ def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "epis
     count = torch.tensor(config.num_objects)[table.task]
     is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
     return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
-
-
-def _places(table: SceneTable, steps: list[int]) -> list[int]:
-    """Indices of steps among those with images."""
-    return [table.image_steps.index(step) for step in steps]
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:

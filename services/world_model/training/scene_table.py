@@ -430,23 +430,14 @@ def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> 
 def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
     """Clips of the images of which all objects are known, where an episode has two or more."""
     clips = []
-    for episode in episodes:
-        if (track := episode.objects) is None or not len(episode.boxes_m):
+    for one in episodes:
+        if (track := one.objects) is None or not len(one.boxes_m):
             continue
-        steps = episode.image_steps[track.known[episode.image_steps].all(axis=1)]
-        if len(steps) > 1:
-            clips.append(_clip(episode, steps, track.poses[steps].astype(np.float64)))
+        steps = one.image_steps[track.known[one.image_steps].all(axis=1)]
+        if len(steps) < 2:
+            continue
+        poses = track.poses[steps].astype(np.float64)
+        present = np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M
+        states = SceneStates.of_actions(one.measured[steps], one.anchor, poses, present)
+        clips.append(SceneClip(steps, one.images(steps), states, one.K_head, one.boxes_m))
     return clips
-
-
-def _clip(
-    episode: EpisodeGrid, steps: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n objects 7"]
-) -> SceneClip:
-    present = np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M
-    return SceneClip(
-        steps=steps,
-        images=episode.images(steps),
-        states=SceneStates.of_actions(episode.measured[steps], episode.anchor, poses, present),
-        K_head=episode.K_head,
-        boxes_m=episode.boxes_m,
-    )
