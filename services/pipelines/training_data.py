@@ -32,7 +32,7 @@ from services.twin.settings import TwinSettings
 from services.twin.sizes import Sizes, object_boxes_m
 from services.twin.stage import Stage
 from services.twin.take_options import MIXES, Mix, PlayedActions, TakeOptions, options_of
-from services.twin.tasks import EVALUATED, TASK_NAMES, named_tasks
+from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
@@ -71,9 +71,6 @@ class Scope:
                 f"training data: got a share of {self.varied} varied and {self.resized} resized "
                 "takes, expected 0 … 1"
             )
-        for task in self.tasks:
-            if task not in TASK_NAMES:
-                raise UnknownNameError("task", task, list(TASK_NAMES))
         for domain in self.domains:
             if domain not in DOMAINS:
                 raise UnknownNameError("domain", domain, list(DOMAINS))
@@ -190,9 +187,7 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
 
 def _recorded(order: Order, options: TakeOptions) -> TruthEpisode:
     stage = stage_of(order.task, order.domain)
-    if order.policy is None:
-        return record(stage, order.seed, options)
-    played = _played_by(order.policy, stage, order.seed)
+    played = order.policy and _played_by(order.policy, stage, order.seed)
     return record(stage, order.seed, options, played=played)
 
 
