@@ -278,6 +278,7 @@ def scene_table(
     tracked = list(zip(episodes, tracks, strict=True))
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
+    sds_m = [np.pad(track.sd_m, (0, MAX_OBJECTS - len(track.sd_m))) for track in tracks]
     boxes_m = usual_boxes_m(episodes)
     touched_tasks = {one.task for one, track in tracked if "touch" in track.sources}
     return SceneTable(
@@ -302,7 +303,7 @@ def scene_table(
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
         touched=torch.tensor([episode.task in touched_tasks for episode in episodes]),
-        placed_sd_m=torch.from_numpy(np.stack([_sd_m(track) for track in tracks])),
+        placed_sd_m=torch.from_numpy(np.stack(sds_m)).float(),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
         instruction=instruction_features([e.about.instruction for e in episodes], config),
@@ -330,12 +331,6 @@ def _known(
     known[:, :count] = _filled(track.known, episode, num_steps)
     known[_whole(episode) :, :count] = False
     return known
-
-
-def _sd_m(track: ObjectTrack) -> Float32[np.ndarray, " slots"]:
-    sd_m = np.zeros(MAX_OBJECTS, dtype=np.float32)
-    sd_m[: len(track.sd_m)] = track.sd_m
-    return sd_m
 
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
