@@ -13,15 +13,13 @@ from jaxtyping import Float32, Float64, UInt8
 from torch import Tensor
 
 from services.world_model.dynamics.trees import Traced, mapped
-from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     DrawingInputs,
     PreparedScenes,
     Scenes,
     drawing_inputs,
 )
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.network import uses_bfloat16 as uses_bfloat16_here
+from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
 from services.world_model.rendering.rasters import (
     MAX_DRAWN_OBJECTS,
     SceneStates,
@@ -56,9 +54,9 @@ class Renderer:
     """
 
     def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
-        dtype = torch.bfloat16 if uses_bfloat16_here(setting=uses_bfloat16) else torch.float32
+        is_half = has_fast_bfloat16() if uses_bfloat16 is None else uses_bfloat16
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
-        self._network.to(dtype)
+        self._network.to(torch.bfloat16 if is_half else torch.float32)
         # As the images are, so that convolutions do not rearrange their weights at each call.
         for weight in self._network.parameters():
             if weight.ndim == 4:
@@ -69,11 +67,6 @@ class Renderer:
         # A rollout draws all its chunks from one start. Those used last are at the end.
         self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
         self._lock = threading.Lock()
-
-    @property
-    def config(self) -> RendererConfig:
-        """Shape of the network."""
-        return self._network.config
 
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
         """Draw images of any number of rollouts; together as alone, except for rounding.
@@ -104,7 +97,7 @@ class Renderer:
         used, local = np.unique(owner, return_inverse=True)
         prepared = joined([starts[index] for index in used])
         with torch.inference_mode():
-            images = self._drawn(drawing_inputs(prepared, states, local, self.config))
+            images = self._drawn(drawing_inputs(prepared, states, local, self._network.config))
             rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
