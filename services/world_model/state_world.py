@@ -37,7 +37,6 @@ from services.world_model.dynamics.model import (
     batched,
     first_steps,
     mean_poses,
-    mean_size,
     memory_arrays,
     memory_from_arrays,
     memory_of,
@@ -287,7 +286,7 @@ class StateWorld(BatchWorld[StateRollout]):
         present = poses[..., 2] > ABSENT_POSE[2]
         states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
-        size = mean_size(state.memory)[0, : len(boxes_m)].double().numpy()
+        size = state.memory.start.size.mean(0)[0, : len(boxes_m)].double().numpy()
         boxes_m = boxes_m * size[:, BOX_AXES]
         return Drawing(state.image, state.K_head, states, boxes_m)
 
@@ -355,7 +354,7 @@ class StateWorld(BatchWorld[StateRollout]):
     def _size_deviation(self, state: StateRollout) -> float:
         """Largest deviation of a movable object's size from the usual one, as a share of it."""
         movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
-        deviations = (mean_size(state.memory)[0] - 1.0).abs() * movable[:, None]
+        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
         return float(deviations.max())
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:

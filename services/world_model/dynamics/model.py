@@ -219,14 +219,9 @@ class DynamicsModel(nn.Module):
     ) -> SceneMemory:
         """Estimate the scene at an observed step.
 
-        If the hands touch nothing, the scene is at rest until they move.
-
-        Args:
-            first: the step as input of the readers.
-            tactile_kpa: pressure at that step.
-            holding: the measured hands, from `Commands.holding`.
-            commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
-            instruction: features of the sentence, from `instruction_features`.
+        If the hands touch nothing, the scene is at rest until they move. `holding` are the measured
+        hands, from `Commands.holding`, and `instruction` the features of the sentence; `commanded`
+        is 1 if the rollout's actions are commanded, 0 if they are measured.
         """
         known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded, instruction)
         readings: list[Reading] = [reader(first) for reader in self.readers()]
@@ -347,11 +342,6 @@ def mean_poses(poses: ObjectPoses) -> ObjectPoses:
         (poses.axes * share[..., None, None]).sum(0),
         poses.present.mean(0),
     )
-
-
-def mean_size(memory: SceneMemory) -> Float32[Tensor, "batch objects 2"]:
-    """Width and height of the objects as factors of the usual ones, averaged over members."""
-    return memory.start.size.mean(0)
 
 
 def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
