@@ -61,12 +61,9 @@ class ModelState(ObservedStart):
 class ModelWorld(BatchWorld[ModelState]):
     """A flow-matching model as a world.
 
-    Args:
-        checkpoint: loaded, from `read_checkpoint`.
-        sampling: network calls, solver and so on; None uses the checkpoint's.
-        precision: of the experts' matrix products; codecs are always float32.
-        reader: finds the objects of every chunk's first step, for a model that is conditioned on
-            contact geometry.
+    Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
+    products; codecs are always float32. A model that is conditioned on contact geometry needs a
+    `reader`, which finds the objects of every chunk's first step.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks.

@@ -312,12 +312,9 @@ class JointWorldModel(nn.Module):
     ) -> Prediction:
         """Sample a future for every request.
 
-        Args:
-            inputs: from `build_inputs`.
-            noise: one per request, from `noise`; like the inputs it may be on any device.
-            sampling: how; None uses the configuration's.
-            all_images: decode every image, or only those of the last latent.
-            precision: of the experts' matrix products (autocast); codecs always use float32.
+        There is one `noise` per request; like the inputs it may be on any device. Of the images,
+        all are decoded or only those of the last latent. `precision` is that of the experts' matrix
+        products (autocast); codecs always use float32.
         """
         inputs = inputs.to(self.device)
         first, noise = self.first_latents(inputs), mapped(noise, lambda one: one.to(self.device))

@@ -264,13 +264,10 @@ E = TypeVar("E", bound=TrainingEpisode)
 class WindowSampler:
     """Samples windows uniformly over starts, and over the episodes of each domain.
 
-    Args:
-        episodes: at least one, each at least `max_steps` long.
-        rng: source of all randomness.
-        commanded_fraction: share of commanded windows, from episodes with commanded actions.
-        chained_fraction: share of commanded windows that are anchored like a later chunk.
-        human_share: share of windows from human episodes, if there are human and robot ones; None:
-            every episode is equally likely.
+    Episodes are at least `max_steps` long. Of windows from episodes with commanded actions, the
+    `commanded_fraction` has them, and of these the `chained_fraction` is anchored like a later
+    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
+    None: every episode is equally likely.
     """
 
     def __init__(

@@ -47,12 +47,7 @@ def evaluate_prediction(
 ) -> dict[str, float]:
     """Errors over every window that starts at a multiple of `stride`.
 
-    Args:
-        model: ready to predict.
-        episodes: held out, none of them trained on.
-        train_fingerprints: fingerprints of the training episodes, from the checkpoint.
-        stride: steps between window starts.
-        action_kind: kind of actions given; episodes without it give their measured ones.
+    Episodes are held out; those without actions of this kind give their measured ones.
 
     Returns:
         psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
