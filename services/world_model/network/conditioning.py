@@ -145,7 +145,9 @@ class VideoCondition(ExpertCondition):
 
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
         """What does not depend on the flow time."""
-        terms, tokens, actions = [], None, _of_latents(features)
+        terms, tokens = [], None
+        # Of each latent frame after the first, as the right hand sees them.
+        actions = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
         if self.actions is not None:
             terms.append(after_first(self.actions(actions.flatten(2))))
         if self.action_tokens is not None:
@@ -254,11 +256,6 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
 def after_first(condition: Float32[Tensor, "batch later ..."]) -> Float32[Tensor, "batch time ..."]:
     """Prepend zeros for index 0, which has no action (c_0 = 0)."""
     return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
-
-
-def _of_latents(features: ActionFeatures) -> Float32[Tensor, "batch latents 4 67"]:
-    """Actions of each latent frame after the first, as the right hand sees them."""
-    return split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
 
 
 def _bounded(features: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
