@@ -200,12 +200,9 @@ def _standing_still(request: PredictionRequest, *, head_moves: bool) -> Predicti
 
 
 def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:
+    touch = {"predicted_kpa": predicted.tactile_kpa, "true_kpa": true.tactile_kpa}
     return {
         f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),
-        f"tactile_mse{suffix}": tactile_metrics.mse(
-            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
-        ),
-        f"contact_f1{suffix}": tactile_metrics.contact_f1(
-            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
-        ),
+        f"tactile_mse{suffix}": tactile_metrics.mse(**touch),
+        f"contact_f1{suffix}": tactile_metrics.contact_f1(**touch),
     }
