@@ -241,10 +241,11 @@ def core_loss(
     )
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
-    true = table.objects_of_latents(rows, batch.start_step)
+    latents = table.latent_steps(batch.start_step)
+    true = mapped(table.objects, lambda values: values[rows][:, latents])
     true = replace(_held_still(true, batch.is_held), present=true.present)
     known = start.objects.present[:, None] * table.labelled[rows, None, None]
-    known = known * table.known_of_latents(rows, batch.start_step)
+    known = known * table.objects_known[rows][:, latents]
     steps = table.steps_after(batch.start_step)
     moves = ~batch.is_held
     touch = data.touch[rows][:, steps].float()

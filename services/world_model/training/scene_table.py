@@ -49,11 +49,8 @@ class HandTable:
     @classmethod
     def of(cls, motions: Sequence[HandMotion]) -> "HandTable":
         """Stack motions of one length."""
-        return cls(
-            torch.from_numpy(np.stack([motion.points_m for motion in motions])),
-            torch.from_numpy(np.stack([motion.axes for motion in motions])),
-            torch.from_numpy(np.stack([motion.joints_rad for motion in motions])),
-        )
+        parts = ([getattr(one, part.name) for one in motions] for part in fields(cls))
+        return cls(*(torch.from_numpy(np.stack(part)) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -63,14 +60,14 @@ class SceneTable:
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
     pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
     measurement, `touched` those of tasks of which some have poses from touch, and `placed_sd_m` is
-    the standard deviation of positions from clicks or touch, 0 of others.
-    `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
-    pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
-    given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
-    share in what is drawn, NaN if it follows from their number. `labelled` marks episodes whose
-    object poses are trained on; `boxes_m` are the usual boxes of each task's objects in their
-    frames (middle, half sizes), and `size` factors of their width and height. `instruction` are the
-    features of each episode's sentence.
+    the standard deviation of positions from clicks or touch, 0 of others. `images` are those of the
+    steps `image_steps`, where `shown`; `in_contact` marks pads in contact; `sent` are commanded
+    hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
+    episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
+    follows from their number. `labelled` marks episodes whose object poses are trained on;
+    `boxes_m` are the usual boxes of each task's objects in their frames (middle, half sizes), and
+    `size` factors of their width and height. `instruction` are the features of each episode's
+    sentence.
     """
 
     sent: HandTable
@@ -170,15 +167,9 @@ class SceneTable:
         ends = torch.arange(start + STEPS_PER_LATENT, self.num_steps, STEPS_PER_LATENT)
         return ends < self.length[rows, None]
 
-    def objects_of_latents(self, rows: Tensor, start: int) -> ObjectPoses:
-        """True objects at the start and at every latent step after it."""
-        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-        return mapped(self.objects, lambda values: values[rows][:, steps])
-
-    def known_of_latents(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents objects"]:
-        """Whether objects are known at the start and at every latent step after it."""
-        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-        return self.objects_known[rows][:, steps]
+    def latent_steps(self, start: int) -> Int64[Tensor, " latents"]:
+        """The start and every latent step after it."""
+        return torch.arange(start, self.num_steps, STEPS_PER_LATENT)
 
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
