@@ -208,14 +208,8 @@ class ModelWorld(BatchWorld[ModelState]):
             "step": state.step,
             "task": state.task,
         }
-        arrays = {
-            "image": state.image,
-            "tactile_kpa": state.tactile_kpa,
-            "reached": state.reached,
-            "anchor": np.stack(state.anchor.as_tuple()),
-            "K_head": state.K_head,
-        }
-        return pack(fields, arrays)
+        arrays = {name: getattr(state, name) for name in _SNAPSHOT_ARRAYS}
+        return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> ModelState:
         """Restore the state of a snapshot.
