@@ -56,8 +56,8 @@ class HandMotion:
     """Both hands over n steps in the world frame, left before right.
 
     `points_m` are the wrist, thumb … little fingertip, their PIP joints, and a point halfway
-    between the wrist and the knuckles; `axes` the first two columns of
-    R_world_wrist; `Ts_world_camera` the head camera's poses.
+    between the wrist and the knuckles; `axes` the first two columns of R_world_wrist;
+    `Ts_world_camera` the head camera's poses.
     """
 
     points_m: Float32[np.ndarray, "n 2 12 3"]
