@@ -114,7 +114,10 @@ class Renderer:
 
     def _prepared(self, drawing: Drawing) -> PreparedScenes:
         """The prepared start of a drawing; those that were used last are kept."""
-        scenes = self._scene(drawing)
+        start = drawing.states.take(slice(0, 1)).padded(MAX_DRAWN_OBJECTS)
+        boxes_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
+        boxes_m[0, : len(drawing.boxes_m)] = drawing.boxes_m
+        scenes = Scenes(drawing.start_image[None], drawing.K_head[None], start, boxes_m)
         arrays = [scenes.images, scenes.K_head, scenes.boxes_m]
         arrays += [getattr(scenes.states, field.name) for field in fields(scenes.states)]
         key = b"".join(array.tobytes() for array in arrays) + str(scenes.images.shape).encode()
@@ -126,10 +129,3 @@ class Renderer:
             if len(self._starts) > _KEPT_STARTS:
                 self._starts.popitem(last=False)
         return prepared
-
-    def _scene(self, drawing: Drawing) -> Scenes:
-        """The start of a drawing, with empty object slots up to the maximum."""
-        start = drawing.states.take(slice(0, 1)).padded(MAX_DRAWN_OBJECTS)
-        boxes_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
-        boxes_m[0, : len(drawing.boxes_m)] = drawing.boxes_m
-        return Scenes(drawing.start_image[None], drawing.K_head[None], start, boxes_m)
