@@ -187,7 +187,7 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
 
 def _recorded(order: Order, options: TakeOptions) -> TruthEpisode:
     stage = stage_of(order.task, order.domain)
-    played = order.policy and _played_by(order.policy, stage, order.seed)
+    played = None if order.policy is None else _played_by(order.policy, stage, order.seed)
     return record(stage, order.seed, options, played=played)
 
 
@@ -250,7 +250,7 @@ def make_training_data(
     mix: Mix,
     *,
     workers: Workers | None = None,
-    scope: Scope | None = None,
+    scope: Scope = Scope(),
     policy: PolicyChoice | None = None,
 ) -> dict[str, int]:
     """Record one episode per seed, task and domain; existing episodes are kept.
@@ -264,7 +264,6 @@ def make_training_data(
     Raises:
         InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
     """
-    scope = scope or Scope()
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(
             f"training data: got seeds {seeds}, tasks {scope.tasks} and domains {scope.domains}, "
