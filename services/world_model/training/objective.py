@@ -93,9 +93,9 @@ def losses(
     noise = mapped(clean, lambda one: processes.randn(one.shape, generator).to(device))
     if options.own_noisy:
         noisy, t = own_noisy(model, inputs, first, noise, generator)
-        noise = combined([noisy, clean], lambda pair: implied_noise(*pair, t))
+        noise = combined([noisy, clean], lambda pair: implied_noise(pair[0], pair[1], t))
     else:
-        noisy = combined([clean, noise], lambda pair: add_noise(*pair, t))
+        noisy = combined([clean, noise], lambda pair: add_noise(pair[0], pair[1], t))
     target = clean
     if model.config.prediction == "velocity":
         # Of the straight path from data to noise.
