@@ -74,14 +74,9 @@ def imagine_all(
     checkpoint: Path,
     only_judged: bool = True,
 ) -> list[str]:
-    """Imagine robot episodes of a store, and return the new ids; existing results are kept.
+    """Imagine robot episodes of a store in another, and return the new ids; results are kept.
 
-    Args:
-        episode_ids: episodes to imagine.
-        episodes: store to read.
-        output: store to write.
-        checkpoint: checkpoint of a world model of either kind.
-        only_judged: whether a state model draws only the images that the success classifier uses.
+    With `only_judged`, a state model draws only the images that the success classifier uses.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)

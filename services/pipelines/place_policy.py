@@ -211,9 +211,6 @@ def _covariance(
 class PlacePolicy:
     """Sends the motion of a whole take, in chunks of 16 actions.
 
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
-
     Raises:
         InvalidInputError: weights that do not fit the configuration in the metadata.
     """
@@ -339,12 +336,7 @@ def read_demonstrations(settings: TrainPolicySettings) -> list[Demonstration]:
 def train_place_policy(
     demonstrations: Sequence[Demonstration], model: Path, *, command: str
 ) -> Checkpoint:
-    """Fit the motions of every task.
-
-    Args:
-        demonstrations: successful takes.
-        model: state model whose start readers find the objects.
-        command: command that repeats the training.
+    """Fit the motions of every task; the start readers of the state model `model` find the objects.
 
     Raises:
         InvalidInputError: too few takes of a task.

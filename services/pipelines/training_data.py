@@ -32,7 +32,7 @@ from services.twin.settings import TwinSettings
 from services.twin.sizes import Sizes, object_boxes_m
 from services.twin.stage import Stage
 from services.twin.take_options import MIXES, Mix, PlayedActions, TakeOptions, options_of
-from services.twin.tasks import EVALUATED, TASK_NAMES, named_tasks
+from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
@@ -71,9 +71,6 @@ class Scope:
                 f"training data: got a share of {self.varied} varied and {self.resized} resized "
                 "takes, expected 0 … 1"
             )
-        for task in self.tasks:
-            if task not in TASK_NAMES:
-                raise UnknownNameError("task", task, list(TASK_NAMES))
         for domain in self.domains:
             if domain not in DOMAINS:
                 raise UnknownNameError("domain", domain, list(DOMAINS))
@@ -190,9 +187,7 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
 
 def _recorded(order: Order, options: TakeOptions) -> TruthEpisode:
     stage = stage_of(order.task, order.domain)
-    if order.policy is None:
-        return record(stage, order.seed, options)
-    played = _played_by(order.policy, stage, order.seed)
+    played = None if order.policy is None else _played_by(order.policy, stage, order.seed)
     return record(stage, order.seed, options, played=played)
 
 
@@ -255,18 +250,12 @@ def make_training_data(
     mix: Mix,
     *,
     workers: Workers | None = None,
-    scope: Scope | None = None,
+    scope: Scope = Scope(),
     policy: PolicyChoice | None = None,
 ) -> dict[str, int]:
     """Record one episode per seed, task and domain; existing episodes are kept.
 
-    Args:
-        store: folder of the store.
-        seeds: seeds of the scenes.
-        mix: kinds of takes.
-        workers: where they are recorded; default: one process per core.
-        scope: tasks, domains and streams.
-        policy: policy that acts instead of the scripts; `mix` is then ignored.
+    By default, each core records one at a time. A policy acts instead of the scripts of `mix`.
 
     Returns:
         Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
@@ -275,7 +264,6 @@ def make_training_data(
     Raises:
         InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
     """
-    scope = scope or Scope()
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(
             f"training data: got seeds {seeds}, tasks {scope.tasks} and domains {scope.domains}, "

@@ -119,10 +119,7 @@ def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMet
 def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
     """Load a checkpoint strictly, in evaluation mode.
 
-    Args:
-        path: file to read.
-        max_bytes: largest size of the file; by default 64 MiB, and for the full size the memory
-            that is available.
+    By default, a file may have 64 MiB, and one of the full size the memory that is available.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.

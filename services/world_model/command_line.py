@@ -30,7 +30,7 @@ from services.world_model.settings import (
     TrainStateCommand,
     WorldModelSettings,
 )
-from services.world_model.training.distribution import Processes, joined_processes
+from services.world_model.training.distribution import joined_processes
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
@@ -63,16 +63,7 @@ def run_distill(arguments: list[str]) -> int:
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
-    with joined_processes() as processes:
-        report = _train_together(settings, processes)
-    if report is not None:
-        print(_table(report))
-        write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
-    return 0
-
-
-def _train_together(settings: TrainSettings, processes: Processes) -> TrainingReport | None:
-    """Train with a progress bar of the first process."""
+    """Train with a progress bar of the first process, which prints the report."""
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -81,7 +72,7 @@ def _train_together(settings: TrainSettings, processes: Processes) -> TrainingRe
         TimeRemainingColumn(),
     )
     lines = ProgressLines("training")
-    with Progress(*columns, disable=not processes.is_first) as bar:
+    with joined_processes() as processes, Progress(*columns, disable=not processes.is_first) as bar:
         task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
 
         def on_progress(now: TrainingProgress) -> None:
@@ -96,7 +87,11 @@ def _train_together(settings: TrainSettings, processes: Processes) -> TrainingRe
                 losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
                 lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
-        return train(settings, on_progress, processes)
+        report = train(settings, on_progress, processes)
+    if report is not None:
+        print(_table(report))
+        write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
+    return 0
 
 
 def _train_state(settings: TrainStateCommand | AdaptStateCommand) -> int:

@@ -26,7 +26,15 @@ def train_settings(arguments: list[str]) -> type[TrainStateCommand] | type[Train
         raise UnknownNameError("preset", preset, [STATE, *PRESETS])
     if preset != STATE:
         return TrainCommand
-    _refuse_other_settings()
+    path, section = configuration_path(), section_of(TrainCommand)
+    # Nothing would read them.
+    if path is not None and read_configuration(path).get(section, {"preset": STATE}) != {
+        "preset": STATE
+    }:
+        raise InvalidInputError(
+            f"{path}: [{section}] has settings of the paper's form, and no preset of it is named; "
+            f'add preset = "tiny" there, or move them to [{section_of(TrainStateCommand)}]'
+        )
     return TrainStateCommand
 
 
@@ -38,22 +46,6 @@ def adapt_settings(arguments: list[str]) -> type[AdaptStateCommand] | type[Adapt
     from services.world_model.checkpoints import is_state_checkpoint
 
     return AdaptStateCommand if is_state_checkpoint(Path(init)) else AdaptCommand
-
-
-def _refuse_other_settings() -> None:
-    """Refuse settings of the paper's form without a preset: nothing would read them.
-
-    Raises:
-        InvalidInputError: the configuration file has some.
-    """
-    path, section = configuration_path(), section_of(TrainCommand)
-    if path is not None and read_configuration(path).get(section, {"preset": STATE}) != {
-        "preset": STATE
-    }:
-        raise InvalidInputError(
-            f"{path}: [{section}] has settings of the paper's form, and no preset of it is named; "
-            f'add preset = "tiny" there, or move them to [{section_of(TrainStateCommand)}]'
-        )
 
 
 def _value(arguments: list[str], name: str, *classes: type[CommandSettings]) -> str | None:

@@ -143,15 +143,7 @@ class TrainSettings(RunSettings):
 def command_line(settings: TrainSettings) -> str:
     """Command that repeats a run, as its checkpoint records it."""
     places = ("episodes", "human", "heldout", "init", "tokenizer")
-    local = (
-        "output",
-        "json_path",
-        "resume",
-        "state_every_cpu_s",
-        "device",
-        "wan",
-        "plan",
-    )
+    local = {"output", "json_path", "resume", "state_every_cpu_s", "device", "wan", "plan"}
     command = f"dextouch train world-model --preset={settings.preset}"
     return recorded_command(settings, command, places, {*local, "preset"})
 

@@ -79,10 +79,7 @@ def initial_model(
 ) -> JointWorldModel:
     """A new model; that of the full size begins with the pretrained weights of its files.
 
-    Args:
-        config: network to build.
-        files: pretrained networks; unused by the small size.
-        filled_later: a checkpoint replaces all weights, so that files are not needed.
+    With `filled_later`, a checkpoint replaces all weights, so that files are not needed.
 
     Raises:
         InvalidInputError: the full size without a folder.
@@ -176,12 +173,7 @@ class StoredWeights:
 
 
 def find_weights(folder: Path, *, stem: str, where: str) -> StoredWeights:
-    """Find the weights of a network in a folder and read their headers.
-
-    Args:
-        folder: local folder.
-        stem: beginning of the file names, such as `diffusion_pytorch_model`.
-        where: context for error messages.
+    """Find the files of a network, whose names begin with `stem`, and read their headers.
 
     Raises:
         NotFoundError: no such folder or file, or a shard is missing.
@@ -248,12 +240,8 @@ def load_weights(
 ) -> None:
     """Load a network in place, in the precision of its parameters; it may be on the meta device.
 
-    Args:
-        network: its parameters are replaced; non-persistent buffers stay as they are.
-        stored: from `find_weights`.
-        rules: names of its tensors in both layouts.
-        where: context for error messages.
-        max_bytes: limit of memory for the weights; None for the memory that is available.
+    Non-persistent buffers stay as they are. The weights may take `max_bytes` of memory; None: what
+    is available.
 
     Raises:
         InvalidInputError: missing or unexpected tensors, or wrong shapes.

@@ -316,14 +316,10 @@ class WorldModelSettings(WorldServiceSettings):
 def recorded_command(
     settings: FrozenModel, command: str, places: Sequence[str], left_out: set[str]
 ) -> str:
-    """Command that repeats a run: every setting that differs from its default.
+    """Command that repeats a run: every setting that differs from its default, but for `left_out`.
 
-    Args:
-        settings: of the run.
-        command: first words.
-        places: settings that name stores and files. Their last path component is given, since
-            folders differ between machines.
-        left_out: settings that do not matter.
+    Of the `places`, settings that name stores and files, the last path component is given, since
+    folders differ between machines.
     """
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     known = {name: given.pop(name) for name in places if name in given}

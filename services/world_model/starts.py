@@ -63,10 +63,8 @@ def observed_start(
 ) -> ObservedStart:
     """Validate the observed step of a start.
 
-    Args:
-        start: start of a rollout.
-        tasks: tasks that the world knows.
-        image_px: side that the middle square of the image is scaled to; None leaves it as it is.
+    `image_px` is the side that the middle square of the image is scaled to; None leaves it as it
+    is.
 
     Raises:
         InvalidInputError: missing observation, anchor or K_head.
@@ -207,8 +205,7 @@ def refuse_non_finite(model: str, predicted: Mapping[str, Tensor]) -> None:
 class SceneReader:
     """Finds the objects of requests, for a model that is conditioned on contact geometry.
 
-    Args:
-        checkpoint: a state model, whose start readers are averaged.
+    The start readers of a state model are averaged.
     """
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:

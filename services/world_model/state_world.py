@@ -37,7 +37,6 @@ from services.world_model.dynamics.model import (
     batched,
     first_steps,
     mean_poses,
-    mean_size,
     memory_arrays,
     memory_from_arrays,
     memory_of,
@@ -97,9 +96,6 @@ class StateWorld(BatchWorld[StateRollout]):
 
     Deterministic: the seeds of chunks have no effect.
 
-    Args:
-        checkpoint: loaded, from `read_state_checkpoint`.
-
     Raises:
         InvalidInputError: weights that are not float32.
     """
@@ -114,10 +110,9 @@ class StateWorld(BatchWorld[StateRollout]):
         self._dynamics = checkpoint.dynamics
         self._dynamics.trace()
         self._renderer = Renderer(checkpoint.renderer)
-        known = checkpoint.metadata.dynamics
-        self._instructions = instruction_features(known.instructions, known)
         self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
         config = self._metadata.dynamics
+        self._instructions = instruction_features(config.instructions, config)
         self._description = WorldDescription(
             name=self._metadata.name,
             kind="model",
@@ -291,7 +286,7 @@ class StateWorld(BatchWorld[StateRollout]):
         present = poses[..., 2] > ABSENT_POSE[2]
         states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
-        size = mean_size(state.memory)[0, : len(boxes_m)].double().numpy()
+        size = state.memory.start.size.mean(0)[0, : len(boxes_m)].double().numpy()
         boxes_m = boxes_m * size[:, BOX_AXES]
         return Drawing(state.image, state.K_head, states, boxes_m)
 
@@ -359,7 +354,7 @@ class StateWorld(BatchWorld[StateRollout]):
     def _size_deviation(self, state: StateRollout) -> float:
         """Largest deviation of a movable object's size from the usual one, as a share of it."""
         movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
-        deviations = (mean_size(state.memory)[0] - 1.0).abs() * movable[:, None]
+        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
         return float(deviations.max())
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:

@@ -33,6 +33,7 @@ from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.starts import (
+    ObservedStart,
     SceneReader,
     checked_chunk,
     checked_selectors,
@@ -48,29 +49,21 @@ _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
 
 
 @dataclass(frozen=True)
-class ModelState:
-    """State of a rollout; `reached` is relative to `anchor`, the poses of step 0."""
+class ModelState(ObservedStart):
+    """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0."""
 
-    image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
-    reached: Float64[np.ndarray, "67"]
-    anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
     instruction: str
     action_kind: ActionKind
     step: int
-    task: str = ""
+    task: str
 
 
 class ModelWorld(BatchWorld[ModelState]):
     """A flow-matching model as a world.
 
-    Args:
-        checkpoint: loaded, from `read_checkpoint`.
-        sampling: network calls, solver and so on; None uses the checkpoint's.
-        precision: of the experts' matrix products; codecs are always float32.
-        reader: finds the objects of every chunk's first step, for a model that is conditioned on
-            contact geometry.
+    Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
+    products; codecs are always float32. A model that is conditioned on contact geometry needs a
+    `reader`, which finds the objects of every chunk's first step.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks.
@@ -127,11 +120,7 @@ class ModelWorld(BatchWorld[ModelState]):
         """
         first = observed_start(start, tasks=self._description.tasks)
         state = ModelState(
-            image=first.image,
-            tactile_kpa=first.tactile_kpa,
-            reached=first.reached,
-            anchor=first.anchor,
-            K_head=first.K_head,
+            **vars(first),
             instruction=start.instruction,
             action_kind=start.action_kind,
             step=0,
@@ -219,14 +208,8 @@ class ModelWorld(BatchWorld[ModelState]):
             "step": state.step,
             "task": state.task,
         }
-        arrays = {
-            "image": state.image,
-            "tactile_kpa": state.tactile_kpa,
-            "reached": state.reached,
-            "anchor": np.stack(state.anchor.as_tuple()),
-            "K_head": state.K_head,
-        }
-        return pack(fields, arrays)
+        arrays = {name: getattr(state, name) for name in _SNAPSHOT_ARRAYS}
+        return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> ModelState:
         """Restore the state of a snapshot.

@@ -13,7 +13,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
-from services.world_model.training.dataset import EpisodeArrays, cut_window, load_episodes
+from services.world_model.training.dataset import EpisodeArrays, WindowPosition, load_episodes
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 
 # Far from the seeds of training and of the checkpoint's own held-out set.
@@ -102,7 +102,7 @@ def test_the_shipped_model_is_small_and_knows_its_history(shipped):
 def test_it_looks_before_it_feels(shipped, tmp_path):
     """With the objects elsewhere the same motions must not be felt: touch follows sight."""
     windows = [
-        cut_window(episode, start, 17, action_kind="commanded")
+        episode.cut(WindowPosition(0, start, 17, action_kind="commanded"))
         for episode in recorded(tmp_path, miss=True)
         for start in range(0, 65, 8)
     ]

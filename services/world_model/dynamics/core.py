@@ -117,13 +117,7 @@ class SceneFuture:
 
 
 class MemberLinear(nn.Module):
-    """A linear layer; initialized as `nn.Linear`.
-
-    Args:
-        members: number of members.
-        inputs: size of the input's last axis.
-        outputs: size of the output's last axis.
-    """
+    """A linear layer of every member; initialized as `nn.Linear`."""
 
     def __init__(self, members: int, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -139,12 +133,7 @@ class MemberLinear(nn.Module):
 
 
 class MemberNorm(nn.Module):
-    """A layer normalization of the last axis (Ba et al. 2016).
-
-    Args:
-        members: number of members.
-        width: size of the last axis.
-    """
+    """A layer normalization of the last axis (Ba et al. 2016) of every member."""
 
     def __init__(self, members: int, width: int) -> None:
         super().__init__()
@@ -158,13 +147,7 @@ class MemberNorm(nn.Module):
 
 
 class MemberGRU(nn.Module):
-    """A gated recurrent cell (Cho et al. 2014), as `nn.GRUCell`.
-
-    Args:
-        members: number of members.
-        inputs: size of an input.
-        width: size of the state.
-    """
+    """A gated recurrent cell (Cho et al. 2014) of every member, as `nn.GRUCell`."""
 
     def __init__(self, members: int, inputs: int, width: int) -> None:
         super().__init__()
@@ -187,10 +170,6 @@ class RecurrentCore(nn.Module):
 
     The members of an ensemble are computed together: entries of the first member come first, then
     those of the second, and so on, equally many of each.
-
-    Args:
-        config: configuration of the dynamics model.
-        members: number of members.
     """
 
     boxes_m: Tensor
@@ -264,9 +243,7 @@ class RecurrentCore(nn.Module):
     ) -> Float32[Tensor, "batch latents"]:
         """Mean excess of the hands' own features over their range in training; 0 inside it.
 
-        Args:
-            commands: of the next latents.
-            before_m: the wrists' positions before them.
+        `before_m` are the wrists' positions before the commands.
         """
         wrist_m = torch.cat([before_m[:, None], commands.points_m[:, :, -1, :, 0]], dim=1)
         own = own_features(commands, wrist_m)
@@ -290,10 +267,7 @@ class RecurrentCore(nn.Module):
     ) -> CoreState:
         """The state before the first step, with the measured hands as one latent step.
 
-        Args:
-            start: start of the rollout.
-            holding: the measured hands.
-            human: 1 where a person acts, 0 for robots; None for robots alone, as in rollouts.
+        `human` is 1 where a person acts, 0 for robots; None for robots alone, as in rollouts.
         """
         known = [
             compressed(start.pads_kpa * 1e-2),
@@ -317,11 +291,8 @@ class RecurrentCore(nn.Module):
     ) -> tuple[SceneFuture, CoreState]:
         """Predictions for every latent, and the state after the last one.
 
-        Args:
-            commands: of the next latents.
-            start: start of the rollout, the same for all its chunks.
-            state: from `first_state` or from the previous chunk.
-            human: as for `first_state`.
+        `start` is the same for all chunks of a rollout, `state` is from `first_state` or from the
+        previous chunk, and `human` as for `first_state`.
         """
         flags = self._flags(start, human)
         # Slots that no entry of the batch uses need no computation.
@@ -417,8 +388,7 @@ class RecurrentCore(nn.Module):
 def direction_free_inputs(width: int) -> list[int]:
     """Inputs of the estimate of success that are lengths, heights and angles.
 
-    Args:
-        width: of the hidden state, which comes first.
+    The hidden state, of this width, comes first.
     """
     of_pairs = width + MAX_OBJECTS * _END_SIZE
     of_objects = [

@@ -56,8 +56,8 @@ class HandMotion:
     """Both hands over n steps in the world frame, left before right.
 
     `points_m` are the wrist, thumb … little fingertip, their PIP joints, and a point halfway
-    between the wrist and the knuckles; `axes` the first two columns of
-    R_world_wrist; `Ts_world_camera` the head camera's poses.
+    between the wrist and the knuckles; `axes` the first two columns of R_world_wrist;
+    `Ts_world_camera` the head camera's poses.
     """
 
     points_m: Float32[np.ndarray, "n 2 12 3"]
@@ -76,12 +76,9 @@ class HandMotion:
 def hand_motion(
     actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
 ) -> HandMotion:
-    """Motion of both hands under the given actions.
+    """Motion of both hands under actions relative to `anchor`.
 
-    Args:
-        actions: relative to `anchor`.
-        anchor: T_world poses that the actions are relative to.
-        validated: the actions were returned by `check_actions` and are not checked again.
+    With `validated`, `check_actions` has returned the actions, and they are not checked again.
 
     Raises:
         DegenerateRotationError: the actions contain a degenerate rotation.

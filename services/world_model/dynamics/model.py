@@ -121,9 +121,7 @@ def by_pad(
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    Args:
-        tactile_kpa: of all taxels.
-        reduce: such as `np.mean`, called with an axis.
+    `reduce` takes the taxels of a pad and an axis, such as `np.mean`.
     """
     tips, palm = split_pads(tactile_kpa)
     pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
@@ -196,12 +194,7 @@ class ImaginedSteps(_Run):
 
 
 class DynamicsModel(nn.Module):
-    """Ensemble of start readers and cores trained from different seeds, with a shared touch codec.
-
-    Args:
-        config: configuration of every member.
-        num_members: size of the ensemble, at least one.
-    """
+    """Ensemble of start readers and cores from different seeds, with a shared touch codec."""
 
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
         super().__init__()
@@ -226,14 +219,9 @@ class DynamicsModel(nn.Module):
     ) -> SceneMemory:
         """Estimate the scene at an observed step.
 
-        If the hands touch nothing, the scene is at rest until they move.
-
-        Args:
-            first: the step as input of the readers.
-            tactile_kpa: pressure at that step.
-            holding: the measured hands, from `Commands.holding`.
-            commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
-            instruction: features of the sentence, from `instruction_features`.
+        If the hands touch nothing, the scene is at rest until they move. `holding` are the measured
+        hands, from `Commands.holding`, and `instruction` the features of the sentence; `commanded`
+        is 1 if the rollout's actions are commanded, 0 if they are measured.
         """
         known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded, instruction)
         readings: list[Reading] = [reader(first) for reader in self.readers()]
@@ -356,11 +344,6 @@ def mean_poses(poses: ObjectPoses) -> ObjectPoses:
     )
 
 
-def mean_size(memory: SceneMemory) -> Float32[Tensor, "batch objects 2"]:
-    """Width and height of the objects as factors of the usual ones, averaged over members."""
-    return memory.start.size.mean(0)
-
-
 def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
     """Poses at every step of the model grid, interpolated linearly between latent steps."""
     weight = torch.arange(1, STEPS_PER_LATENT + 1) / STEPS_PER_LATENT
@@ -441,10 +424,7 @@ def memory_from_arrays(
 
 def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
     """The memory of one rollout with zeros: names, shapes and types of a snapshot."""
-    objects = MAX_OBJECTS
-
-    def zeros(*shape: int) -> Tensor:
-        return torch.zeros(shape)
+    objects, zeros = MAX_OBJECTS, torch.zeros
 
     def poses(*batch: int) -> ObjectPoses:
         return ObjectPoses(
@@ -457,7 +437,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         size=zeros(members, 1, objects, 2),
         touch=zeros(members, 1, 2, config.touch_channels),
         pads_kpa=zeros(members, 1, NUM_PADS),
-        task=torch.zeros((members, 1), dtype=torch.int64),
+        task=zeros(members, 1, dtype=torch.int64),
         commanded=zeros(members, 1),
         instruction=zeros(members, 1, config.instruction_size),
     )
@@ -476,7 +456,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         tactile_kpa=zeros(1, 2, NUM_TAXELS),
         success=zeros(members, 1),
         points_m=zeros(1, 2, NUM_POINTS, 3),
-        num_still=torch.zeros(1, dtype=torch.int64),
+        num_still=zeros(1, dtype=torch.int64),
     )
 
 

@@ -74,9 +74,6 @@ class StartReader(nn.Module):
     Feature points of the whole image give a first guess; a crop about each guess, with the hands as
     seen from there, corrects it. Channels of the image are standardized, so that exposure, gain and
     the colour of the light have no effect.
-
-    Args:
-        config: configuration of the dynamics model.
     """
 
     height_mean: Tensor

@@ -118,28 +118,36 @@ class Constants:
         return Condition(sum(self.terms, start=time), self.actions)
 
 
-class VideoCondition(nn.Module):
-    """Condition of every latent frame."""
+class ExpertCondition(nn.Module):
+    """What both experts are conditioned on: the actions of `num_steps`, and contact geometry."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: NetworkConfig, *, width: int, num_steps: int) -> None:
         super().__init__()
-        width = config.video_width
         self.actions: nn.Sequential | None = None
         self.action_tokens: ActionTokens | None = None
         if config.action_conditioning == "cross_attention":
-            self.action_tokens = ActionTokens(num_steps=FRAMES_PER_LATENT, width=width)
+            self.action_tokens = ActionTokens(num_steps=num_steps, width=width)
         else:
-            # Both hands and the camera for each of the four steps of a latent frame.
-            self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
+            self.actions = two_layers(num_steps * ACTION_WIDTH, 2 * width, width)
         self.geometry: nn.Sequential | None = None
         if config.use_contact_geometry:
-            self.geometry = two_layers(FRAMES_PER_LATENT * 2 * GEOMETRY_SIZE, 2 * width, width)
+            self.geometry = two_layers(num_steps * 2 * GEOMETRY_SIZE, 2 * width, width)
+
+
+class VideoCondition(ExpertCondition):
+    """Condition of every latent frame."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        width = config.video_width
+        super().__init__(config, width=width, num_steps=FRAMES_PER_LATENT)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
         """What does not depend on the flow time."""
-        terms, tokens, actions = [], None, _of_latents(features)
+        terms, tokens = [], None
+        # Of each latent frame after the first, as the right hand sees them.
+        actions = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
         if self.actions is not None:
             terms.append(after_first(self.actions(actions.flatten(2))))
         if self.action_tokens is not None:
@@ -154,21 +162,12 @@ class VideoCondition(nn.Module):
         return constants.at(self.time(t))
 
 
-class TactileCondition(nn.Module):
+class TactileCondition(ExpertCondition):
     """Condition of every step and hand."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
         width = config.tactile_width
-        self.actions: nn.Sequential | None = None
-        self.action_tokens: ActionTokens | None = None
-        if config.action_conditioning == "cross_attention":
-            self.action_tokens = ActionTokens(num_steps=1, width=width)
-        else:
-            self.actions = two_layers(ACTION_WIDTH, 2 * width, width)
-        self.geometry: nn.Sequential | None = None
-        if config.use_contact_geometry:
-            self.geometry = two_layers(2 * GEOMETRY_SIZE, 2 * width, width)
+        super().__init__(config, width=width, num_steps=1)
         self.layout: nn.Sequential | None = None
         self.scene: SceneEncoder | None = None
         if config.use_scene_encoder:
@@ -257,11 +256,6 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
 def after_first(condition: Float32[Tensor, "batch later ..."]) -> Float32[Tensor, "batch time ..."]:
     """Prepend zeros for index 0, which has no action (c_0 = 0)."""
     return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
-
-
-def _of_latents(features: ActionFeatures) -> Float32[Tensor, "batch latents 4 67"]:
-    """Actions of each latent frame after the first, as the right hand sees them."""
-    return split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
 
 
 def _bounded(features: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:

@@ -125,13 +125,6 @@ class WanConfig(FrozenModel):
         }
 
 
-def dtype_of(name: str, dtype: "torch.dtype") -> "torch.dtype":
-    """Kind of number of one tensor of the transformer."""
-    import torch
-
-    return torch.float32 if any(part in name for part in FLOAT32_PARTS) else dtype
-
-
 class NetworkConfig(FrozenModel):
     """Shape and sampling of the joint model; stored in every checkpoint."""
 

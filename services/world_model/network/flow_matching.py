@@ -137,13 +137,6 @@ def implied_noise(
     return clean + (noisy - clean) / t.view(-1, *[1] * (clean.ndim - 1))
 
 
-def velocity(
-    clean: Float32[Tensor, "batch ..."], noise: Float32[Tensor, "batch ..."]
-) -> Float32[Tensor, "batch ..."]:
-    """Velocity of the straight path from data to noise: ε - x_0."""
-    return noise - clean
-
-
 def clean_from_velocity(
     noisy: Float32[Tensor, "batch ..."],
     velocity: Float32[Tensor, "batch ..."],
@@ -169,13 +162,12 @@ def sample(
 ) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
     """Integrate from noise to data, for both streams at once.
 
-    Args:
-        denoise: maps noisy video, noisy touch and times [batch] to predictions of the clean ones.
-        noise: initial noise of both streams.
-        num_steps: network calls, at least one; with one the sample is the first prediction.
-        shift: shift of the time grid.
-        sampler: solver, the same for both streams.
-        stop_after: steps to take of these, for noisy latents on the way; None for all.
+    `denoise` maps noisy video, noisy touch and times [batch] to predictions of the clean ones. With
+    one network call the sample is the first prediction. After `stop_after` of `num_steps` calls the
+    latents are noisy ones on the way.
+
+    Raises:
+        InvalidInputError: less than one step.
     """
     if num_steps < 1:
         raise InvalidInputError(f"sampling: got {num_steps} steps, expected at least 1")

@@ -6,7 +6,6 @@ tensors, so that training and serving treat a window identically.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from dextouch.hands.actions import (
     pose_from_9d,
     pose_to_9d,
 )
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.features import (
@@ -54,7 +53,6 @@ GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
 _PER_M = 10.0
 # Standard deviation of a point's Gaussian blot, in raster cells.
 BLOT_CELLS = 1.0
-_WRIST_AND_SIDES = (("left", WRIST_LEFT, JOINTS_LEFT), ("right", WRIST_RIGHT, JOINTS_RIGHT))
 MAX_TRANSLATION_M = 2.0
 MAX_JOINT_RAD = 2.0 * np.pi
 MAX_PRESSURE_KPA = 1e5
@@ -112,19 +110,6 @@ def contact_geometry(
     return torch.cat([slots.flatten(2), side], dim=-1).numpy()
 
 
-@cache
-def _hand(side: str) -> RobotHand:
-    return RobotHand(side)
-
-
-def hand_points_m(joints_rad: np.ndarray, *, side: str) -> Float64[np.ndarray, "*batch 21 3"]:
-    """Wrist and four points per finger in wrist coordinates, for joint angles [..., 20]."""
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    batch = joints.shape[:-1]
-    chains = _hand(side).chain_points_m(joints.reshape(-1, 20)).reshape(*batch, 20, 3)
-    return np.concatenate([np.zeros((*batch, 1, 3)), chains], axis=-2)
-
-
 def blots(
     pixels: np.ndarray, visible: np.ndarray, *, image_px: int, cells: int
 ) -> Float32[np.ndarray, "*batch cells cells"]:
@@ -159,11 +144,14 @@ def pose_raster(
     actions = np.asarray(actions, dtype=np.float64)
     Ts_world_camera = anchors[:, None, 2] @ pose_from_9d(actions[..., CAMERA])
     Ts_camera_world = invert(Ts_world_camera)
+    joints_rad = np.stack([actions[..., JOINTS_LEFT], actions[..., JOINTS_RIGHT]], axis=-2)
+    # The wrists, then four points per finger, in wrist coordinates.
+    points_m = np.zeros((*joints_rad.shape[:-1], 21, 3))
+    points_m[..., 1:, :] = chain_points_of_both_m(joints_rad).reshape(*joints_rad.shape, 3)
     rasters = []
-    for index, (side, wrist, joints) in enumerate(_WRIST_AND_SIDES):
+    for index, wrist in enumerate((WRIST_LEFT, WRIST_RIGHT)):
         Ts_world_wrist = anchors[:, None, index] @ pose_from_9d(actions[..., wrist])
-        points_wrist = hand_points_m(actions[..., joints], side=side)
-        points_camera = apply(Ts_camera_world @ Ts_world_wrist, points_wrist)
+        points_camera = apply(Ts_camera_world @ Ts_world_wrist, points_m[:, :, index])
         each = zip(K_head, points_camera, strict=True)
         pixels, visible = map(np.stack, zip(*(project(K, one) for K, one in each), strict=True))
         # Far outside the image a blot is zero; clipping keeps float32 squares finite.

@@ -33,29 +33,14 @@ _MAX_TEXTS: Final = 1024
 
 
 def instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:
-    """Buckets of an instruction's words or subwords, padded with `NO_WORD` to a fixed length."""
+    """Buckets of the first 16 words (lower case) or 160 subwords, padded with `NO_WORD`."""
     if config.instruction_encoder == "hashed_words":
-        return hash_words(instruction, config.num_word_buckets)
-    return hash_subwords(instruction)
-
-
-def hash_words(instruction: str, num_buckets: int) -> Int64[Tensor, " max_words"]:
-    """Bucket of each of the first 16 words (lower case), padded with `NO_WORD`."""
-    words = WORD.findall(instruction.lower())[:MAX_WORDS]
-    return _padded([_bucket(word, num_buckets) for word in words], MAX_WORDS)
-
-
-def hash_subwords(instruction: str) -> Int64[Tensor, " max_subwords"]:
-    """Bucket of each of the first 160 subwords."""
-    ids = [_bucket(part, NUM_SUBWORD_BUCKETS) for part in subwords(instruction)]
-    return _padded(ids, MAX_SUBWORDS)
-
-
-def _bucket(text: str, num_buckets: int) -> int:
-    return 1 + zlib.crc32(text.encode()) % num_buckets
-
-
-def _padded(ids: list[int], length: int) -> Int64[Tensor, " length"]:
+        parts = WORD.findall(instruction.lower())[:MAX_WORDS]
+        length, num_buckets = MAX_WORDS, config.num_word_buckets
+    else:
+        parts = subwords(instruction)
+        length, num_buckets = MAX_SUBWORDS, NUM_SUBWORD_BUCKETS
+    ids = [1 + zlib.crc32(part.encode()) % num_buckets for part in parts]
     return torch.tensor(ids + [NO_WORD] * (length - len(ids)), dtype=torch.int64)
 
 
@@ -152,11 +137,9 @@ class TextFeatures:
         self._known: dict[str, Tensor] = {}
 
     def use(self, folder: Path | None, cache: Path | None = None) -> None:
-        """Choose where unknown texts are looked up.
+        """Choose the folder of the pretrained model, whose text encoder unknown texts are given to.
 
-        Args:
-            folder: folder of the pretrained model with its text encoder.
-            cache: folder in which features are kept as safetensors; None for memory only.
+        Features are kept as safetensors in the folder `cache`; without one, in memory only.
         """
         self._folder, self._cache, self._encoder = folder, cache, None
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
+from services.world_model.dynamics.trees import combined, mapped
 from services.world_model.network import flow_matching
 from services.world_model.network.attention import ExpertBlock, JointLayer, Stream, clean_mask
 from services.world_model.network.conditioning import (
@@ -53,10 +54,6 @@ class JointLatents:
 
     video: Float32[Tensor, "batch latents tokens channels"]
     tactile: Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]
-
-    def to(self, device: torch.device) -> "JointLatents":
-        """Copy to a device."""
-        return JointLatents(self.video.to(device), self.tactile.to(device))
 
 
 @dataclass(frozen=True)
@@ -315,15 +312,12 @@ class JointWorldModel(nn.Module):
     ) -> Prediction:
         """Sample a future for every request.
 
-        Args:
-            inputs: from `build_inputs`.
-            noise: one per request, from `noise`; like the inputs it may be on any device.
-            sampling: how; None uses the configuration's.
-            all_images: decode every image, or only those of the last latent.
-            precision: of the experts' matrix products (autocast); codecs always use float32.
+        There is one `noise` per request; like the inputs it may be on any device. Of the images,
+        all are decoded or only those of the last latent. `precision` is that of the experts' matrix
+        products (autocast); codecs always use float32.
         """
         inputs = inputs.to(self.device)
-        first, noise = self.first_latents(inputs), noise.to(self.device)
+        first, noise = self.first_latents(inputs), mapped(noise, lambda one: one.to(self.device))
         clean = self.sample(inputs, first, noise, sampling or Sampling(), precision=precision)
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
@@ -413,9 +407,7 @@ def products_in(precision: Precision, device_type: str) -> Iterator[None]:
 
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:
     """Stack the noise of several rollouts into a batch."""
-    return JointLatents(
-        torch.cat([noise.video for noise in noises]), torch.cat([noise.tactile for noise in noises])
-    )
+    return combined(noises, torch.cat)
 
 
 def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:

@@ -45,11 +45,8 @@ class TactileTokenizer(nn.Module, ABC):
     """Encoder and decoder of the taxels of one hand; zero pressure is the zero latent.
 
     All work on the square root of pressure, which gives light touch more weight, and are frozen
-    while a world model is trained on their latents. `peak_kpa` is the highest pressure in training.
-
-    Args:
-        num_tokens: tokens per hand.
-        channels: latent values of each token.
+    while a world model is trained on their latents. A hand is `num_tokens` tokens of `channels`
+    values each. `peak_kpa` is the highest pressure in training.
     """
 
     peak_kpa: Tensor
@@ -139,15 +136,9 @@ class MapShape:
 
     Layers have no biases and embeddings multiply features instead of being added, so that an
     untouched map is the zero latent and the zero latent an untouched map, whatever the weights are.
-
-    Args:
-        rows: rows of a map.
-        columns: columns of a map.
-        num_maps: maps per hand that share the weights and differ by an identity embedding.
-        channels: latent values of each map.
-        width: channels of the convolutions.
-        hidden: width of the layer between features and latents.
-        num_halvings: how often the encoder halves the resolution.
+    The `num_maps` maps of a hand share the weights and differ by an identity embedding. `channels`
+    are latent values of each map, `width` is that of the convolutions, and `hidden` that of the
+    layer between features and latents. The encoder halves the resolution `num_halvings` times.
     """
 
     rows: int

@@ -33,13 +33,13 @@ from services.world_model.network.conditioning import (
     two_layers,
 )
 from services.world_model.network.configuration import (
+    FLOAT32_PARTS,
     FRAMES_PER_LATENT,
     LATENT_MEAN,
     LATENT_STD,
     RASTER_CELLS_PER_TOKEN,
     NetworkConfig,
     WanConfig,
-    dtype_of,
 )
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import TextFeatures
@@ -468,7 +468,8 @@ def empty_transformer(
     with torch.device("meta"):
         transformer = WanTransformer3DModel(**sizes)
     for name, parameter in transformer.named_parameters():
-        parameter.data = parameter.data.to(dtype_of(name, config.dtype))
+        is_exact = any(part in name for part in FLOAT32_PARTS)
+        parameter.data = parameter.data.to(torch.float32 if is_exact else config.dtype)
     return transformer.eval()
 
 

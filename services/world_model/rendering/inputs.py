@@ -56,11 +56,10 @@ _PER_M, _NEARNESS_M = 10.0, 0.5
 class CameraMotion:
     """Maps from pixels of later images to pixels of start images.
 
-    Attributes:
-        table: homogeneous pixels of a later image to those of the start, on the table.
-        infinity: the same for points at infinity.
-        inverse_depth: row vectors whose product with a homogeneous pixel is 1 / (depth of the
-            table there), in 1/m; zero for a camera that sees the table as a line.
+    `table` maps homogeneous pixels of a later image to those of the start, on the table; `infinity`
+    does the same for points at infinity. The product of the row vectors `inverse_depth` with a
+    homogeneous pixel is 1 / (depth of the table there), in 1/m; they are zero for a camera that
+    sees the table as a line.
     """
 
     table: Float64[np.ndarray, "n 3 3"]

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from dextouch.errors import NonFiniteError, ShapeError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
@@ -89,33 +88,6 @@ class SceneStates:
     def take(self, rows: Int64[np.ndarray, " m"] | slice) -> "SceneStates":
         """Select states, in the order of `rows`."""
         return SceneStates(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def check(self, num_slots: int) -> None:
-        """Refuse states that cannot be drawn.
-
-        Raises:
-            ShapeError: arrays of another shape, or another number of object slots.
-            NonFiniteError: NaN or infinity.
-        """
-        expected = {
-            "Ts_world_camera": (4, 4),
-            "Ts_world_wrist": (2, 4, 4),
-            "joints_rad": (2, 20),
-            "object_poses": (num_slots, 7),
-            "object_present": (num_slots,),
-        }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array.shape[1:] != shape:
-                raise ShapeError(
-                    f"scene states: {name} is {array.shape[1:]}, expected {shape} for {num_slots} "
-                    "boxes"
-                )
-            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
-            if len(bad):
-                raise NonFiniteError(
-                    f"scene state {bad[0]}: {name} contains NaN or infinity; expected finite values"
-                )
 
 
 def joined(parts: Sequence[Arrays]) -> Arrays:
@@ -238,11 +210,7 @@ def positions_at_start(
 ) -> Float64[np.ndarray, "hits 2"]:
     """Start image pixels of the hit points; far outside for points behind the start camera.
 
-    Args:
-        hits: from `cast_boxes`.
-        Ts_start_box: pose of each box in the start camera, at the start.
-        half_m: half sizes of the boxes.
-        K: intrinsics of the start camera.
+    `Ts_start_box` are the boxes' poses at the start in the start camera, and `K` its intrinsics.
     """
     x, y, z = hits.local.T
     scaled = (K[:, None] @ Ts_start_box[..., :3, :]).transpose(2, 3, 0, 1)
@@ -340,15 +308,15 @@ def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
 
 
 def project_hands(
-    base_world: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray, *, middle_only: bool = False
+    base_world: Float64[np.ndarray, "n 2 22 3"],
+    K: Float64[np.ndarray, "n 3 3"],
+    T_world_camera: Float64[np.ndarray, "n 4 4"],
+    *,
+    middle_only: bool = False,
 ) -> HandPoints:
     """Project all points of both hands into a camera.
 
-    Args:
-        base_world: [n, 2, 22, 3] from `base_points_world`.
-        K: [n, 3, 3] in pixels.
-        T_world_camera: [n, 4, 4].
-        middle_only: put every point on the centre line of its bone.
+    With `middle_only`, every point is put on the centre line of its bone.
     """
     ribbons = _ribbons()
     base = apply(invert(T_world_camera)[:, None], base_world)

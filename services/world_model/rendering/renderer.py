@@ -9,20 +9,17 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from torch import Tensor
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from services.world_model.dynamics.trees import Traced
-from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.dynamics.trees import Traced, mapped
 from services.world_model.rendering.inputs import (
     DrawingInputs,
     PreparedScenes,
     Scenes,
     drawing_inputs,
 )
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.network import uses_bfloat16 as uses_bfloat16_here
+from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
 from services.world_model.rendering.rasters import (
     MAX_DRAWN_OBJECTS,
     SceneStates,
@@ -37,35 +34,29 @@ _KEPT_STARTS: Final = 64
 
 @dataclass(frozen=True)
 class Drawing:
-    """States of one rollout to draw; checked as it is drawn.
+    """States of one rollout to draw.
 
-    Attributes:
-        start_image: uint8 [h, w, 3], the head camera image at the start.
-        K_head: intrinsics [3, 3] in pixels; lens distortion is not modelled.
-        states: the state at the start, then at least one to draw, of a later or earlier step.
-        boxes_m: [k, 6], centre and half sizes (x y z, x y z) of the bounding box of each object
-            slot, in the object frame.
+    `start_image` is the head camera image at the start, and `states` the state there, then those to
+    draw; `boxes_m` are as of `Scenes`. Lens distortion is not modelled.
     """
 
-    start_image: np.ndarray
-    K_head: np.ndarray
+    start_image: UInt8[np.ndarray, "h w 3"]
+    K_head: Float64[np.ndarray, "3 3"]
     states: SceneStates
-    boxes_m: np.ndarray
+    boxes_m: Float64[np.ndarray, "k 6"]
 
 
 class Renderer:
     """Draws head camera images of states; equal inputs give equal bytes.
 
-    Args:
-        network: trained weights; they are copied.
-        uses_bfloat16: run convolutions in bfloat16; default: if that is clearly faster on this
-            processor, which is timed once in a process.
+    The network is copied. By default, convolutions run in bfloat16 if that is clearly faster on
+    this processor, which is timed once in a process.
     """
 
     def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
-        dtype = torch.bfloat16 if uses_bfloat16_here(setting=uses_bfloat16) else torch.float32
+        is_half = has_fast_bfloat16() if uses_bfloat16 is None else uses_bfloat16
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
-        self._network.to(dtype)
+        self._network.to(torch.bfloat16 if is_half else torch.float32)
         # As the images are, so that convolutions do not rearrange their weights at each call.
         for weight in self._network.parameters():
             if weight.ndim == 4:
@@ -77,28 +68,16 @@ class Renderer:
         self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
         self._lock = threading.Lock()
 
-    @property
-    def config(self) -> RendererConfig:
-        """Shape of the network."""
-        return self._network.config
-
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
         """Draw images of any number of rollouts; together as alone, except for rounding.
 
+        Start images have one size, whose sides are multiples of `pixel_multiple`.
+
         If camera, hands and objects are where they were at the start, the image is exactly the
         start image.
-
-        Raises:
-            ShapeError: wrong array shapes, no state, object slots that do not match the boxes, or
-                start images of several sizes.
-            InvalidInputError: image sides that the network does not support.
-            NonFiniteError: NaN or infinity.
         """
         if not drawings:
             return []
-        sizes = {drawing.start_image.shape for drawing in drawings}
-        if len(sizes) > 1:
-            raise ShapeError(f"renderer: got start images {sorted(sizes)}, expected one size")
         starts = [self._prepared(drawing) for drawing in drawings]
         later = [one.states.take(slice(1, None)).padded(MAX_DRAWN_OBJECTS) for one in drawings]
         counts = [len(states) for states in later]
@@ -118,7 +97,7 @@ class Renderer:
         used, local = np.unique(owner, return_inverse=True)
         prepared = joined([starts[index] for index in used])
         with torch.inference_mode():
-            images = self._drawn(drawing_inputs(prepared, states, local, self.config))
+            images = self._drawn(drawing_inputs(prepared, states, local, self._network.config))
             rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
@@ -130,15 +109,15 @@ class Renderer:
             return self._paint(inputs) if len(changed) == 1 else self._network(inputs)
         images = inputs.fine[:, :3].clone()
         if bool(changed.any()):
-            some = DrawingInputs(
-                inputs.fine[changed], inputs.coarse[changed], inputs.change[changed]
-            )
-            images[changed] = self._network(some)
+            images[changed] = self._network(mapped(inputs, lambda planes: planes[changed]))
         return images
 
     def _prepared(self, drawing: Drawing) -> PreparedScenes:
         """The prepared start of a drawing; those that were used last are kept."""
-        scenes = self._scene(drawing)
+        start = drawing.states.take(slice(0, 1)).padded(MAX_DRAWN_OBJECTS)
+        boxes_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
+        boxes_m[0, : len(drawing.boxes_m)] = drawing.boxes_m
+        scenes = Scenes(drawing.start_image[None], drawing.K_head[None], start, boxes_m)
         arrays = [scenes.images, scenes.K_head, scenes.boxes_m]
         arrays += [getattr(scenes.states, field.name) for field in fields(scenes.states)]
         key = b"".join(array.tobytes() for array in arrays) + str(scenes.images.shape).encode()
@@ -150,33 +129,3 @@ class Renderer:
             if len(self._starts) > _KEPT_STARTS:
                 self._starts.popitem(last=False)
         return prepared
-
-    def _scene(self, drawing: Drawing) -> Scenes:
-        """The start of a drawing, with empty object slots up to the maximum."""
-        image, states = drawing.start_image, drawing.states
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise ShapeError(
-                f"renderer: got a start image {image.dtype} {image.shape}, expected uint8 [h, w, 3]"
-            )
-        multiple = self.config.pixel_multiple
-        if any(side % multiple or side == 0 for side in image.shape[:2]):
-            raise InvalidInputError(
-                f"renderer: got a start image of {image.shape[:2]} px, expected sides that are "
-                f"multiples of {multiple}"
-            )
-        K = np.asarray(drawing.K_head, dtype=np.float64)
-        boxes_m = np.asarray(drawing.boxes_m, dtype=np.float64)
-        if K.shape != (3, 3) or boxes_m.shape[1:] != (6,) or len(boxes_m) > MAX_DRAWN_OBJECTS:
-            raise ShapeError(
-                f"renderer: got K_head {K.shape} and boxes {boxes_m.shape}, expected (3, 3) and at "
-                f"most ({MAX_DRAWN_OBJECTS}, 6)"
-            )
-        if not (np.isfinite(K).all() and np.isfinite(boxes_m).all()):
-            raise NonFiniteError("renderer: K_head or boxes contain NaN or infinity")
-        if len(states) < 2:
-            raise ShapeError("renderer: got none of the states to draw, expected at least one")
-        states.check(len(boxes_m))
-        start = states.take(slice(0, 1)).padded(MAX_DRAWN_OBJECTS)
-        padded_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
-        padded_m[0, : len(boxes_m)] = boxes_m
-        return Scenes(image[None], K[None], start, padded_m)

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import (
     Budget,
@@ -36,7 +36,7 @@ OnProgress = Callable[[float, int, float], None]
 
 @dataclass(frozen=True)
 class SceneClip:
-    """Images of one episode at `steps`, with the ground-truth state at each of them.
+    """At least two images of one episode at `steps`, with the ground-truth state at each of them.
 
     `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
     """
@@ -46,14 +46,6 @@ class SceneClip:
     states: SceneStates
     K_head: Float64[np.ndarray, "3 3"]
     boxes_m: Float64[np.ndarray, "k 6"]
-
-    def __post_init__(self) -> None:
-        lengths = {len(self.steps), len(self.images), len(self.states)}
-        if len(lengths) > 1 or len(self.steps) < 2:
-            raise ShapeError(
-                f"scene clip: got {len(self.steps)} steps, {len(self.images)} images and "
-                f"{len(self.states)} states, expected equal numbers of at least two"
-            )
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -70,19 +62,16 @@ def train_renderer(
 ) -> tuple[RendererNetwork, float]:
     """Train on pairs of images of one clip: a start image and a target image.
 
-    Args:
-        clips: at least one, all of images of one size.
-        config: shape of the network.
-        settings: how to train.
-        rng: source of initial weights, pairs and pose noise.
-        on_progress: called every few steps with the completed share, the step and the loss.
-        initial: network to start from, of the same shape; default: random weights.
+    `rng` draws initial weights, pairs and pose noise. `on_progress` is called every few steps with
+    the completed share, the step and the loss. Training starts from the weights of `initial`, which
+    has the same shape, if there is one.
 
     Returns:
         The averaged network, and the CPU seconds of training.
 
     Raises:
-        InvalidInputError: no clips, or image sides that the network does not support.
+        InvalidInputError: no clips, several sizes of images, or sides that the network does not
+            support.
     """
     run = RendererRun(clips, config, settings, rng=rng)
     if initial is not None:
@@ -176,16 +165,11 @@ class RendererRun:
 def drawing_loss(
     drawn: Float32[Tensor, "n 3 h w"], true: Float32[Tensor, "n 3 h w"], settings: RendererTraining
 ) -> Float32[Tensor, ""]:
-    """Mean absolute error of colours, of image gradients and of edge strength.
+    """Mean absolute error of colours (0 … 1), of image gradients and of edge strength.
 
     An edge drawn a pixel off costs twice in colours and a missing edge once, so that colours alone
     lead to blurred images; the mean strength of edges in a window does not depend on where exactly
     they are.
-
-    Args:
-        drawn: colours in 0 … 1.
-        true: true colours in 0 … 1.
-        settings: weights of the losses.
     """
     error = drawn - true
     across = (error[..., 1:] - error[..., :-1]).abs().mean()

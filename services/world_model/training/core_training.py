@@ -73,13 +73,8 @@ def train_core(
 ) -> RecurrentCore:
     """Train a core to predict scenes from any start step to the end.
 
-    Args:
-        data: training episodes.
-        config: of the dynamics model.
-        settings: number of steps, loss weights and so on.
-        seed: seed of weights and sampling.
-        on_step: called with the step and its loss.
-        initial: core to start from; those of its weights that require gradients are changed.
+    Weights of `initial` that require gradients are changed. `on_step` is called with each step and
+    its loss.
     """
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     with torch.random.fork_rng(devices=[]):
@@ -102,10 +97,7 @@ def train_core(
 def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) -> None:
     """Set a core's objects of every task, and the range of the hands' motion.
 
-    Args:
-        core: its buffers are changed.
-        table: training episodes.
-        widens: whether the range that the core already has is kept, and widened.
+    With `widens`, the range that the core already has is kept, and widened.
     """
     # Tasks without episodes keep what the core knows of them.
     seen = torch.bincount(table.task, minlength=len(core.boxes_m)) > 0
@@ -249,10 +241,11 @@ def core_loss(
     )
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
-    true = table.objects_of_latents(rows, batch.start_step)
+    latents = table.latent_steps(batch.start_step)
+    true = mapped(table.objects, lambda values: values[rows][:, latents])
     true = replace(_held_still(true, batch.is_held), present=true.present)
     known = start.objects.present[:, None] * table.labelled[rows, None, None]
-    known = known * table.known_of_latents(rows, batch.start_step)
+    known = known * table.objects_known[rows][:, latents]
     steps = table.steps_after(batch.start_step)
     moves = ~batch.is_held
     touch = data.touch[rows][:, steps].float()

@@ -102,13 +102,26 @@ class EpisodeArrays:
         return digest.hexdigest()
 
     def cut(self, place: WindowPosition) -> "Window":
-        """Cut the window at a place in this episode."""
-        return cut_window(
-            self,
-            place.start,
-            place.num_steps,
+        """Cut the window at a place in this episode, and re-anchor its actions to its first step.
+
+        Commanded actions `from_command` are anchored as those of a served rollout after its first
+        chunk, since it measures no pose.
+        """
+        steps = slice(place.start, place.start + place.num_steps)
+        origin_kind = place.action_kind if place.from_command else "measured"
+        origin = self.actions[origin_kind][place.start]
+        request = PredictionRequest(
+            first_image=self.images[place.start],
+            first_tactile_kpa=self.tactile_kpa[place.start],
+            actions=reanchor(self.actions[place.action_kind][steps], 0, anchor_action=origin),
             action_kind=place.action_kind,
-            from_command=place.from_command,
+            instruction=self.instruction,
+            anchor=poses_from_actions(origin[None], self.anchor).anchor(0),
+            K_head=self.K_head,
+            objects=self.objects_at(place.start),
+        )
+        return Window(
+            request, self.images[steps], self.tactile_kpa[steps], self.tactile_valid[steps]
         )
 
 
@@ -130,56 +143,6 @@ class WindowBatch:
     images: UInt8[Tensor, "batch time px px 3"]
     tactile_kpa: Float32[Tensor, "batch time 2 320"]
     tactile_valid: Bool[Tensor, "batch time 2"]
-
-
-def cut_window(
-    episode: EpisodeArrays,
-    start: int,
-    num_steps: int,
-    *,
-    action_kind: ActionKind = "measured",
-    from_command: bool = False,
-) -> Window:
-    """Cut steps start … start + num_steps - 1 and re-anchor them to the first.
-
-    Args:
-        episode: the episode to cut from.
-        start: first step.
-        num_steps: 1 + 4k.
-        action_kind: kind of actions in the request.
-        from_command: with commanded actions, anchor at the first step's *commanded* pose, as a
-            served rollout does after its first chunk, since it measures no pose.
-
-    Raises:
-        InvalidInputError: steps outside the episode, or an action kind it does not have.
-    """
-    if not 0 <= start <= len(episode) - num_steps:
-        raise InvalidInputError(
-            f"episode {episode.episode_id}: got steps {start} … {start + num_steps - 1}, "
-            f"expected them inside 0 … {len(episode) - 1}"
-        )
-    if action_kind not in episode.actions:
-        raise InvalidInputError(
-            f"episode {episode.episode_id}: has no {action_kind} actions, only "
-            f"{sorted(episode.actions)}"
-        )
-    steps = slice(start, start + num_steps)
-    origin_kind = action_kind if from_command else "measured"
-    origin = episode.actions[origin_kind][start]
-    actions = reanchor(episode.actions[action_kind][steps], 0, anchor_action=origin)
-    request = PredictionRequest(
-        first_image=episode.images[start],
-        first_tactile_kpa=episode.tactile_kpa[start],
-        actions=actions,
-        action_kind=action_kind,
-        instruction=episode.instruction,
-        anchor=poses_from_actions(origin[None], episode.anchor).anchor(0),
-        K_head=episode.K_head,
-        objects=episode.objects_at(start),
-    )
-    return Window(
-        request, episode.images[steps], episode.tactile_kpa[steps], episode.tactile_valid[steps]
-    )
 
 
 def stack_windows(windows: Sequence[Window]) -> WindowBatch:
@@ -301,13 +264,10 @@ E = TypeVar("E", bound=TrainingEpisode)
 class WindowSampler:
     """Samples windows uniformly over starts, and over the episodes of each domain.
 
-    Args:
-        episodes: at least one, each at least `max_steps` long.
-        rng: source of all randomness.
-        commanded_fraction: share of commanded windows, from episodes with commanded actions.
-        chained_fraction: share of commanded windows that are anchored like a later chunk.
-        human_share: share of windows from human episodes, if there are human and robot ones; None:
-            every episode is equally likely.
+    Episodes are at least `max_steps` long. Of windows from episodes with commanded actions, the
+    `commanded_fraction` has them, and of these the `chained_fraction` is anchored like a later
+    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
+    None: every episode is equally likely.
     """
 
     def __init__(
@@ -436,10 +396,8 @@ def read_batches(
 ) -> Generator[WindowBatch, None, None]:
     """Batches at these places, in order, independent of the number of processes.
 
-    Args:
-        episodes: episodes that the places refer to.
-        places: places of each batch; may be endless and is read ahead.
-        num_workers: reader processes, which end with the iterator; 0 reads in this process.
+    Places may be endless and are read ahead. Reader processes end with the iterator; without any,
+    this process reads.
     """
     loader = DataLoader(
         _Windows(episodes),

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TypeAlias, TypeVar
 
 from dextouch.episodes import EpisodeGrid, data_hash
-from dextouch.errors import InvalidInputError
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import TrainingSet
 from services.world_model.settings import DataSettings
@@ -25,11 +25,6 @@ def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> li
     """A number of episodes chosen by their content, in their order; None for all.
 
     A larger subset of the same episodes contains every smaller one.
-
-    Args:
-        episodes: to choose from.
-        count: how many.
-        what: what they are, for the message.
 
     Raises:
         InvalidInputError: there are fewer; `what` names them.
@@ -50,15 +45,26 @@ def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> li
     return [episodes[index] for index in sorted(chosen)]
 
 
+def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[float]) -> None:
+    """Check that the episodes of a training have one model rate, and are in one store each.
+
+    Raises:
+        ConflictError: they are not.
+    """
+    twice = [name for name, count in Counter(ids).items() if count > 1]
+    if twice or len(rates_hz) > 1:
+        raise ConflictError(
+            f"training: the episodes of {', '.join(urls)} have model rates of {sorted(rates_hz)} "
+            f"Hz, and {twice[:3]} are in two stores; expected one rate, and each episode once"
+        )
+
+
 def check_tasks(
     episodes: Iterable[DomainEpisode], settings: DataSettings, known: Collection[str] = ()
 ) -> None:
     """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`).
 
-    Args:
-        episodes: trained on and held out.
-        settings: of the run.
-        known: tasks that the initial checkpoint was trained on.
+    `known` are those that the initial checkpoint was trained on.
 
     Raises:
         InvalidInputError: a task is both human and robot, or is known already.
@@ -91,15 +97,11 @@ def training_sets(
     inherited: Sequence[TrainingSet] = (),
     ancestor: str | None = None,
 ) -> tuple[TrainingSet, ...]:
-    """The episodes of a run by domain, after those of its ancestors.
+    """The episodes of a run by domain, after the inherited ones of its ancestors.
 
-    Args:
-        trained: episodes of training.
-        heldout: episodes of evaluation.
-        human_share: share of human episodes in what is drawn; None if it follows from their number.
-        image_px: side that images are scaled to, as `data_hash` wants it.
-        inherited: sets of the initial checkpoint.
-        ancestor: its digest.
+    `ancestor` is the digest of the initial checkpoint. `human_share` of what is drawn is human;
+    None: as their number says. `image_px` is the side that images are scaled to, as `data_hash`
+    wants it.
     """
     found = [
         one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})

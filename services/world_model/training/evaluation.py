@@ -21,7 +21,7 @@ from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,
     Window,
-    cut_window,
+    WindowPosition,
     stack_windows,
 )
 
@@ -47,12 +47,7 @@ def evaluate_prediction(
 ) -> dict[str, float]:
     """Errors over every window that starts at a multiple of `stride`.
 
-    Args:
-        model: ready to predict.
-        episodes: held out, none of them trained on.
-        train_fingerprints: fingerprints of the training episodes, from the checkpoint.
-        stride: steps between window starts.
-        action_kind: kind of actions given; episodes without it give their measured ones.
+    Episodes are held out; those without actions of this kind give their measured ones.
 
     Returns:
         psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
@@ -158,7 +153,7 @@ def _in_batches(
 
 def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
     available: ActionKind = kind if kind in episode.actions else "measured"
-    return cut_window(episode, start, num_steps, action_kind=available)
+    return episode.cut(WindowPosition(0, start, num_steps, available))
 
 
 def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
@@ -205,12 +200,9 @@ def _standing_still(request: PredictionRequest, *, head_moves: bool) -> Predicti
 
 
 def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:
+    touch = {"predicted_kpa": predicted.tactile_kpa, "true_kpa": true.tactile_kpa}
     return {
         f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),
-        f"tactile_mse{suffix}": tactile_metrics.mse(
-            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
-        ),
-        f"contact_f1{suffix}": tactile_metrics.contact_f1(
-            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
-        ),
+        f"tactile_mse{suffix}": tactile_metrics.mse(**touch),
+        f"contact_f1{suffix}": tactile_metrics.contact_f1(**touch),
     }

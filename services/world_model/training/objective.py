@@ -18,6 +18,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
+from services.world_model.dynamics.trees import combined, mapped
 from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
@@ -25,7 +26,6 @@ from services.world_model.network.flow_matching import (
     implied_noise,
     sampling_times,
     training_times,
-    velocity,
 )
 from services.world_model.network.inputs import ModelInputs, PredictionRequest, build_inputs
 from services.world_model.network.model import (
@@ -80,13 +80,8 @@ def losses(
 ) -> Losses:
     """Errors of the prediction at random times.
 
-    Args:
-        model: the network.
-        batch: the true windows.
-        generator: source of times and noise.
-        options: what counts, and in which precision.
-        processes: processes whose batches together are the whole one; losses are this process's
-            contributions to it, which have the whole one's loss as their mean.
+    The batches of all `processes` together are the whole one. Losses are this process's
+    contributions to it, which have the whole one's loss as their mean.
     """
     device = model.device
     inputs = build_inputs(batch.requests, model.config).to(device)
@@ -95,25 +90,16 @@ def losses(
     first = _with_noise(model.first_latents(inputs), options.context_noise, generator, processes)
     num_windows, shift = len(inputs) * processes.count, model.config.training_time_shift
     t = processes.own(training_times(num_windows, shift=shift, generator=generator)).to(device)
-    noise = JointLatents(
-        processes.randn(clean.video.shape, generator).to(device),
-        processes.randn(clean.tactile.shape, generator).to(device),
-    )
+    noise = mapped(clean, lambda one: processes.randn(one.shape, generator).to(device))
     if options.own_noisy:
         noisy, t = own_noisy(model, inputs, first, noise, generator)
-        noise = JointLatents(
-            implied_noise(noisy.video, clean.video, t),
-            implied_noise(noisy.tactile, clean.tactile, t),
-        )
+        noise = combined([noisy, clean], lambda pair: implied_noise(pair[0], pair[1], t))
     else:
-        noisy = JointLatents(
-            add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
-        )
+        noisy = combined([clean, noise], lambda pair: add_noise(pair[0], pair[1], t))
     target = clean
     if model.config.prediction == "velocity":
-        target = JointLatents(
-            velocity(clean.video, noise.video), velocity(clean.tactile, noise.tactile)
-        )
+        # Of the straight path from data to noise.
+        target = combined([noise, clean], lambda pair: pair[0] - pair[1])
     with products_in(options.precision, device.type):
         guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
@@ -159,7 +145,7 @@ def _with_noise(
         noise = processes.randn(latents.shape, generator).to(latents.device)
         return latents + context_noise * amount.to(noise.device) * processes.std(latents) * noise
 
-    return FirstLatents(shaken(first.video), shaken(first.tactile))
+    return mapped(first, shaken)
 
 
 def own_context(
@@ -187,10 +173,9 @@ def own_context(
             batch.tactile_kpa[:, : middle + 1],
             batch.tactile_valid[:, : middle + 1],
         )
-    one = model.noise(middle + 1, generator)
-    noise = JointLatents(
-        processes.randn([len(firsts), *one.video.shape[1:]], generator),
-        processes.randn([len(firsts), *one.tactile.shape[1:]], generator),
+    noise = mapped(
+        model.noise(middle + 1, generator),
+        lambda one: processes.randn([len(firsts), *one.shape[1:]], generator),
     )
     inputs = build_inputs(firsts, model.config)
     future = model.predict(inputs, noise, sampling=Sampling(keep_context=False), all_images=False)

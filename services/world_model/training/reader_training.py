@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -47,14 +47,6 @@ OnStep = Callable[[int, float], None]
 Network = TypeVar("Network", bound=nn.Module)
 
 
-@dataclass(frozen=True)
-class ReaderError:
-    """Errors over the table on held-out steps, of present objects: median and 90 % quantile."""
-
-    lateral_mm: float
-    lateral_90_mm: float
-
-
 def train_reader(
     table: SceneTable,
     config: DynamicsConfig,
@@ -66,13 +58,8 @@ def train_reader(
 ) -> StartReader:
     """Train a reader of objects from single steps, both first and later ones.
 
-    Args:
-        table: training episodes; only labelled ones are used.
-        config: of the dynamics model.
-        settings: number of steps and so on.
-        seed: seed of weights and sampling.
-        on_step: called with the step and its loss.
-        initial: reader to start from; its weights are changed.
+    Only labelled episodes are used. The weights of `initial` are changed. `on_step` is called with
+    each step and its loss.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -84,7 +71,8 @@ def train_reader(
     is_known = _knows_some(table, config)
     # Later steps of each episode, in their order; of further ones nothing is known, they have no
     # image or lie behind its end.
-    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
+    places = [table.image_steps.index(step) for step in later]
+    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, places]
     reached &= is_known[:, later]
     counts = reached.sum(1)
     order = torch.argsort(~reached, dim=1, stable=True)
@@ -111,11 +99,6 @@ def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "epis
     count = torch.tensor(config.num_objects)[table.task]
     is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
     return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
-
-
-def _places(table: SceneTable, steps: list[int]) -> list[int]:
-    """Indices of steps among those with images."""
-    return [table.image_steps.index(step) for step in steps]
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:
@@ -186,9 +169,12 @@ def read_step(reader: StartReader, table: SceneTable, step: int) -> Reading:
     return combined(parts, torch.cat)
 
 
-def reader_errors(reader: StartReader, table: SceneTable) -> dict[str, ReaderError]:
-    """Errors by task at the first step of held-out episodes; tasks without objects are omitted."""
-    predicted, errors = read_step(reader, table, 0).objects, {}
+def reader_errors(reader: StartReader, table: SceneTable) -> dict[str, float]:
+    """Errors (mm) over the table at the first step of held-out episodes, by task.
+
+    They are the median and the 90 % quantile over present objects; tasks without are left out.
+    """
+    predicted, errors = read_step(reader, table, 0).objects, dict[str, float]()
     true = table.objects_at(torch.arange(len(table)), 0)
     for index, task in enumerate(reader.config.tasks):
         known = table.objects_known[:, 0] & (table.task == index)[:, None]
@@ -196,7 +182,8 @@ def reader_errors(reader: StartReader, table: SceneTable) -> dict[str, ReaderErr
         if there.any():
             off_mm = 1e3 * (predicted.position_m - true.position_m)[there]
             lateral = off_mm[:, :2].norm(dim=-1)
-            errors[task] = ReaderError(float(lateral.median()), float(lateral.quantile(0.9)))
+            errors[f"start_lateral_mm_{task}"] = float(lateral.median())
+            errors[f"start_lateral_90_mm_{task}"] = float(lateral.quantile(0.9))
     return errors
 
 
@@ -270,14 +257,9 @@ def train_averaged(
     weight_decay: float,
     on_step: OnStep | None = None,
 ) -> Network:
-    """Train a network and return it with the moving average of its weights.
+    """Train a network in place, and return the moving average of its weights.
 
-    Args:
-        network: its weights are changed.
-        loss: loss of a fresh batch.
-        settings: number of steps, learning rate and decay of the average.
-        weight_decay: AdamW weight decay.
-        on_step: called with the step and its loss.
+    `loss` draws a fresh batch. `on_step` is called with each step and its loss.
     """
     options = OptimizerOptions(
         settings.learning_rate, weight_decay, warmup_steps=_WARMUP_STEPS, schedule=_to_a_hundredth

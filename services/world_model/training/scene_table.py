@@ -49,11 +49,8 @@ class HandTable:
     @classmethod
     def of(cls, motions: Sequence[HandMotion]) -> "HandTable":
         """Stack motions of one length."""
-        return cls(
-            torch.from_numpy(np.stack([motion.points_m for motion in motions])),
-            torch.from_numpy(np.stack([motion.axes for motion in motions])),
-            torch.from_numpy(np.stack([motion.joints_rad for motion in motions])),
-        )
+        parts = ([getattr(one, part.name) for one in motions] for part in fields(cls))
+        return cls(*(torch.from_numpy(np.stack(part)) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -63,14 +60,14 @@ class SceneTable:
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
     pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
     measurement, `touched` those of tasks of which some have poses from touch, and `placed_sd_m` is
-    the standard deviation of positions from clicks or touch, 0 of others.
-    `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
-    pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
-    given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
-    share in what is drawn, NaN if it follows from their number. `labelled` marks episodes whose
-    object poses are trained on; `boxes_m` are the usual boxes of each task's objects in their
-    frames (middle, half sizes), and `size` factors of their width and height. `instruction` are the
-    features of each episode's sentence.
+    the standard deviation of positions from clicks or touch, 0 of others. `images` are those of the
+    steps `image_steps`, where `shown`; `in_contact` marks pads in contact; `sent` are commanded
+    hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
+    episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
+    follows from their number. `labelled` marks episodes whose object poses are trained on;
+    `boxes_m` are the usual boxes of each task's objects in their frames (middle, half sizes), and
+    `size` factors of their width and height. `instruction` are the features of each episode's
+    sentence.
     """
 
     sent: HandTable
@@ -148,13 +145,7 @@ class SceneTable:
     def drawn(
         self, able: Int64[Tensor, " rows"], count: int, generator: torch.Generator
     ) -> Int64[Tensor, " count"]:
-        """Random episodes of some, a share of them human if there are both.
-
-        Args:
-            able: indices of the episodes to draw from.
-            count: how many to draw, with replacement.
-            generator: source of randomness.
-        """
+        """Random episodes of some, maybe repeated; a share of them human if there are both."""
         is_human, share = self.human[able], self.human_share
         num_human = is_human.sum()
         if bool(share.isnan()) or not 0 < int(num_human) < len(able):
@@ -176,15 +167,9 @@ class SceneTable:
         ends = torch.arange(start + STEPS_PER_LATENT, self.num_steps, STEPS_PER_LATENT)
         return ends < self.length[rows, None]
 
-    def objects_of_latents(self, rows: Tensor, start: int) -> ObjectPoses:
-        """True objects at the start and at every latent step after it."""
-        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-        return mapped(self.objects, lambda values: values[rows][:, steps])
-
-    def known_of_latents(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents objects"]:
-        """Whether objects are known at the start and at every latent step after it."""
-        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-        return self.objects_known[rows][:, steps]
+    def latent_steps(self, start: int) -> Int64[Tensor, " latents"]:
+        """The start and every latent step after it."""
+        return torch.arange(start, self.num_steps, STEPS_PER_LATENT)
 
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
@@ -266,11 +251,8 @@ def scene_table(
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
-    Args:
-        episodes: at least one.
-        config: of the dynamics model.
-        labelled: for each episode, whether its object poses are trained on; default: all.
-        human_share: share of human episodes in what is drawn; None if it follows from their number.
+    `labelled` says of each whether its object poses are trained on; by default all. `human_share`
+    of what is drawn is human; None: as their number says.
 
     Raises:
         InvalidInputError: no image of the first step, none later that all episodes have, too short
@@ -287,6 +269,7 @@ def scene_table(
     tracked = list(zip(episodes, tracks, strict=True))
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
+    sds_m = [np.pad(track.sd_m, (0, MAX_OBJECTS - len(track.sd_m))) for track in tracks]
     boxes_m = usual_boxes_m(episodes)
     touched_tasks = {one.task for one, track in tracked if "touch" in track.sources}
     return SceneTable(
@@ -311,7 +294,7 @@ def scene_table(
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
         touched=torch.tensor([episode.task in touched_tasks for episode in episodes]),
-        placed_sd_m=torch.from_numpy(np.stack([_sd_m(track) for track in tracks])),
+        placed_sd_m=torch.from_numpy(np.stack(sds_m)).float(),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
         instruction=instruction_features([e.about.instruction for e in episodes], config),
@@ -339,12 +322,6 @@ def _known(
     known[:, :count] = _filled(track.known, episode, num_steps)
     known[_whole(episode) :, :count] = False
     return known
-
-
-def _sd_m(track: ObjectTrack) -> Float32[np.ndarray, " slots"]:
-    sd_m = np.zeros(MAX_OBJECTS, dtype=np.float32)
-    sd_m[: len(track.sd_m)] = track.sd_m
-    return sd_m
 
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
@@ -439,23 +416,14 @@ def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> 
 def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
     """Clips of the images of which all objects are known, where an episode has two or more."""
     clips = []
-    for episode in episodes:
-        if (track := episode.objects) is None or not len(episode.boxes_m):
+    for one in episodes:
+        if (track := one.objects) is None or not len(one.boxes_m):
             continue
-        steps = episode.image_steps[track.known[episode.image_steps].all(axis=1)]
-        if len(steps) > 1:
-            clips.append(_clip(episode, steps, track.poses[steps].astype(np.float64)))
+        steps = one.image_steps[track.known[one.image_steps].all(axis=1)]
+        if len(steps) < 2:
+            continue
+        poses = track.poses[steps].astype(np.float64)
+        present = np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M
+        states = SceneStates.of_actions(one.measured[steps], one.anchor, poses, present)
+        clips.append(SceneClip(steps, one.images(steps), states, one.K_head, one.boxes_m))
     return clips
-
-
-def _clip(
-    episode: EpisodeGrid, steps: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n objects 7"]
-) -> SceneClip:
-    present = np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M
-    return SceneClip(
-        steps=steps,
-        images=episode.images(steps),
-        states=SceneStates.of_actions(episode.measured[steps], episode.anchor, poses, present),
-        K_head=episode.K_head,
-        boxes_m=episode.boxes_m,
-    )

@@ -34,14 +34,14 @@ from dextouch.episodes import (
     split_by_scene,
     touched_objects,
 )
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.domains import check_tasks, subset_by_hash
+from services.world_model.training.domains import check_stores, check_tasks, subset_by_hash
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 
@@ -56,11 +56,7 @@ _NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
 class SceneGrid(EpisodeGrid):
     """An episode on the model grid whose objects a file may list, and people may have clicked.
 
-    Args:
-        reader: the episode.
-        image_px: as of `EpisodeGrid`.
-        objects: its task's objects as a file lists them; None if it does not.
-        clicked: poses at the first step from clicks; None without any.
+    `objects` are its task's in a file that lists them, `clicked` poses at the first step.
     """
 
     def __init__(
@@ -166,18 +162,11 @@ def load_scene_episodes(
 ) -> list[SceneGrid]:
     """Episodes of stores that a state model can learn from, store by store.
 
-    Args:
-        urls: URLs of the stores.
-        tasks: tasks to load; empty for all.
-        splits: splits of the scenes; empty for all.
-        image_px: side that the middle square of larger images is scaled to; None leaves images as
-            they are.
-        clicks: objects of tasks, and clicks on them; those in the stores are used as well.
-        domain: whose hands act; None for people and robots.
+    All tasks, all splits, and people and robots, unless some are named. The middle square of images
+    that are larger than `image_px` is scaled to it. Clicks in the stores are used beside `clicks`.
 
     Raises:
-        NotFoundError: as `select_episodes`.
-        ConflictError: as `select_episodes`.
+        NotFoundError, ConflictError: as `select_episodes`.
         InvalidInputError: as `clicked_poses`.
     """
     stores = [EpisodeStore(url) for url in urls]
@@ -282,7 +271,8 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     """
     clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
     heldout_urls = () if settings.heldout is None else (settings.heldout,)
-    _check_clicked(clicks, (*settings.episodes, *settings.human, *heldout_urls))
+    urls = (*settings.episodes, *settings.human, *heldout_urls)
+    _check_clicked(clicks, urls)
     load = partial(
         load_scene_episodes, tasks=settings.tasks, image_px=settings.image_px, clicks=clicks
     )
@@ -305,7 +295,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
                 "--heldout store, or a larger --heldout-share"
             )
     data = StateData(training, heldout)
-    _check_together(data)
+    _check_together(data, urls)
     _correct_grips(data.episodes)
     return data
 
@@ -351,7 +341,7 @@ def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[
     return kept
 
 
-def _check_together(data: StateData) -> None:
+def _check_together(data: StateData, urls: Sequence[str]) -> None:
     """Check what holds for all stores of a run; each is read for itself."""
     both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
     if both:
@@ -359,14 +349,8 @@ def _check_together(data: StateData) -> None:
             f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
             "ones; use another --heldout store"
         )
-    counts = Counter(episode.episode_id for episode in data.episodes)
-    twice = [name for name, count in counts.items() if count > 1]
-    rates_hz = sorted({episode.about.model_rate_hz for episode in data.episodes})
-    if twice or len(rates_hz) > 1:
-        raise ConflictError(
-            f"training: the episodes have model rates of {rates_hz} Hz, and {twice[:3]} are in two "
-            "stores; expected one rate, and each episode once"
-        )
+    ids = [episode.episode_id for episode in data.episodes]
+    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
@@ -403,12 +387,7 @@ def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
 def configured(
     data: StateData, settings: StateTrainSettings, base: Base | None = None
 ) -> DynamicsConfig:
-    """The configuration of a model of some episodes.
-
-    Args:
-        data: the episodes.
-        settings: of the training.
-        base: model that it starts from.
+    """The configuration of a model of some episodes, which may start from another model.
 
     Raises:
         InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or

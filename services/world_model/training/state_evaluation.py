@@ -117,10 +117,7 @@ def _episode_figures(
         found = there & (table.task == index)[:, None]
         if found.any():
             figures[f"final_object_mm_{task}"] = float(off_mm[found].median())
-    for task, error in reader_errors(dynamics.readers()[0], table).items():
-        figures[f"start_lateral_mm_{task}"] = error.lateral_mm
-        figures[f"start_lateral_90_mm_{task}"] = error.lateral_90_mm
-    return figures
+    return figures | reader_errors(dynamics.readers()[0], table)
 
 
 def _object_errors(

@@ -108,9 +108,7 @@ def train_tokenizer(
 ) -> TokenizerReport:
     """Train a tokenizer, evaluate it on held-out scenes and write it.
 
-    Args:
-        settings: data, tokenizer and limits of the run.
-        on_evaluation: called with the completed share and each new point of the curve.
+    `on_evaluation` is called with the completed share and each new point of the curve.
 
     Raises:
         InvalidInputError: no scene to train on or none held out, or no touch at all.

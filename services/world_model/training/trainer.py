@@ -2,9 +2,10 @@
 
 import copy
 import json
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,12 @@ from services.world_model.training.dataset import (
     read_batches,
 )
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.domains import check_tasks, subset_by_hash, training_sets
+from services.world_model.training.domains import (
+    check_stores,
+    check_tasks,
+    subset_by_hash,
+    training_sets,
+)
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import LossOptions, losses, own_context
 from services.world_model.training.tokenizer_trainer import (
@@ -140,8 +146,7 @@ class TrainingRun:
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
         """Fit everything in closed form: codecs, action statistics, residual scales.
 
-        Args:
-            tokenizer: pretrained tokenizer to use instead of fitting one.
+        A pretrained tokenizer is taken instead of fitting one.
         """
         model, config = self.model, self.settings.network
         if model.device.type != "cpu":
@@ -231,9 +236,8 @@ class TrainingRun:
     ) -> list[TrainingProgress]:
         """Train until the budget or the number of steps is used up; returns the loss log.
 
-        Args:
-            on_progress: called with every entry of the log.
-            on_step: called with the run after every step.
+        `on_progress` is called with every entry of the log, `on_step` with the run after every
+        step.
         """
         budget = self.budget
         budget.start()
@@ -474,30 +478,25 @@ def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list
     Robot episodes are split before a subset of them is taken, so that every subset has the same
     held-out episodes. These are never human if human stores are given.
     """
-    trained, heldout = _load_robot(settings)
-    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
-    together = [*trained, *_load_human(settings)]
-    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
-    counts = Counter(episode.episode_id for episode in together)
-    if len(rates_hz) > 1 or len(counts) < len(together):
-        twice = [name for name, count in counts.items() if count > 1]
-        raise ConflictError(
-            f"training: the episodes of {', '.join([settings.episodes, *settings.human])} have "
-            f"model rates of {sorted(rates_hz)} Hz, and {twice[:3]} are in two stores; expected "
-            "one rate, and each episode once"
-        )
-    return together, heldout
-
-
-def _load_robot(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+    px = settings.network.image_px
+    how = index_episodes if settings.streaming else load_episodes
+    read = partial(how, splits=settings.splits, image_px=px)
     domain: Domain | None = "robot" if settings.human else None
-    url, splits, px = settings.episodes, settings.splits, settings.network.image_px
-    read = index_episodes if settings.streaming else load_episodes
-    episodes: Sequence[TrainingEpisode] = read(url, splits=splits, domain=domain, image_px=px)
+    trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
     if settings.heldout is not None:
-        return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
-    trained, heldout = _split(episodes, settings)
-    return trained, [one.load() if isinstance(one, StoredEpisode) else one for one in heldout]
+        heldout = load_episodes(settings.heldout, domain=domain, image_px=px)
+    else:
+        trained, stored = _split(trained, settings)
+        heldout = [one.load() if isinstance(one, StoredEpisode) else one for one in stored]
+    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
+    people: list[TrainingEpisode] = []
+    for url in settings.human if settings.human_episodes != 0 else ():
+        people += read(url, domain="human")
+    together = [*trained, *subset_by_hash(people, settings.human_episodes, what="human")]
+    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
+    ids = [episode.episode_id for episode in together]
+    check_stores([settings.episodes, *settings.human], ids, rates_hz)
+    return together, heldout
 
 
 def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
@@ -505,17 +504,6 @@ def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], lis
         return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
     stored = read_tokenizer(settings.tokenizer)
     return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
-
-
-def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
-    if settings.human_episodes == 0:
-        return []
-    read = index_episodes if settings.streaming else load_episodes
-    found: list[TrainingEpisode] = []
-    for url in settings.human:
-        px = settings.network.image_px
-        found += read(url, splits=settings.splits, domain="human", image_px=px)
-    return subset_by_hash(found, settings.human_episodes, what="human")
 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:

@@ -72,12 +72,7 @@ class TrainingState:
 
 
 class StateFiles:
-    """State of the run with this output; all its processes must call each method.
-
-    Args:
-        output: checkpoint that the run will write.
-        processes: processes of the run.
-    """
+    """State of the run that will write this output; all its processes must call each method."""
 
     def __init__(self, output: Path, processes: Processes) -> None:
         self._file = state_path(output)
@@ -104,16 +99,21 @@ class StateFiles:
     def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
         """Read the state of a run with these settings and data.
 
-        Args:
-            identity: from `identity_of`.
-            own: a tensor of the same name, shape and sharding for every tensor of the state.
+        `own` has a tensor of the same name, shape and sharding for every tensor of the state.
 
         Raises:
             ConflictError: the state has other settings or data; they are named.
             CorruptDataError: not a training state, or a damaged one.
         """
         if not self._is_sharded:
-            return read_state(self._file, identity)
+            where = f"training state {self._file.name}"
+            try:
+                tensors, notes = read_tensors(self._file, where)
+            except CorruptDataError as error:
+                raise CorruptDataError(f"{error.message}; remove it to start over") from error
+            return TrainingState(
+                tensors, checked_facts(notes.get(METADATA_KEY, ""), identity, where)
+            )
         where = f"training state {self._folder.name}"
         facts = checked_facts((self._folder / FACTS).read_text(), identity, where)
         reader = HuggingFaceStorageReader(str(self._of_step(facts.step)))
@@ -125,9 +125,10 @@ class StateFiles:
         return TrainingState(tensors, facts)
 
     def write(self, state: TrainingState) -> None:
-        """Replace the state."""
+        """Replace the state atomically."""
         if not self._is_sharded:
-            write_state(self._file, state)
+            facts = state.facts.model_dump_json()
+            write_tensors(self._file, state.tensors, {METADATA_KEY: facts})
             return
         target = self._of_step(state.facts.step)
         if self._processes.is_first:
@@ -173,28 +174,8 @@ def identity_of(settings: TrainSettings, **digests: str | None) -> dict[str, Jso
     return {**settings.model_dump(mode="json", exclude=_FREE_SETTINGS), **digests}
 
 
-def write_state(path: Path, state: TrainingState) -> None:
-    """Replace the state of a run atomically."""
-    write_tensors(path, state.tensors, {METADATA_KEY: state.facts.model_dump_json()})
-
-
-def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
-    """Read the state of a run with these settings and data.
-
-    Raises:
-        ConflictError: the state has other settings or data; they are named.
-        CorruptDataError: not a training state, or a damaged one.
-    """
-    where = f"training state {path.name}"
-    try:
-        tensors, notes = read_tensors(path, where)
-    except CorruptDataError as error:
-        raise CorruptDataError(f"{error.message}; remove it to start over") from error
-    return TrainingState(tensors, checked_facts(notes.get(METADATA_KEY, ""), identity, where))
-
-
 def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> RunFacts:
-    """Metadata of a state, if it is one of a run with these settings and data; as `read_state`."""
+    """Metadata of a state, if it is one of a run with these settings and data."""
     try:
         facts = RunFacts.model_validate_json(text)
     except ValidationError as error:

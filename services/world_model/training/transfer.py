@@ -4,7 +4,6 @@ Which parts are trained and which are kept is decided in `state_trainer`, by `--
 """
 
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from services.world_model.checkpoints import StateCheckpoint, read_state_checkpoint
+from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.start_reader import StartReader
@@ -26,28 +25,17 @@ _SUCCESS = "success."
 class Base:
     """A trained state model that another one starts from.
 
-    Args:
-        path: its checkpoint.
+    Raises:
+        NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-
-    @cached_property
-    def checkpoint(self) -> StateCheckpoint:
-        """The checkpoint, read once.
-
-        Raises:
-            NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
-        """
-        return read_state_checkpoint(self._path)
+        self._path, self.checkpoint = path, read_state_checkpoint(path)
 
     def configured(self, config: DynamicsConfig, *, keeps_tasks: bool) -> DynamicsConfig:
         """A configuration with the shape of the base's networks, for the tasks of another one.
 
-        Args:
-            config: of the episodes.
-            keeps_tasks: whether the tasks stay the base's, of which the episodes have some.
+        With `keeps_tasks`, they stay the base's, of which the episodes have some.
 
         Raises:
             InvalidInputError: images of another size.

@@ -19,7 +19,7 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.starts import SceneReader
-from services.world_model.training.dataset import WindowSampler, cut_window
+from services.world_model.training.dataset import WindowPosition, WindowSampler
 from services.world_model.training.distribution import Processes
 from services.world_model.training.objective import own_context
 from services.world_model.world import ModelWorld
@@ -32,7 +32,7 @@ PER_POINT, POINTS = 7, 11
 
 @pytest.fixture
 def window(toy_episode):
-    return cut_window(toy_episode(0), 5, 17)
+    return toy_episode(0).cut(WindowPosition(0, 5, 17))
 
 
 @pytest.fixture
@@ -77,10 +77,10 @@ def test_slots_without_an_object_are_empty(window):
 def test_a_window_has_the_objects_of_its_first_step(toy_episode):
     episode = toy_episode(1)
     episode.object_poses[:, 0, 0] = np.arange(len(episode)) * 0.01
-    request = cut_window(episode, 7, 9).request
+    request = episode.cut(WindowPosition(0, 7, 9)).request
     assert request.objects.poses[0, 0] == pytest.approx(0.07)
     unknown = replace(episode, object_poses=None)
-    assert cut_window(unknown, 7, 9).request.objects is None
+    assert unknown.cut(WindowPosition(0, 7, 9)).request.objects is None
 
 
 @torch.no_grad()

@@ -8,8 +8,8 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from services.world_model.training.dataset import (
+    WindowPosition,
     WindowSampler,
-    cut_window,
     load_episodes,
     read_episode,
 )
@@ -19,7 +19,7 @@ from services.world_model.training.dataset import (
 @pytest.mark.parametrize(("start", "num_steps"), [(0, 17), (7, 9), (24, 17)])
 def test_a_cut_window_is_the_readers_window(toy_store, kind, start, num_steps):
     reader = toy_store.open("toy-2")
-    cut = cut_window(read_episode(reader), start, num_steps, action_kind=kind)
+    cut = read_episode(reader).cut(WindowPosition(0, start, num_steps, action_kind=kind))
     read = reader.window(start, num_steps, action_kind=kind)
     np.testing.assert_array_equal(cut.images, read.images["camera_head"])
     np.testing.assert_array_equal(cut.tactile_kpa, read.tactile_kpa)
@@ -32,9 +32,9 @@ def test_a_cut_window_is_the_readers_window(toy_store, kind, start, num_steps):
 
 def test_a_chained_window_starts_where_the_command_was(toy_episode):
     episode = toy_episode(1)
-    cut = cut_window(episode, 6, 9, action_kind="commanded", from_command=True)
+    cut = episode.cut(WindowPosition(0, 6, 9, action_kind="commanded", from_command=True))
     np.testing.assert_allclose(cut.request.actions[0, :3], 0, atol=1e-12)
-    plain = cut_window(episode, 6, 9, action_kind="commanded")
+    plain = episode.cut(WindowPosition(0, 6, 9, action_kind="commanded"))
     gap_m = np.linalg.norm(
         cut.request.anchor.T_world_wrist_left[:3, 3]
         - plain.request.anchor.T_world_wrist_left[:3, 3]
@@ -46,15 +46,6 @@ def test_a_chained_window_starts_where_the_command_was(toy_episode):
         for w in (cut, plain)
     ]
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
-
-
-def test_slices_and_kinds_that_do_not_exist_are_refused(toy_episode):
-    episode = toy_episode(0)
-    with pytest.raises(InvalidInputError, match="steps 30"):
-        cut_window(episode, 30, 17)
-    human = replace(episode, actions={"measured": episode.actions["measured"]})
-    with pytest.raises(InvalidInputError, match="no commanded"):
-        cut_window(human, 0, 17, action_kind="commanded")
 
 
 def test_the_sampler_repeats_itself_and_mixes_kinds(toy_episodes):
@@ -106,7 +97,7 @@ def test_every_start_is_drawn_the_last_one_too(toy_episode):
 def test_a_window_carries_the_flags_of_its_own_steps(toy_episode):
     episode = toy_episode(0)
     episode.tactile_valid[7, 1] = False
-    flags = cut_window(episode, 5, 9).tactile_valid
+    flags = episode.cut(WindowPosition(0, 5, 9)).tactile_valid
     assert np.argwhere(~flags).tolist() == [[2, 1]]
 
 

@@ -13,7 +13,7 @@ from torch.distributed.device_mesh import init_device_mesh
 
 from dextouch.errors import ConflictError, InvalidInputError
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.training.dataset import cut_window, stack_windows
+from services.world_model.training.dataset import WindowPosition, stack_windows
 from services.world_model.training.distribution import Processes
 from services.world_model.training.objective import losses
 from services.world_model.training.trainer import TrainingRun, train, train_on
@@ -145,7 +145,7 @@ def test_sharded_training_is_resumed_and_equals_plain_training(
 
 
 def test_losses_of_the_parts_have_that_of_the_batch_as_their_mean(toy_episodes, tiny_model):
-    windows = [cut_window(episode, 3, 9) for episode in toy_episodes[:4]]
+    windows = [episode.cut(WindowPosition(0, 3, 9)) for episode in toy_episodes[:4]]
 
     def found(processes):
         batch = stack_windows(processes.part(windows))

@@ -24,9 +24,10 @@ from services.world_model.network.attention import (
     left_joint_signs,
 )
 from services.world_model.network.conditioning import ActionNormalizer, SceneEncoder
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import blots, build_inputs, pose_raster
-from services.world_model.network.instruction import NO_WORD, hash_words
-from services.world_model.training.dataset import cut_window
+from services.world_model.network.instruction import NO_WORD, instruction_ids
+from services.world_model.training.dataset import WindowPosition
 
 # The rotation columns of both wrists and the head camera in a 67-D action.
 POSE_COLUMNS = np.array([[*range(3, 9)], [*range(12, 18)], [*range(61, 67)]])
@@ -34,7 +35,7 @@ POSE_COLUMNS = np.array([[*range(3, 9)], [*range(12, 18)], [*range(61, 67)]])
 
 @pytest.fixture
 def request_(toy_episode):
-    return cut_window(toy_episode(3), 5, 17, action_kind="commanded").request
+    return toy_episode(3).cut(WindowPosition(0, 5, 17, action_kind="commanded")).request
 
 
 def test_the_left_hand_is_the_mirror_image_of_the_right():
@@ -87,7 +88,7 @@ def test_each_hand_sees_itself_first_then_the_other_within_ten_deviations(reques
 
 def test_the_raster_shows_the_hands_where_they_are(toy_episode, tiny_config):
     episode = toy_episode(1)
-    request = cut_window(episode, 0, 17).request
+    request = episode.cut(WindowPosition(0, 0, 17)).request
     raster = build_inputs([request], tiny_config).raster[0].numpy()
     cells = tiny_config.raster_cells
     for hand, T in enumerate(request.anchor.as_tuple()[:2]):
@@ -161,14 +162,14 @@ def test_points_behind_the_camera_leave_no_blot():
 def test_the_raster_follows_the_kind_of_action_given(toy_episode, tiny_config):
     episode = toy_episode(3)
     kinds = ("measured", "commanded")
-    requests = [cut_window(episode, 5, 17, action_kind=kind).request for kind in kinds]
+    requests = [episode.cut(WindowPosition(0, 5, 17, action_kind=kind)).request for kind in kinds]
     inputs = build_inputs(requests, tiny_config)
     assert (inputs.raster[0, 1:] - inputs.raster[1, 1:]).abs().max() > 0.05
     assert inputs.commanded.tolist() == [0.0, 1.0]
 
 
 def test_one_request_means_the_same_alone_and_in_a_batch(toy_episodes, tiny_config):
-    requests = [cut_window(episode, 3, 9).request for episode in toy_episodes]
+    requests = [episode.cut(WindowPosition(0, 3, 9)).request for episode in toy_episodes]
     together = build_inputs(requests, tiny_config)
     for index, request in enumerate(requests):
         alone = build_inputs([request], tiny_config)
@@ -240,8 +241,9 @@ def test_foreign_shapes_names_and_numbers_are_refused(request_, tiny_config):
 
 
 def test_words_are_hashed_alike_and_padded():
-    words = hash_words("Stand the BOTTLE, upright!", 64)
-    assert torch.equal(words, hash_words("stand the bottle upright", 64))
+    config = NetworkConfig(num_word_buckets=64)
+    words = instruction_ids("Stand the BOTTLE, upright!", config)
+    assert torch.equal(words, instruction_ids("stand the bottle upright", config))
     assert (words != NO_WORD).sum() == 4
-    assert (hash_words("", 64) == NO_WORD).all()
-    assert (hash_words("x " * 100, 64) != NO_WORD).all()
+    assert (instruction_ids("", config) == NO_WORD).all()
+    assert (instruction_ids("x " * 100, config) != NO_WORD).all()

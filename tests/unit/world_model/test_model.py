@@ -9,7 +9,7 @@ from services.world_model.network.attention import clean_mask
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
-from services.world_model.training.dataset import cut_window
+from services.world_model.training.dataset import WindowPosition
 
 
 def _generator(seed):
@@ -28,7 +28,9 @@ def model(tiny_config):
 
 @pytest.fixture
 def inputs(toy_episodes, tiny_config):
-    requests = [cut_window(e, 2, 17, action_kind="commanded").request for e in toy_episodes[:3]]
+    requests = [
+        e.cut(WindowPosition(0, 2, 17, action_kind="commanded")).request for e in toy_episodes[:3]
+    ]
     return build_inputs(requests, tiny_config)
 
 
@@ -170,7 +172,7 @@ def test_words_kind_and_layout_matter(model, inputs, noisy):
 @pytest.mark.long
 @pytest.mark.parametrize("num_steps", [5, 9, 13, 17])
 def test_a_batch_of_one_equals_a_batch_of_many(model, toy_episodes, num_steps):
-    requests = [cut_window(e, 4, num_steps).request for e in toy_episodes]
+    requests = [e.cut(WindowPosition(0, 4, num_steps)).request for e in toy_episodes]
     noises = [model.noise(num_steps, _generator(seed)) for seed in range(len(requests))]
     together = model.predict(build_inputs(requests, model.config), stack_noise(noises))
     for index, (request, noise) in enumerate(zip(requests, noises, strict=True)):
@@ -193,7 +195,7 @@ def test_true_residuals_decode_to_the_truth(tiny_config, toy_episodes):
     torch.manual_seed(0)
     full = tiny_config.model_copy(update={"codec_channels": 768, "palm_channels": 240})
     model = JointWorldModel(full)
-    windows = [cut_window(episode, 0, 9) for episode in toy_episodes]
+    windows = [episode.cut(WindowPosition(0, 0, 9)) for episode in toy_episodes]
     images = torch.stack([torch.from_numpy(w.images) for w in windows])
     touch = torch.stack([torch.from_numpy(w.tactile_kpa) for w in windows])
     model.codec.fit(images)

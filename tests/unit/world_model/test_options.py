@@ -11,9 +11,10 @@ from dextouch.errors import InvalidInputError
 from services.twin.names import TASK_NAMES
 from services.twin.tasks import get_task
 from services.world_model.checkpoints import CheckpointMetadata, write_checkpoint
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.flow_matching import sample
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.instruction import NO_WORD, hash_subwords
+from services.world_model.network.instruction import NO_WORD, instruction_ids
 from services.world_model.network.model import JointLatents, JointWorldModel, Sampling, stack_noise
 from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.objective import LossOptions, contact_or_changing, losses
@@ -194,12 +195,13 @@ def test_idle_tokens_do_not_count_in_the_papers_loss(tiny_config, batch):
 
 
 def test_no_two_instructions_of_the_twin_share_their_subwords():
+    config = NetworkConfig(instruction_encoder="subwords")
     sentences = [get_task(name).instruction for name in TASK_NAMES]
-    known = {tuple(sorted(set(hash_subwords(one).tolist()))) for one in sentences}
+    known = {tuple(sorted(set(instruction_ids(one, config).tolist()))) for one in sentences}
     assert len(known) == len(set(sentences))
     words = {word for one in sentences for word in re.findall("[a-z]+", one.lower())}
-    assert len({tuple(hash_subwords(word).tolist()) for word in words}) == len(words)
-    assert hash_subwords("").eq(NO_WORD).all()
+    assert len({tuple(instruction_ids(word, config).tolist()) for word in words}) == len(words)
+    assert instruction_ids("", config).eq(NO_WORD).all()
 
 
 def test_a_model_without_touch_is_only_opened_on_request(tiny_config, tmp_path):

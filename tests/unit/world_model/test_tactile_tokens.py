@@ -14,7 +14,7 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
 from services.world_model.network.tactile import build_tokenizer
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
-from services.world_model.training.dataset import WindowSampler, cut_window
+from services.world_model.training.dataset import WindowPosition, WindowSampler
 from services.world_model.training.objective import losses
 
 FORMS = [("principal_axes", "hand", 1), ("grid", "hand", 1), ("split_hands", "hand", 1),
@@ -36,7 +36,9 @@ def test_every_form_predicts_and_hides_noise_from_clean_tokens(
     tiny_config, toy_episodes, tokenizer, tokens, count
 ):
     model = _model(tiny_config, tokenizer, tokens)
-    inputs = build_inputs([cut_window(e, 2, 9).request for e in toy_episodes[:2]], model.config)
+    inputs = build_inputs(
+        [e.cut(WindowPosition(0, 2, 9)).request for e in toy_episodes[:2]], model.config
+    )
     noisy = stack_noise([model.noise(9, torch.Generator().manual_seed(s)) for s in range(2)])
     assert noisy.tactile.shape == (2, 9, 2, count, model.tokenizer.channels)
     future = model.predict(inputs, noisy)
@@ -73,7 +75,7 @@ def test_pads_of_equal_content_are_told_apart_by_their_embedding(tiny_config):
 
 def test_residuals_of_pads_are_anchored_to_the_first_step(tiny_config, toy_episodes):
     model = _model(tiny_config, "split_hands", "pad", scale=0.0)
-    window = cut_window(toy_episodes[0], 0, 9)
+    window = toy_episodes[0].cut(WindowPosition(0, 0, 9))
     images, touch = (torch.from_numpy(a)[None] for a in (window.images, window.tactile_kpa))
     residuals = model.targets(images, touch).tactile
     assert (residuals[:, 0] == 0).all()
@@ -126,7 +128,7 @@ def test_the_committed_checkpoint_predicts_what_it_did_with_one_token_per_hand(t
     np.testing.assert_allclose(model.tokenizer.encode(touch)[:, 0], expected, rtol=1e-4, atol=1e-4)
     image = np.arange(64 * 64 * 3).reshape(64, 64, 3) % 251
     request = replace(
-        cut_window(toy_episode(1), 5, 17, action_kind="commanded").request,
+        toy_episode(1).cut(WindowPosition(0, 5, 17, action_kind="commanded")).request,
         first_image=image.astype(np.uint8),
         first_tactile_kpa=touch.numpy(),
     )

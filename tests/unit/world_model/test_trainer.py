@@ -11,7 +11,7 @@ from safetensors import safe_open
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
 from services.world_model.training import evaluation
-from services.world_model.training.dataset import cut_window, stack_windows
+from services.world_model.training.dataset import WindowPosition, stack_windows
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
 from services.world_model.training.trainer import TrainingRun, check_disjoint, train, train_on
@@ -137,7 +137,9 @@ def test_false_actions_are_of_the_same_moment(tiny_model, heldout, monkeypatch):
     own, other_take, hold, hands_still = asked
     starts = (0, 8, 0, 8)
     other = [
-        cut_window(heldout[1 - index // 2], start, 17, action_kind="commanded").request.actions
+        heldout[1 - index // 2]
+        .cut(WindowPosition(0, start, 17, action_kind="commanded"))
+        .request.actions
         for index, start in enumerate(starts)
     ]
     for index, request in enumerate(own):
@@ -160,7 +162,7 @@ def test_copy_and_zero_are_what_they_say(tiny_model, heldout):
 
 def test_invalid_touch_is_not_learned_from(tiny_model, toy_episodes):
     def loss(*, valid):
-        windows = [cut_window(episode, 0, 9) for episode in toy_episodes]
+        windows = [episode.cut(WindowPosition(0, 0, 9)) for episode in toy_episodes]
         windows = [replace(w, tactile_valid=np.full((9, 2), valid)) for w in windows]
         batch = stack_windows(windows)
         return losses(tiny_model, batch, generator=torch.Generator().manual_seed(0))

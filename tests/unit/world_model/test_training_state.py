@@ -11,9 +11,9 @@ import torch
 
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.training import training_state
+from services.world_model.training.distribution import ALONE
 from services.world_model.training.trainer import TrainingRun, train, train_on
-from services.world_model.training.training_state import read_state, state_path
+from services.world_model.training.training_state import StateFiles, state_path
 
 CHILD = Path(__file__).with_name("killed_training.py")
 ROOT = Path(__file__).parents[3]
@@ -106,7 +106,7 @@ def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
     for damaged in (data[:100], b"", data[: len(data) // 2]):
         path.write_bytes(damaged)
         with pytest.raises(CorruptDataError, match="start over"):
-            read_state(path, {})
+            StateFiles(settings.output, ALONE).read({}, {})
 
 
 @pytest.mark.long
@@ -143,9 +143,7 @@ def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, 
 @pytest.mark.long
 def test_a_state_is_kept_now_and_then(toy_episodes, toy_episode, settings, monkeypatch):
     kept = []
-    monkeypatch.setattr(
-        training_state, "write_state", lambda path, state: kept.append(state.facts.step)
-    )
+    monkeypatch.setattr(StateFiles, "write", lambda files, state: kept.append(state.facts.step))
     train_on(toy_episodes, [toy_episode(9, 25)], settings.model_copy(update={"max_steps": 3}))
     assert kept == []
     often = settings.model_copy(update={"max_steps": 3, "state_every_cpu_s": 0.0})

@@ -19,7 +19,7 @@ from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, World
 from services.world_model import world as world_module
 from services.world_model.network.inputs import build_inputs
-from services.world_model.training.dataset import cut_window
+from services.world_model.training.dataset import WindowPosition
 from services.world_model.world import ModelWorld
 
 
@@ -33,7 +33,7 @@ def world(checkpoint):
 
 
 def make_start(episode, start=0, kind="commanded"):
-    window = cut_window(episode, start, 5)
+    window = episode.cut(WindowPosition(0, start, 5))
     request = window.request
     return RolloutStart(
         task=episode.task,
@@ -78,7 +78,7 @@ def test_loader_and_server_give_identical_tensors(world, toy_episode, monkeypatc
     monkeypatch.setattr(world_module, "build_inputs", spy)
     for kind in ("measured", "commanded"):
         loader = build_inputs(
-            [cut_window(episode, 0, 17, action_kind=kind).request], world._model.config
+            [episode.cut(WindowPosition(0, 0, 17, action_kind=kind)).request], world._model.config
         )
         state = world.reset(make_start(episode, kind=kind)).state
         world.step(state, episode.actions[kind][1:17], seed=0)
@@ -108,7 +108,7 @@ def test_later_chunks_are_re_anchored_to_where_the_rollout_stands(world, toy_epi
     monkeypatch.setattr(world_module, "build_inputs", spy)
     world.step(state, actions[9:17], seed=0)
     expected = build_inputs(
-        [cut_window(episode, 8, 9, action_kind="commanded", from_command=True).request],
+        [episode.cut(WindowPosition(0, 8, 9, action_kind="commanded", from_command=True)).request],
         world._model.config,
     )
     for name in ("hands", "camera", "raster", "layout"):

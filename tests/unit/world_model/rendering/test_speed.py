@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.nn import functional
 
-from dextouch.errors import ShapeError
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import PreparedScenes
@@ -158,12 +157,6 @@ def test_rollouts_drawn_together_are_drawn_as_one_at_a_time(small, image, still,
         (alone,) = renderer.draw_all([one])
         assert np.abs(images.astype(int) - alone.astype(int)).max() <= 1
     assert renderer.draw_all([]) == []
-
-
-def test_start_images_of_several_sizes_are_refused(small, image, still):
-    drawings = [drawing(shown, K, still, [still], BOXES_M) for shown in (image, image[:32])]
-    with pytest.raises(ShapeError, match="one size"):
-        Renderer(weights_of(small)).draw_all(drawings)
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from services.world_model.pretrained_video import (
     load_pretrained,
     original_names,
 )
-from services.world_model.training.dataset import cut_window
+from services.world_model.training.dataset import WindowPosition
 from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
 
 
@@ -151,7 +151,7 @@ def test_kept_clean_tokens_change_nothing(model, toy_episodes):
             if weight.abs().max() == 0:
                 weight.normal_(0.0, 0.1)
     larger = [replace(e, images=e.images.repeat(2, 1).repeat(2, 2)) for e in toy_episodes[:2]]
-    requests = [cut_window(episode, 0, 17).request for episode in larger]
+    requests = [episode.cut(WindowPosition(0, 0, 17)).request for episode in larger]
     assert_kept_tokens_change_nothing(
         model.requires_grad_(requires_grad=False), build_inputs(requests, model.config)
     )

@@ -11,7 +11,7 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.plan import PeakMemory, plan_of, plan_table
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import cut_window
+from services.world_model.training.dataset import WindowPosition
 
 KIB = 1024
 
@@ -54,7 +54,7 @@ def test_a_plan_without_weights_is_what_a_run_measures(
     for model in (full, JointWorldModel(tiny_config).eval()):
         config = model.config
         episode = toy_episode(0)
-        request = cut_window(episode, 0, 17).request
+        request = episode.cut(WindowPosition(0, 0, 17)).request
         inputs = build_inputs([_resized(request, config.image_px)], config)
         first = model.first_latents(inputs)
         noise = model.noise(17, torch.Generator().manual_seed(0))

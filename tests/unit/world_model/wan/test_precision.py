@@ -7,7 +7,7 @@ import torch
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import WindowSampler, cut_window
+from services.world_model.training.dataset import WindowPosition, WindowSampler
 from services.world_model.training.objective import LossOptions, losses
 
 
@@ -39,7 +39,7 @@ def _predicted(model, request):
 
 @pytest.mark.long
 def test_bfloat16_weights_predict_nearly_the_same(model, episode):
-    request = cut_window(episode, 0, 17, action_kind="commanded").request
+    request = episode.cut(WindowPosition(0, 0, 17, action_kind="commanded")).request
     exact = _predicted(model, request)
     half = _predicted(model.to(torch.bfloat16), request)
     assert half.images.dtype == half.tactile_kpa.dtype == torch.float32
