@@ -7,8 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from dextouch.streams import Sample, StreamDescriptor
-from dextouch.streams.plausibility import implausible_values
+from dextouch.streams import Sample, StreamDescriptor, implausible_values
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health.evaluation import (
     WINDOW_NS,

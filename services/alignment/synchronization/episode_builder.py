@@ -8,8 +8,7 @@ import numpy as np
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
-from dextouch.streams import StreamDescriptor
-from dextouch.streams.plausibility import check_camera_matrix
+from dextouch.streams import StreamDescriptor, check_camera_matrix
 from dextouch.tactile import pad_forces_n
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands import CHAINS, chain_indices
-from dextouch.streams.plausibility import (
+from dextouch.streams import (
     Implausible,
     implausible_repeats,
     implausible_values,

@@ -12,6 +12,13 @@ from .packing import pack as pack
 from .packing import pack_openpi as pack_openpi
 from .packing import unpack as unpack
 from .packing import unpack_openpi as unpack_openpi
+from .plausibility import Implausible as Implausible
+from .plausibility import check_camera_matrix as check_camera_matrix
+from .plausibility import implausible_joints as implausible_joints
+from .plausibility import implausible_poses as implausible_poses
+from .plausibility import implausible_repeats as implausible_repeats
+from .plausibility import implausible_values as implausible_values
+from .plausibility import lasting_jumps as lasting_jumps
 from .samples import ENCODED_UNITS as ENCODED_UNITS
 from .samples import H264_UNIT as H264_UNIT
 from .samples import HEAD_CAMERA as HEAD_CAMERA

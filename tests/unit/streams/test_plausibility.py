@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.streams.plausibility import (
+from dextouch.streams import (
     check_camera_matrix,
     implausible_joints,
     implausible_poses,
