@@ -97,7 +97,7 @@ COMMANDS = {
     "train world-model": Command(
         "train a world model on episodes of robots and people, of either form",
         "world_model.command_line:run_train",
-        "world_model.forms:train_settings",
+        "world_model.paper_settings:train_settings",
     ),
     "train distill": Command(
         "train a world model in the paper's form to sample in few steps",
@@ -107,7 +107,7 @@ COMMANDS = {
     "train adapt": Command(
         "adapt a world model of either form to new tasks",
         "world_model.command_line:run_adapt",
-        "world_model.forms:adapt_settings",
+        "world_model.paper_settings:adapt_settings",
     ),
     "train imagined": Command(
         "predict the episodes of a store with the world model",

@@ -21,8 +21,12 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
     read_tokenizer,
 )
-from services.world_model.forms import adapt_settings, train_settings
-from services.world_model.paper_settings import DistillCommand, TrainSettings
+from services.world_model.paper_settings import (
+    DistillCommand,
+    TrainSettings,
+    adapt_settings,
+    train_settings,
+)
 from services.world_model.plan import plan_table
 from services.world_model.settings import (
     AdaptStateCommand,

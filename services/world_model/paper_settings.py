@@ -1,14 +1,23 @@
-"""Settings of the paper's form: its training, adaptation and distillation, and its tokenizer's."""
+"""Settings of the paper's form, and which form of the world model a command line is about."""
 
+import os
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
 
-from dextouch.command_line import JSON_HELP
+from dextouch.command_line import JSON_HELP, CommandParser
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import CommandSettings, file_source, service_config
+from dextouch.serving import (
+    CommandSettings,
+    configuration_path,
+    file_source,
+    read_configuration,
+    section_of,
+    service_config,
+)
 from services.networks.training_settings import (
     AverageDecay,
     Batch,
@@ -30,7 +39,15 @@ from services.world_model.network.configuration import (
     WanFiles,
 )
 from services.world_model.presets import PRESETS, PresetSource
-from services.world_model.settings import AdaptationSettings, DataSettings, recorded_command
+from services.world_model.settings import (
+    AdaptationSettings,
+    AdaptStateCommand,
+    DataSettings,
+    TrainStateCommand,
+    recorded_command,
+)
+
+STATE: Final = "state"
 
 
 class OptimizerSettings(FrozenModel):
@@ -332,3 +349,49 @@ class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):
         default=(), description="files of other tokenizers to draw in the picture, too"
     )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+def train_settings(arguments: list[str]) -> type[TrainStateCommand] | type[TrainCommand]:
+    """Settings of `dextouch train world-model`: of the form that --preset names.
+
+    Raises:
+        UnknownNameError: no such preset.
+        InvalidInputError: the configuration file has settings of a form that is not trained.
+    """
+    preset = _value(arguments, "preset", TrainCommand) or STATE
+    if preset not in (STATE, *PRESETS):
+        raise UnknownNameError("preset", preset, [STATE, *PRESETS])
+    if preset != STATE:
+        return TrainCommand
+    path, section = configuration_path(), section_of(TrainCommand)
+    # Nothing would read them.
+    if path is not None and read_configuration(path).get(section, {"preset": STATE}) != {
+        "preset": STATE
+    }:
+        raise InvalidInputError(
+            f"{path}: [{section}] has settings of the paper's form, and no preset of it is named; "
+            f'add preset = "tiny" there, or move them to [{section_of(TrainStateCommand)}]'
+        )
+    return TrainStateCommand
+
+
+def adapt_settings(arguments: list[str]) -> type[AdaptStateCommand] | type[AdaptCommand]:
+    """Settings of `dextouch train adapt`: of the form of the checkpoint --init."""
+    init = _value(arguments, "init", AdaptStateCommand, AdaptCommand)
+    if init is None:
+        return AdaptStateCommand
+    from services.world_model.checkpoints import is_state_checkpoint
+
+    return AdaptStateCommand if is_state_checkpoint(Path(init)) else AdaptCommand
+
+
+def _value(arguments: list[str], name: str, *classes: type[CommandSettings]) -> str | None:
+    """One setting, before it is known which class it is of: a flag, or configured."""
+    parser = CommandParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(f"--{name}", dest="value")
+    value: str | None = parser.parse_known_args(arguments)[0].value
+    path = configuration_path()
+    for section in map(section_of, classes):
+        kept = {} if path is None else read_configuration(path).get(section, {})
+        value = value or os.environ.get(f"DEXTOUCH_{section}_{name}".upper()) or kept.get(name)
+    return value

@@ -102,7 +102,7 @@ def build_episode(
         for name, stream in streams.items()
     }
     streams = {name: one.stream for name, one in checked.items()}
-    check_quaternion_order(streams)
+    check_quaternion_order(streams, recording.attributes.domain)
     stretch = _find_stretch(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands import CHAINS, chain_indices
+from dextouch.schemas import Domain
 from dextouch.streams import (
     Implausible,
     implausible_repeats,
@@ -74,11 +75,11 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
     return CheckedStream(stream, parts_ns)
 
 
-def check_quaternion_order(streams: Mapping[str, DatedStream]) -> None:
-    """Refuse a head or a wrist whose quaternions are x, y, z, w.
+def check_quaternion_order(streams: Mapping[str, DatedStream], domain: Domain) -> None:
+    """Refuse a head, or a person's wrist, whose quaternions are x, y, z, w.
 
-    Heads look at the hands, and fingers point away from the head: where neither holds, but does
-    once the columns are read in the other order, they are in the other order.
+    Heads are upright and look at the hands, and a person's fingers point away from the head: where
+    that does not hold, but does once the columns are read in the other order, they are in it.
 
     Raises:
         InvalidInputError: names the stream.
@@ -91,14 +92,13 @@ def check_quaternion_order(streams: Mapping[str, DatedStream]) -> None:
         {name: _poses_at(streams[name], t_ns, order=order) for name in names}
         for order in ((3, 4, 5, 6), (6, 3, 4, 5))
     )
-    for name in names:
+    # Cameras may stand opposite a robot.
+    for name in names if domain == "human" else names[:1]:
         as_read, otherwise = (
             _share_as_usual(name, {**poses, name: of[name]}) for of in (poses, others)
         )
-        if as_read is None or otherwise is None:
-            continue
         if as_read <= WRONG_SHARE and otherwise >= RIGHT_SHARE:
-            usual = "sees the hands" if name == "head" else "points away from the head"
+            usual = "is upright and sees the hands" if name == "head" else "points forward"
             raise InvalidInputError(
                 f"stream {name!r}: {usual} in {as_read:.0%} of the samples, but in {otherwise:.0%} "
                 "of them if its quaternions are x, y, z, w; expected w, x, y, z: correct the order "
@@ -189,18 +189,22 @@ def _poses_at(
     return transform_from_pose(loaded.values[seen][near])
 
 
-def _share_as_usual(name: str, Ts: Mapping[str, np.ndarray]) -> float | None:
+def _share_as_usual(name: str, Ts: Mapping[str, np.ndarray]) -> float:
     """Share of the samples in which the head sees the hands, or a hand points away from it."""
     if min(len(T) for T in Ts.values()) < MIN_ORDER_SAMPLES:
-        return None
+        return 0.0
     head, body = Ts["head"], Ts[name]
-    if name == "head":
-        hands_m = (Ts["wrist_left"][:, :3, 3] + Ts["wrist_right"][:, :3, 3]) / 2
-        to_m, axis = hands_m - head[:, :3, 3], head[:, :3, 2]
-        least = np.cos(MAX_VIEW_RAD)
-    else:
+    if name != "head":
         # Fingers point along -z of the wrist.
-        to_m, axis, least = body[:, :3, 3] - head[:, :3, 3], -body[:, :3, 2], 0.0
-    lengths_m = np.linalg.norm(to_m, axis=1)
-    cosines = (to_m * axis).sum(axis=1) / np.maximum(lengths_m, LEAST_DISTANCE_M)
-    return float((cosines > least).mean())
+        away_m = body[:, :3, 3] - head[:, :3, 3]
+        return float((_cosines(away_m, -body[:, :3, 2]) > 0).mean())
+    hands_m = (Ts["wrist_left"][:, :3, 3] + Ts["wrist_right"][:, :3, 3]) / 2
+    sees = _cosines(hands_m - head[:, :3, 3], head[:, :3, 2]) > np.cos(MAX_VIEW_RAD)
+    # Rows of images go down, and z of the world goes up.
+    is_upright = head[:, 2, 1] < -np.cos(MAX_VIEW_RAD)
+    return float((sees & is_upright).mean())
+
+
+def _cosines(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(some, axis=1) * np.linalg.norm(others, axis=1)
+    return np.asarray((some * others).sum(axis=1) / np.maximum(lengths, LEAST_DISTANCE_M))

@@ -19,6 +19,8 @@ from services.alignment.calibration.tactile_tare import (
 )
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization.plausible_streams import check_quaternion_order
+from services.alignment.synchronization.recorded_streams import date_stream
 from services.alignment.synchronization.stream_clock import time_stream
 from tests.unit.alignment import recordings
 
@@ -157,14 +159,40 @@ def test_another_unit_is_refused_by_name(tmp_path, stream, factor, said):
     assert refused.value.details["stream"] == stream
 
 
-@pytest.mark.parametrize("stream", ["head", "wrist_left", "wrist_right"])
-def test_another_order_of_quaternions_is_refused_by_name(tmp_path, stream):
-    def swap(poses):
-        poses[:, 3:] = poses[:, [4, 5, 6, 3]]
+def dated(folder, domain, fault):
+    """Dated streams of a take of that domain, and its quaternions as they are sent."""
+    store = EpisodeStore(folder)
+    recordings.write_recording(
+        store, "take", seconds=SECONDS, edit=lambda name, values: fault(name, moving(name, values))
+    )
+    recording = store.recording("take")
+    return {name: date_stream(recording, name) for name in recording.streams}, domain
 
+
+def swapped(poses):
+    poses[:, 3:] = poses[:, [4, 5, 6, 3]]
+
+
+@pytest.mark.parametrize(
+    ("domain", "stream"),
+    [("human", "head"), ("human", "wrist_left"), ("human", "wrist_right"), ("robot", "head")],
+)
+def test_another_order_of_quaternions_is_refused_by_name(tmp_path, domain, stream):
     with pytest.raises(InvalidInputError, match=f"{stream}.*x, y, z, w; expected w") as refused:
-        aligned(tmp_path, only(stream, swap))
+        check_quaternion_order(*dated(tmp_path, domain, only(stream, swapped)))
     assert refused.value.details["fault"] == "quaternion_order"
+
+
+def test_a_robot_that_a_camera_faces_and_bodies_without_rotation_are_accepted(tmp_path):
+    check_quaternion_order(*dated(tmp_path / "0", "robot", only("wrist_left", swapped)))
+
+    def unturned(name, values):
+        if values.shape[1] == 7:
+            values[:, 3:] = [1, 0, 0, 0]
+        return values
+
+    for domain in ("human", "robot"):
+        check_quaternion_order(*dated(tmp_path / domain, domain, unturned))
 
 
 def test_order_of_quaternions_of_all_trackers(tmp_path):

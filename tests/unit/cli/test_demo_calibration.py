@@ -5,7 +5,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
-from dextouch.schemas import TakePrompt, matrix_rows
+from dextouch.schemas import TakePrompt
 from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.gloves import GloveCalibration
@@ -57,7 +57,7 @@ def test_a_take_is_aligned_again_with_the_calibration_that_its_devices_have(meas
         streams,
         TakePrompt(task="wave", instruction="wave", domain="human"),
         success=True,
-        calibration={"K_head": matrix_rows(np.eye(3)), **measured},
+        calibration={"K_head": ((75.0, 0.0, 32.0), (0.0, 75.0, 32.0), (0.0, 0.0, 1.0)), **measured},
         recording_id="demo-human",
         seed=SEED,
         unit_seed=SEED,
