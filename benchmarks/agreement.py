@@ -14,7 +14,6 @@ from scipy.special import ndtri
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Amounts, Bar
@@ -80,7 +79,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no study.
     """
-    del folder
     plan = AMOUNTS.of(options)
     kinds = [(p, d) for p in NUM_POLICIES for d in DISAGREEMENTS]
     found: dict[tuple[int, float], dict[tuple[str, str], Tally]] = {}
@@ -94,7 +92,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     times_s = timed(plan["rounds"])
     return StageReport(
         stage="agreement",
-        machine=describe_machine(("numpy", "scipy")),
+        packages=("numpy", "scipy"),
         options=plan,
         tables=[coverage_table(name, found) for name in MEASURED] + [time_table(times_s)],
         panels=[panel(found, times_s)],

@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float32, Float64
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.episodes import (
@@ -415,7 +414,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Train a judge, write it, and report its metrics on held-out episodes."""
-    del folder, bar
     torch.set_num_threads(1)
     settings = JudgeSettings(
         options.seed,
@@ -431,7 +429,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     metrics = checkpoint.metadata.metrics
     return StageReport(
         stage="direct-judge",
-        machine=describe_machine(("numpy", "torch")),
+        packages=("numpy", "torch"),
         options={"episodes": names, "tasks": options.tasks, "training": asdict(settings)},
         tables=[
             ResultTable(
@@ -440,7 +438,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 [(name, f"{value:.4g}") for name, value in metrics.items()],
             )
         ],
-        panels=[],
         requirements=[],
         data={"metrics": metrics},
     )

@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 
 from benchmarks.figures import Figure, Requirement, at_least
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
@@ -22,7 +21,6 @@ from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
 from services.world_model.training.trainer import TrainingRun
 
-PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
 # Default of `dextouch train world-model --streaming`.
 USUAL_WORKERS = 0
@@ -60,10 +58,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     rates = {name: Figure.of(values) for name, values in found.items()}
     return StageReport(
         stage="loader",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "zstandard"),
         options={**plan, "episodes": pace.num_episodes, "batch": pace.batch, "workers": workers},
         tables=[rate_table(rates, pace.num_episodes)],
-        panels=[],
         requirements=[requirement(rates)],
         data={"windows_per_s": {name: list(figure.values) for name, figure in rates.items()}},
         notes=["the episodes are in the page cache, so disk latency is not included"],

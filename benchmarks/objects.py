@@ -13,7 +13,6 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.figures import at_most
-from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.object_touch import TouchErrors, touch_errors
 from benchmarks.report import ResultTable, StageReport
@@ -30,7 +29,6 @@ from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 
-PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
 FIRST_SEED = 46_000
 AMOUNTS: Final = Amounts(usual={"takes": 4}, quick={"takes": 1})
 # Takes without images are cheap: so many for one with them.
@@ -85,7 +83,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no take.
         UnknownNameError: no such task.
     """
-    del folder
     count = AMOUNTS.of(options)["takes"]
     tasks = named_tasks(options.tasks.split(","))
     sides_px = SIDES_PX[:1] if options.quick else SIDES_PX
@@ -107,10 +104,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
     return StageReport(
         stage="objects",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "opencv-contrib-python-headless", "mujoco"),
         options={"takes": count, "tasks": ", ".join(tasks)},
         tables=[_table(found), _click_table(clicked), _touch_table(touched)],
-        panels=[],
         requirements=[
             at_most("median error, sharp (mm)", _quantile(_all(best, "off_mm")), 1.0),
             at_most("95 % error, sharp (mm)", _quantile(_all(best, "off_mm"), 0.95), 5.0),

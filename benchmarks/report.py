@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from benchmarks.chart import Panel
 from benchmarks.figures import Figure, Requirement
+from benchmarks.machine import describe_machine
 from dextouch.command_line import write_json_text
 
 
@@ -38,19 +40,24 @@ def _digits(value: float) -> str:
 
 @dataclass(frozen=True)
 class StageReport:
-    """Results of one run of a stage.
+    """Results of one run of a stage; `packages` are distributions whose versions matter to it.
 
     `data` holds the raw measurements for JSON: every round of every figure.
     """
 
     stage: str
-    machine: dict[str, str]
+    packages: Sequence[str]
     options: dict[str, Any]
     tables: Sequence[ResultTable]
-    panels: Sequence[Panel]
     requirements: Sequence[Requirement]
     data: dict[str, Any]
-    notes: Sequence[str] = field(default=())
+    panels: Sequence[Panel] = ()
+    notes: Sequence[str] = ()
+
+    @cached_property
+    def machine(self) -> dict[str, str]:
+        """Description of the machine."""
+        return describe_machine(self.packages)
 
     @property
     def is_met(self) -> bool:

@@ -19,7 +19,6 @@ from benchmarks.evaluator.playing import (
     start_in_twin,
 )
 from benchmarks.figures import Requirement, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.clients import PolicyStart
@@ -36,7 +35,6 @@ from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
-PACKAGES: Final = ("numpy", "mujoco", "torch")
 FIRST_SEED = 45_000
 AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 STEPS: Final = (32, 64)
@@ -69,7 +67,6 @@ def _mild(image: np.ndarray, draw: np.random.Generator) -> np.ndarray:
 
 def _jpeg(quality: int) -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:
     def compressed(image: np.ndarray, draw: np.random.Generator) -> np.ndarray:
-        del draw
         return decode_jpeg(encode_jpeg(_pixels(image), quality=quality)) / 255.0
 
     return compressed
@@ -117,7 +114,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no start.
         UnknownNameError: no such task.
     """
-    del folder
     count = AMOUNTS.of(options)["starts"]
     tasks = named_tasks(options.tasks.split(","))
     judged = _Judged(options.world, SuccessClassifier.load(options.probe))
@@ -139,10 +135,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                         step(f"{task} {seed}")
     return StageReport(
         stage="starts",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco", "torch"),
         options={"starts": count, "first seed": options.first_seed},
         tables=[_errors(found), _outcomes(found)],
-        panels=[],
         requirements=_requirements(found),
         data={
             task: {

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.figures import at_least
-from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import clicked_image
 from benchmarks.object_touch import GRIPS, described_objects
 from benchmarks.report import ResultTable, StageReport
@@ -20,7 +19,6 @@ from dextouch.episodes import EpisodeGrid, EpisodeStore, split_of
 from dextouch.errors import ConflictError
 from dextouch.schemas import EpisodeClicks, ObjectClicks, SceneObject
 
-PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 NUM_TAKES: Final = 84
 _OBJECTS, _LAB, _RECORDED = "objects.json", "lab", "recorded"
 _MODEL, _JUDGE, _SCORES = "model.safetensors", "judge.safetensors", "scores.json"
@@ -47,7 +45,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         ConflictError: a command failed.
     """
-    del folder, bar
     keep: Path = options.keep
     data = _step(
         _RECORDED,
@@ -63,7 +60,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     trust: dict[str, dict[str, Any]] = scores["trust"]
     return StageReport(
         stage="touch",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={
             "takes": options.takes,
             "tasks": options.tasks,
@@ -71,7 +68,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "init": options.init is not None,
         },
         tables=[_table(trust)],
-        panels=[],
         requirements=[
             at_least(f"AUC, {task}", float(one.get("auc") or "nan"), 0.80)
             for task, one in trust.items()

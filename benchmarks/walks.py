@@ -92,7 +92,6 @@ class Tracer:
 
     def __call__(self, frame: FrameType, event: str, argument: object) -> None:
         """See `sys.setprofile`."""
-        del argument
         if event != "call" or not self.is_on:
             return
         code = frame.f_code

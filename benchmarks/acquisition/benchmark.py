@@ -11,12 +11,10 @@ from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.speed import measure_speed
 from benchmarks.acquisition.tables import panels, requirements, tables
 from benchmarks.figures import Figure
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 
 LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
-PACKAGES = ("numpy", "pyserial")
 AMOUNTS = Amounts(
     usual={"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60},
     quick={"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5},
@@ -43,7 +41,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: an invalid number.
     """
-    del folder
     plan = AMOUNTS.of(options, packets=5, seconds=1e-3)
     seed = options.seed
     families = make_families()
@@ -74,7 +71,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     share = Figure.of([100 * run["cpu_s"] / run["seconds"] / NUM_STREAMS for run in runs])
     return StageReport(
         stage="acquisition",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "pyserial"),
         options={**plan, "seed": seed},
         tables=tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
         panels=panels(judgements, speeds),

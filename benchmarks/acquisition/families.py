@@ -152,7 +152,6 @@ def _make_wuji(index: int, rng: np.random.Generator) -> bytes:
 
 
 def _make_justfloat(index: int, rng: np.random.Generator) -> bytes:
-    del index
     counts = rng.integers(0, round(FULL_SCALE) + 1, NUM_VALUES)
     counts[rng.random(NUM_VALUES) >= TOUCHED_SHARE] = 0
     return encode_justfloat(counts.astype(np.float32))

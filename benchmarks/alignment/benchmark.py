@@ -7,13 +7,11 @@ from pathlib import Path
 from benchmarks.alignment.compare import compare
 from benchmarks.alignment.recordings import RecordedTake, record
 from benchmarks.alignment.tables import panels, requirements, tables
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_retargeter import warm_up
 
-PACKAGES = ("numpy", "numba", "scipy", "zstandard")
 QUICK_SECONDS, USUAL_SECONDS = "3", "10,60"
 AMOUNTS = Amounts(usual={"rounds": 5}, quick={"rounds": 1})
 # Shorter takes have no stretch of 17 steps.
@@ -45,7 +43,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     longest = results[-1]
     return StageReport(
         stage="alignment",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "numba", "scipy", "zstandard"),
         options={"seconds": lengths_s, "rounds": num_rounds, "seed": options.seed},
         tables=tables(results),
         panels=panels(longest),

@@ -7,11 +7,9 @@ from benchmarks.clocks.compare import compare, compare_stampless
 from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STOP_SCENES, find_scene
 from benchmarks.clocks.scores import WARM_UP_S
 from benchmarks.clocks.tables import panels, requirements, tables
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 
-PACKAGES = ("numpy",)
 AMOUNTS = Amounts(usual={"seconds": 600.0, "rounds": 5}, quick={"seconds": 60.0, "rounds": 1})
 # Online errors count after the warm-up, and a step comes in the middle.
 MIN_SECONDS = 2 * WARM_UP_S + 2
@@ -42,7 +40,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     stampless = compare_stampless(**effort, bar=bar)
     return StageReport(
         stage="clocks",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy",),
         options={**plan, "seed": options.seed, "scenes": names},
         tables=tables(results, stampless),
         panels=panels(results),

@@ -9,11 +9,9 @@ from benchmarks.closure.contact_times import timing_errors
 from benchmarks.closure.methods import METHODS, OURS, Method
 from benchmarks.closure.replay import TASKS, ClosureTake, close_take
 from benchmarks.figures import Requirement, at_least
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 
-PACKAGES = ("numpy", "mujoco", "numba")
 FIRST_SEED = 100
 AMOUNTS = Amounts(usual={"takes": 20}, quick={"takes": 1})
 MIN_SUCCESS = 0.8
@@ -38,7 +36,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no take.
         UnknownNameError: no such task.
     """
-    del folder
     num_takes = AMOUNTS.of(options)["takes"]
     tasks = options.tasks.split(",")
     methods = QUICK_METHODS if options.quick else METHODS
@@ -52,10 +49,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                     played[task, take.method].append(take)
     return StageReport(
         stage="closure",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco", "numba"),
         options={"takes": num_takes, "tasks": tasks},
         tables=[_table(played, num_takes)],
-        panels=[],
         requirements=[_requirement(played, task) for task in tasks],
         data={
             "succeeded": {

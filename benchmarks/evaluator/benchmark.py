@@ -26,7 +26,6 @@ from benchmarks.evaluator.plan import (
 from benchmarks.evaluator.repetition import read_lines, repetition
 from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
@@ -36,7 +35,6 @@ from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED
 
-PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
 AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 # Titles of the tables, by their names in `evaluator.json`.
@@ -132,7 +130,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: options that do not fit.
     """
-    del folder
     earlier = read_lines(options.repeats) if options.repeats else {}
     plan = _plan(options)
     study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
@@ -168,7 +165,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     (plan.keep / "evaluator.json").write_text(text + "\n", encoding="utf-8")
     return StageReport(
         stage="evaluator",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco"),
         options={
             "tasks": study.tasks,
             "starts": len(plan.seeds),
@@ -176,7 +173,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "kinds": plan.kinds and asdict(plan.kinds),
         },
         tables=tables,
-        panels=[],
         requirements=[
             *(line.requirement() for line in lines),
             *(repetition(lines, earlier) if options.repeats else ()),

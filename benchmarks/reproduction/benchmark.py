@@ -10,7 +10,6 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from benchmarks.figures import Requirement
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport, to_markdown, write_json
 from benchmarks.reproduction.experiments import QUICK, TABLES, Experiments, Sizes, Table
 from benchmarks.reproduction.steps import Step, run
@@ -19,7 +18,6 @@ from benchmarks.stages import Bar
 from dextouch.errors import NotFoundError
 from dextouch.schemas import first_problems
 
-PACKAGES = ("numpy", "torch", "mujoco-core")
 _LEGEND = (
     "cells are means over training seeds with 95 % intervals (Student's t); in brackets the "
     "paper's numbers, measured on other data and in other units"
@@ -44,7 +42,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Run the missing steps, and write the tables."""
-    del folder, bar
     keep: Path = options.keep
     tables: Sequence[Table] = options.tables or TABLES
     sizes = options.sizes or (QUICK if options.quick else Sizes())
@@ -69,10 +66,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     shown = [table for page in pages for table in page.tables()]
     report = StageReport(
         stage="reproduction",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={"tables": tables, "seeds": options.seeds, "sizes": sizes.model_dump(mode="json")},
         tables=[_step_table(steps, keep)] if options.list else [*shown, data],
-        panels=[],
         requirements=[Requirement("steps that fail", float(len(failed)), "at most", 0.0)],
         data={
             "tables": [page.to_json() for page in pages],

@@ -5,7 +5,6 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.retargeting.compare import (
     Effort,
@@ -30,7 +29,6 @@ from benchmarks.retargeting.tables import panels, requirements, tables
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 
-PACKAGES = ("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs")
 AMOUNTS = Amounts(
     usual={"seeds": 2, "samples": 600, "people": 5, "rounds": 6, "postures": 5000},
     quick={"seeds": 1, "samples": 120, "people": 1, "rounds": 1, "postures": 100},
@@ -58,7 +56,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         UnknownNameError: a rival that there is not.
         InvalidInputError: no round, or motions of fewer than 30 samples.
     """
-    del folder
     if options.seed < 0:
         raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
     plan = AMOUNTS.of(options, samples=30)
@@ -73,7 +70,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     cold = cold_start(effort.num_postures, effort.seed)
     return StageReport(
         stage="retargeting",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs"),
         options={**asdict(effort), "rivals": list(rivals)},
         tables=tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
         panels=panels(speeds, robot, pinches),

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
 from benchmarks.rollouts.watcher import listing_s, watched
@@ -70,7 +69,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round, or more chunks than a rollout may have.
     """
-    del folder
     plan = AMOUNTS.of(options, watched_rollouts=0)
     if max(plan["chunks"], plan["crowd_chunks"]) > MAX_CHUNKS:
         raise InvalidInputError(
@@ -91,10 +89,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     over = {way: _overhead(times_s, way, bare_s[way.selector]) for way in ways}
     return StageReport(
         stage="rollouts",
-        machine=describe_machine(("numpy", "fastapi", "uvicorn", "websockets", "msgpack")),
+        packages=("numpy", "fastapi", "uvicorn", "websockets", "msgpack"),
         options=plan,
         tables=[_table(times_s, over, sizes), _crowd_table(crowds)],
-        panels=[],
         requirements=[
             *_requirements(times_s, over, crowds),
             *_listing_requirements(listings_s, plan["watched_rollouts"]),

@@ -64,7 +64,6 @@ class StillWorld:
 
     def reset(self, start: RolloutStart) -> StartedRollout[int]:
         """See World."""
-        del start
         anchor = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
         return StartedRollout(0, self._seen(0, resting_actions(1)), anchor, np.eye(3))
 
@@ -77,7 +76,6 @@ class StillWorld:
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[int]:
         """See World."""
-        del seed
         seen = self._seen(state + 1, check_actions(actions)).selected(selector)
         return SteppedRollout(state + len(actions), seen)
 

@@ -68,17 +68,14 @@ def _swapped_fingers(samples: np.ndarray, rng: Generator) -> None:
 
 
 def _dropout(samples: np.ndarray, rng: Generator) -> None:
-    del rng
     samples[:] = np.nan
 
 
 def _twice_as_large(samples: np.ndarray, rng: Generator) -> None:
-    del rng
     samples *= 2.0
 
 
 def _millimetres(samples: np.ndarray, rng: Generator) -> None:
-    del rng
     samples *= 1e3
 
 

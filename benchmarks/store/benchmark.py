@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 from benchmarks.store.appends import measure_appends
@@ -28,7 +27,6 @@ DESIGNS: tuple[Design, ...] = (
     ZarrDesign("raw"),
     McapDesign(),
 )
-PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap")
 AMOUNTS = Amounts(
     usual={"seconds": 10.0, "rounds": 5, "windows": 40},
     quick={"seconds": 2.0, "rounds": 1, "windows": 4},
@@ -69,7 +67,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     live = _live(results, workload, folder / "live", plan["rounds"], bar)
     return StageReport(
         stage="store",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap"),
         options={**plan, "seed": options.seed, "designs": [design.name for design in designs]},
         tables=tables(results, appends, live),
         panels=panels(results),

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Requirement, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from benchmarks.stress.cells import (
@@ -116,8 +115,8 @@ def _place(stage: str) -> int:
 def _report(
     tables: Sequence[ResultTable], requirements: Sequence[Requirement], data: dict[str, Any]
 ) -> StageReport:
-    machine = describe_machine(["numpy", "scipy", "torch", "mujoco-core"])
-    return StageReport("stress", machine, {}, tables, [], requirements, data)
+    packages = ("numpy", "scipy", "torch", "mujoco-core")
+    return StageReport("stress", packages, {}, tables, requirements, data)
 
 
 def _matrix(findings: Sequence[Finding]) -> ResultTable:

@@ -10,7 +10,6 @@ import numpy as np
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
@@ -24,7 +23,6 @@ from benchmarks.twin.physics import (
 )
 from services.twin.tasks import TASK_NAMES
 
-PACKAGES: Final = ("numpy", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
 # 16 steps at 15 a second.
@@ -47,7 +45,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round.
     """
-    del folder
     plan = AMOUNTS.of(options)
     chunk = TimedChunk(options.task, FIRST_SEED)
     subjects = chunk.subjects()
@@ -57,7 +54,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     solver_ms, errors, num_chunks = _solvers(options.task, plan, bar)
     return StageReport(
         stage="twin",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco-core"),
         options={**plan, "task": options.task, "chunks_with_contact": num_chunks},
         tables=[selector_table(times_ms), solver_table(solver_ms, errors, num_chunks)],
         panels=[panel(solver_ms, errors)],

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Figure
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
@@ -45,7 +44,6 @@ from services.world_model.shipped_checkpoints import (
 from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 
-PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
 AMOUNTS: Final = Amounts(usual={"rounds": 7, "seeds": 6}, quick={"rounds": 1, "seeds": 1})
@@ -80,7 +78,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
-    del folder
     plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
@@ -115,7 +112,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     state_ms = _state_costs(state_world, plan["rounds"], bar)
     return StageReport(
         stage="world-model",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={**plan, "tasks": tasks, "checkpoint": world.description.name, "served": served},
         tables=[
             error_table(times_ms, errors, served, len(episodes)),
