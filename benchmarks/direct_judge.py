@@ -111,8 +111,7 @@ class Attempts:
 class DirectNetwork(nn.Module):
     """Gated recurrent network on commands relative to the objects that a start reader finds.
 
-    Args:
-        config: tasks, objects and images; of the state model it has the reader only.
+    Of the state model that `config` describes, it has the reader only.
     """
 
     boxes_m: Tensor
@@ -163,10 +162,7 @@ class DirectNetwork(nn.Module):
 
 
 class DirectJudge:
-    """A trained direct judge.
-
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
+    """A trained direct judge, from `load_checkpoint` or from training.
 
     Raises:
         InvalidInputError: the weights do not match the configuration in the metadata.
@@ -190,11 +186,7 @@ class DirectJudge:
 
     @torch.no_grad()
     def probability(self, start: RolloutStart, actions: Float64[np.ndarray, "steps 67"]) -> float:
-        """Calibrated probability that commands succeed.
-
-        Args:
-            start: with the first observation, the anchor and K_head.
-            actions: commands of all 4k steps after it, relative to the anchor.
+        """Calibrated probability that commands (4k steps, relative to the anchor) succeed.
 
         Raises:
             UnknownNameError: a task that the judge was not trained for.
@@ -254,13 +246,8 @@ def train_direct_judge(
 ) -> Checkpoint:
     """Train a start reader on object poses, then the recurrent network on outcomes.
 
-    A share of the scenes is held out for early stopping, calibration and metrics.
-
-    Args:
-        episodes: with known outcomes.
-        starts: digests of their first observations, to store in the checkpoint.
-        settings: training settings.
-        command: command to store in the checkpoint.
+    A share of the scenes is held out for early stopping, calibration and metrics. The digests of
+    the first observations and the command are stored in the checkpoint.
 
     Raises:
         InvalidInputError: only one outcome, or too few scenes to hold some out.

@@ -95,11 +95,7 @@ class TrainingPace:
     """Windows per second of the loader and the training step, separately and together.
 
     All measurements use the same network, the same sampling of windows and one thread, and exclude
-    one-time work: codecs are fitted and worker processes started beforehand.
-
-    Args:
-        url: URL of an episode store.
-        fit_windows: windows the codecs are fitted on.
+    one-time work: codecs are fitted on `fit_windows` and worker processes started beforehand.
     """
 
     def __init__(self, url: str, *, fit_windows: int = 256) -> None:

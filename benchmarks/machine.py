@@ -16,11 +16,7 @@ NOT_INSTALLED = "not installed"
 
 
 def describe_machine(packages: Sequence[str]) -> dict[str, str]:
-    """Processor, memory, system, load and versions, for the head of a report.
-
-    Args:
-        packages: distributions whose versions matter to the stage.
-    """
+    """Processor, memory, system, load and versions of packages, for the head of a report."""
     about = {
         "dextouch": dextouch.__version__,
         "commit": commit(),

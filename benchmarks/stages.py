@@ -32,12 +32,7 @@ class Stage(Protocol):
 
 
 class Amounts:
-    """Amounts that a stage measures: their usual values, those of --quick, and options for some.
-
-    Args:
-        usual: values by name.
-        quick: likewise, with --quick.
-    """
+    """Amounts that a stage measures by name: usual and quick ones, and options for some."""
 
     def __init__(self, usual: dict[str, Any], quick: dict[str, Any]) -> None:
         self.usual, self.quick = usual, quick
@@ -52,12 +47,8 @@ class Amounts:
     def of(self, options: argparse.Namespace, **least: int | float) -> dict[str, Any]:
         """The amounts of a run, those that options set instead of the default ones.
 
-        Args:
-            options: parsed command line.
-            least: smallest amounts other than 1.
-
         Raises:
-            InvalidInputError: an option that is too small.
+            InvalidInputError: an option that is less than 1, or than `least` says.
         """
         plan = {}
         for name, default in (self.quick if options.quick else self.usual).items():

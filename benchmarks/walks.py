@@ -49,11 +49,7 @@ _PREFIXES = tuple(f"{root}/" for root in _ROOTS)
 
 @dataclass
 class Walk:
-    """Files and functions that a piece of data passed through.
-
-    Attributes:
-        calls: number of calls by (thread, file, function).
-    """
+    """Files and functions that data passed through: calls by (thread, file, function)."""
 
     name: str
     calls: Counter[tuple[str, str, str]] = field(default_factory=Counter)
@@ -139,12 +135,7 @@ def _place(code: CodeType) -> tuple[str, str] | None:
 
 
 def packet_to_spool(stream: str, *, links: MockLinks | None = None) -> Walk:
-    """From the read of a packet or image to its record in the spool, in the reader's thread.
-
-    Args:
-        stream: `tactile_left` or a camera's.
-        links: how the mock device is connected.
-    """
+    """From the read of a packet or image to its record in the spool, in the reader's thread."""
     device = stream.replace("tactile_", "glove_")
     tracer = Tracer(f"{stream} → spool", threads=f"read-{device}")
     streams = [s for s in pattern_streams(TAKE_S) if s.descriptor.name == stream]
@@ -187,8 +178,7 @@ def upload() -> Walk:
 def action_chunk_walk(world: World[Any] | None = None) -> Walk:
     """From a policy's chunk to its observation, on both sides of HTTP.
 
-    Args:
-        world: world to serve; default: the baseline, which computes nothing.
+    The default world is the baseline, which computes nothing.
     """
     shown = world or CopyFirstWorld(tasks=(TASK,))
     tracer = Tracer(f"action chunk, {shown.description.name}")

@@ -81,14 +81,7 @@ class _Run:
 def compare(
     take: RecordedTake, num_rounds: int, folder: Path, *, bar: Bar
 ) -> dict[str, MethodResult]:
-    """Align a take alternately with every method, each time in a new store.
-
-    Args:
-        take: in the spool.
-        num_rounds: at least 1; errors are those of the first round.
-        folder: for the stores; they are removed.
-        bar: opens a progress bar.
-    """
+    """Align a take of the spool alternately with every method, each time in a new store."""
     subjects = {name: partial(_run, take, name, folder / "store") for name in METHODS}
     with bar(f"take of {take.seconds:g} s", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
@@ -143,16 +136,11 @@ def _clock_fits_s(recording: RecordingReader) -> float:
 def align_by_arrivals(
     store: EpisodeStore, recording_id: str, on_stage: OnStage, *, nearest: bool
 ) -> str:
-    """Align a recording as if every sample had been taken when it arrived.
+    """Align a recording of a person as if every sample had been taken when it arrived.
 
     There is no clock model, no path delay and no gap; values are converted and hands retargeted as
-    in the service. Returns the episode's id.
-
-    Args:
-        store: of recording and episode.
-        recording_id: of a take of a person.
-        on_stage: called at the beginning of each stage.
-        nearest: steps take the nearest sample instead of interpolating.
+    in the service. With `nearest`, steps take the nearest sample instead of interpolating. Returns
+    the episode's id.
     """
     recording = store.recording(recording_id)
     # The clock fits inside are timed separately and subtracted.

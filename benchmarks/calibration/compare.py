@@ -100,8 +100,7 @@ def not_worse_share(
 ) -> tuple[float, float]:
     """Share of seeds with an error of at most the rival's plus a tolerance in our sigmas.
 
-    Returns:
-        Share by rotation, by translation.
+    Returns the share by rotation and that by translation.
 
     Raises:
         InvalidInputError: ours has no sigma.

@@ -18,16 +18,11 @@ RIVALS = ("tsai", "park", "daniilidis", "li")
 
 @dataclass(frozen=True)
 class SceneResult:
-    """One kind of scene.
+    """One kind of scene, and how ours and the other methods treat it.
 
-    Attributes:
-        name: what is wrong with it.
-        is_healthy: whether it should be solved.
-        num_seeds: number of scenes.
-        num_refused: number of refusals by ours.
-        num_named: number of refusals that name axes to add.
-        cause: message of the first refusal.
-        rivals: other method → median error, or that it refuses or returns NaN.
+    Of `num_refused` refusals by ours, `num_named` name axes to add, and `cause` is the message of
+    the first; `rivals` has the median errors of the other methods, or that they refuse or return
+    NaN.
     """
 
     name: str

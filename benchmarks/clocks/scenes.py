@@ -60,14 +60,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class Take:
-    """A simulated take: recorded data and ground truth.
+    """A simulated take: what was recorded of the samples that arrived, and their true times.
 
-    Attributes:
-        sequence: numbers of the samples that arrived, counted by the device.
-        t_device_ns: the device's timestamps.
-        t_host_ns: arrivals on the host's clock.
-        true_ns: true sampling times, on the host's clock.
-        step_true_ns: time of the clock step; None if there is none.
+    `sequence` is counted by the device; arrivals and true times are on the host's clock.
+    `step_true_ns` is the time of the clock step; None if there is none.
     """
 
     scene: Scene

@@ -36,13 +36,7 @@ _PALM_SIGN: Final = {"left": -1.0, "right": 1.0}
 
 @dataclass(frozen=True)
 class HandServos:
-    """Stiffness of a position-controlled hand and its arm, measured or from the manufacturer.
-
-    Args:
-        finger_nm_rad: stiffness of every finger joint.
-        wrist_n_m: translational stiffness of the wrist.
-        wrist_nm_rad: rotational stiffness of the wrist.
-    """
+    """Stiffness of every finger joint of a position-controlled hand, and of its wrist."""
 
     finger_nm_rad: float
     wrist_n_m: float
@@ -66,12 +60,8 @@ def commands_from_touch(
 ) -> HandCommands:
     """Commands of one hand; without contact, exactly the poses to be reached.
 
-    Args:
-        hand: kinematics.
-        Ts_world_wrist: [T, 4, 4], target poses of the robot's wrist.
-        joints_rad: [T, 20], target angles, inside the limits.
-        pad_forces_n: [T, 6], target forces of thumb … little fingertip and palm.
-        servos: stiffness of the commanded hand.
+    Poses are those of the robot's wrist [T, 4, 4], joint angles [T, 20] inside the limits, forces
+    [T, 6] those of thumb … little fingertip and palm; the servos are those of the commanded hand.
     """
     Ts = np.asarray(Ts_world_wrist, dtype=np.float64)
     joints = np.asarray(joints_rad, dtype=np.float64)

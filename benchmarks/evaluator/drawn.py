@@ -88,11 +88,7 @@ class Drawn:
 
 
 class Sampling:
-    """Draws of the starts of a task, the same for every figure.
-
-    Args:
-        rollouts: whose starts are drawn.
-    """
+    """Draws of the starts of a task, the same for every figure."""
 
     def __init__(self, rollouts: Iterable[Rolled]) -> None:
         self.seeds = sorted({one.seed for one in rollouts})
@@ -191,12 +187,7 @@ def probabilities(rollouts: Iterable[Rolled], kind: str) -> np.ndarray:
 
 
 def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line]:
-    """The mean of every figure over the training seeds, and the worst seed where it has a bound.
-
-    Args:
-        task: its name.
-        by_seed: the same figures of every training seed, in the same order.
-    """
+    """The mean of every figure over the training seeds, and the worst seed where it has a bound."""
     lines = []
     for same in zip(*by_seed, strict=True):
         values = [one.value for one in same]

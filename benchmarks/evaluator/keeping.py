@@ -29,11 +29,7 @@ def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 class KeptRows:
-    """All rows of a file; added rows are written immediately.
-
-    Args:
-        path: file; it and its folder are created with the first row.
-    """
+    """All rows of a file, which is created with the first; added rows are written at once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -30,13 +30,10 @@ BySeed = Sequence[Sequence[Rolled]]
 
 
 class KindFigures:
-    """Figures of one task about scripts with mistakes.
+    """Figures of one task about scripts with mistakes of a set of kinds.
 
-    Args:
-        task: its name.
-        name: of the set of kinds.
-        by_seed: their rollouts, for every training seed the same ones in the same order.
-        ladder: rollouts of the scripts that err in position only, to stand beside them.
+    The rollouts are the same ones for every training seed, in the same order; beside them stand
+    those of the scripts that err in position only, the ladder.
     """
 
     def __init__(self, task: str, name: str, by_seed: BySeed, ladder: BySeed) -> None:
@@ -151,12 +148,7 @@ def policy_figures(
 ) -> list[Drawn]:
     """Agreement of success rates over policies, each from its own starts.
 
-    Args:
-        sampling: of the starts.
-        what: name of the figures.
-        rollouts: of all policies.
-        policy_of: the policy of a rollout.
-        bounds: least correlation and greatest MMRV.
+    `bounds` are the least correlation and the greatest MMRV.
     """
     names = list(dict.fromkeys(map(policy_of, rollouts)))
     shape = (len(names), len(sampling.seeds))

@@ -35,12 +35,8 @@ _LAST_IMAGE = "verdict of the last image"
 class TaskFigures:
     """All figures of one task.
 
-    Args:
-        task: its name.
-        by_seed: for every training seed the rollouts completed in both worlds, the same ones in
-            the same order.
-        scripts: names of the scripted policies.
-        kinds: name of the set of kinds of mistakes.
+    The rollouts were completed in both worlds; they are the same ones for every training seed, in
+    the same order. `kinds` is the name of the set of kinds of mistakes.
     """
 
     def __init__(

@@ -76,13 +76,9 @@ class OutsidePolicy:
 
 @dataclass(frozen=True)
 class Trained:
-    """The checkpoints of one training seed.
+    """The checkpoints of one training seed: world model (None: the package's), judge, baselines.
 
-    Args:
-        world: world model; None: the one included in the package.
-        probe: judge of imagined endings.
-        direct: direct judge, the baseline without a world model; None for none.
-        untouched: world model trained without touch; None for none.
+    `direct` is a judge without a world model, `untouched` a world model trained without touch.
     """
 
     world: Path | None

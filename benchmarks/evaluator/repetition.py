@@ -61,10 +61,6 @@ def read_lines(path: Path) -> Earlier:
 def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
     """Difference of each figure that both runs have, with its tolerance.
 
-    Args:
-        lines: of this run.
-        earlier: from `read_lines`.
-
     Raises:
         InvalidInputError: no line in common.
     """

@@ -8,10 +8,9 @@ from services.evaluation.statistics import Counts, Interval, central_interval
 
 
 def interval_of_draws(figures: np.ndarray) -> Interval | None:
-    """95 % percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
+    """95 % percentile interval of figures [draws] of a bootstrap that are defined, thus not NaN.
 
-    Returns:
-        The interval of the defined draws; None where more than half are undefined.
+    Returns None where more than half are undefined.
 
     Raises:
         ShapeError: not one axis with at least one draw.
@@ -32,10 +31,7 @@ def rates_of_draws(
 ) -> Float64[np.ndarray, "draws policies"]:
     """Mean outcome of every policy in every draw; NaN where a draw lacks all of its starts.
 
-    Args:
-        outcomes: [policies, starts], sums over the rollouts.
-        played: [policies, starts], numbers of rollouts.
-        counts: from `start_counts`.
+    From sums of outcomes and numbers of rollouts, both [policies, starts].
     """
     with np.errstate(invalid="ignore"):
         return np.asarray((counts @ outcomes.T) / (counts @ played.T))
@@ -46,11 +42,7 @@ def area_under_roc_of_draws(
 ) -> Float64[np.ndarray, " draws"]:
     """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
 
-    Args:
-        scores: [n], higher for more certain success.
-        success: [n] outcomes.
-        start_index: [n], start of each rollout.
-        counts: from `start_counts`.
+    Scores [n] are higher for more certain success; each rollout has the index of its start.
     """
     scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
     weight = _weights(counts, start_index)

@@ -56,12 +56,9 @@ DEPENDS_ON: Final[dict[str, tuple[str, ...]]] = {
 class PolicyRollout:
     """One policy from one start, in the twin and in the world of every training seed.
 
-    Args:
-        twin: the real world.
-        keep: folder of results; existing arrays are not computed again.
-        about: the task, the seed and the name of the policy; of a policy with a mistake also the
-            digest of the mistakes, since only the ending of its rollouts is kept.
-        actor: the policy, or its actions.
+    Arrays that exist in the folder `keep` are not computed again. `about` are the task, the seed
+    and the name of the policy; of a policy with a mistake also the digest of the mistakes, since
+    only the ending of its rollouts is kept. `actor` is the policy, or its actions.
     """
 
     def __init__(

@@ -12,11 +12,7 @@ from services.world_model.shipped_checkpoints import default_checkpoint
 
 
 def write_single_members(world: Path | None, folder: Path) -> list[Path]:
-    """Write a checkpoint of every member of a state model's ensemble.
-
-    Args:
-        world: checkpoint of a state model; None: the one included in the package.
-        folder: where to write them.
+    """Write a checkpoint of every member of a state model's ensemble (None: the package's own).
 
     Raises:
         CorruptDataError: not a state model.

@@ -48,10 +48,7 @@ def still_figures(
 ) -> dict[str, object]:
     """The greatest imagined pressure, and PSNR [imagined, copy of the first image] of each image.
 
-    Args:
-        imagined: by a world.
-        true_images: [shown, h, w, 3] of the same steps.
-        first_image: [h, w, 3] of step 0.
+    True images [shown, h, w, 3] are those of the same steps, the first image is that of step 0.
     """
     everywhere = np.ones(first_image.shape[:2], dtype=bool)
     return {

@@ -460,14 +460,10 @@ def estimate_figures(
     task: str,
     estimate: Callable[[RolloutScore], float | None] = _own,
 ) -> EstimateFigures:
-    """Figures of one world and task; NaN where it is undefined or there are no estimates.
+    """Figures of one task in an imagined world; NaN where undefined or without estimates.
 
-    Args:
-        scores: of rollouts in one imagined world.
-        true: success (0 or 1) or score in the real world by task, policy and seed; rollouts
-            without one are left out.
-        task: to measure.
-        estimate: of it, of a rollout.
+    `true` is success (0 or 1) or score in the real world by task, policy and seed; rollouts without
+    one are left out.
     """
     used = [
         (one.policy, value, float(true[one.task, one.policy, one.seed]))

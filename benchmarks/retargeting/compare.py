@@ -44,13 +44,9 @@ _NOISE_STREAM = 7
 class Effort:
     """Extent of the measurement.
 
-    Args:
-        num_seeds: robot motions of each kind and side.
-        num_samples: of each of them, at 60 Hz; also of a round of the timing.
-        num_people: pinching people per side, smallest first, 1 … 5.
-        num_rounds: of the timing.
-        num_postures: per side, for cold starts.
-        seed: of the first motion.
+    Robot motions are `num_seeds` of each kind and side, of `num_samples` at 60 Hz each, as is a
+    round of the timing; people per side are 1 … 5, smallest first; `seed` is that of the first
+    motion.
     """
 
     num_seeds: int
@@ -65,9 +61,8 @@ class Effort:
 class Speed:
     """One method on one input: processor time a sample of each round, wall time of its calls.
 
-    Attributes:
-        call_us: median and 99th percentile of a call's wall time over all rounds; None where
-            there is one call for all samples.
+    `call_us` are the median and 99th percentile of a call's wall time over all rounds; None where
+    there is one call for all samples.
     """
 
     method: str

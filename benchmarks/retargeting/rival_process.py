@@ -136,9 +136,8 @@ def serve(name: str, requests: IO[bytes], answers: IO[bytes]) -> None:
 def follow(setup: Setup) -> tuple[np.ndarray, dict[str, Any]]:
     """Run the rival on all references, one call per sample, after a warm-up on the first.
 
-    Returns:
-        Joint angles [T, joints] in its own order, and the times: `cpu_s` of all calls and `call_s`
-        of each, without the time between calls.
+    Returns joint angles [T, joints] in its own order, and the times: `cpu_s` of all calls and
+    `call_s` of each, without the time between calls.
     """
     warm_up = setup.references[:1] * NUM_WARM_UP
     joints, calls_s, cpus_s = [], [], []

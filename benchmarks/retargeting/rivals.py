@@ -107,12 +107,8 @@ def set_up(
 ) -> Setup:
     """Create a retargeter for the robot hand of one side, with its references.
 
-    Args:
-        rival: which.
-        keypoints_m: [T, 25, 3], wrist coordinates.
-        side: of the hand.
-        scale: size of the robot's hand relative to the tracked one.
-        folder: for the URDF.
+    Keypoints are [T, 25, 3] in wrist coordinates, `scale` is the size of the robot's hand relative
+    to the tracked one, the folder is for the URDF.
 
     Raises:
         UnavailableError: its library is not installed.

@@ -20,11 +20,8 @@ LIMIT_TOLERANCE_RAD = 1e-6
 class RobotScore:
     """Errors in recovering known joint angles of the robot's own hand, pooled over motions.
 
-    Tip errors are distances in the wrist frame, not relative to the knuckle.
-
-    Attributes:
-        num_outside: joint angles beyond their limits.
-        max_step_deg: the largest joint change from one sample to the next.
+    Tip errors are distances in the wrist frame, not relative to the knuckle. `num_outside` joint
+    angles are beyond their limits, `max_step_deg` is the largest change of a joint between samples.
     """
 
     tip_mean_mm: float
@@ -40,13 +37,9 @@ class RobotScore:
 class PinchScore:
     """Quality of people's pinches on the robot hand, pooled over motions.
 
-    Attributes:
-        gap_mean_mm: distance of the robot's tips where the human ones are less than 3 mm apart.
-        gap_p95_mm: of the same distances.
-        same_angle_deg: mean difference of robot and human joint angles over all samples.
-        max_step_deg: the largest turn of a joint from one sample to the next.
-        num_outside: joint angles beyond the robot's limits.
-        num_pinched: number of tip distances behind the first two.
+    Gaps are the distances of the robot's tips where the human ones are less than 3 mm apart,
+    `num_pinched` of them; `same_angle_deg` is the mean difference of robot and human joint angles
+    over all samples, `max_step_deg` the largest turn of a joint from one sample to the next.
     """
 
     gap_mean_mm: float

@@ -35,8 +35,7 @@ def resting_actions(num_steps: int) -> Float64[np.ndarray, "steps 67"]:
 class StillWorld:
     """Returns the same prepared observation for every chunk.
 
-    Args:
-        is_quick: whether the service may call it in its event loop.
+    `is_quick`: whether the service may call it in its event loop.
     """
 
     def __init__(self, *, is_quick: bool = True) -> None:

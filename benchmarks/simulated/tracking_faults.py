@@ -20,13 +20,11 @@ _BODY = np.array([node for chain in CHAINS for node in chain_indices(chain)])
 
 @dataclass(frozen=True)
 class FuzzedMotion:
-    """Keypoints with faults, and ground truth about these.
+    """Keypoints (wrist coordinates) with faults, and ground truth about these.
 
-    Attributes:
-        keypoints_m: wrist coordinates.
-        kind: index in `FAULTS` of each sample's fault; -1 none.
-        hit: fingers with a corrupted point.
-        since_fault: clean samples since the last fault; large before the first.
+    `kind` is the index in `FAULTS` of each sample's fault, -1 for none; `hit` are fingers with a
+    corrupted point; `since_fault` counts clean samples since the last fault, large before the
+    first.
     """
 
     keypoints_m: Float64[np.ndarray, "time 25 3"]

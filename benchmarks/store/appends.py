@@ -39,16 +39,10 @@ class AppendResult:
 def measure_appends(
     workload: Workload, folder: Path, num_rounds: int, bar: Bar, *, share: float = 1.0
 ) -> list[AppendResult]:
-    """Append glove samples one by one to the spool, with and without sync.
+    """Append samples of the left glove one by one to the spool, with and without sync.
 
-    Compared with plain file writes, and with a zarr array.
-
-    Args:
-        workload: source of the left glove's samples, appended repeatedly.
-        folder: for the spools.
-        num_rounds: at least 1.
-        bar: opens a progress bar.
-        share: of the usual number of appends.
+    Compared with plain file writes, and with a zarr array; `share` is that of the usual number of
+    appends.
     """
     ways: dict[str, Callable[[Workload, Path, int], np.ndarray]] = {
         SPOOL: partial(_spool, sync=False),

@@ -42,11 +42,7 @@ class LiveResult:
 def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SPEED) -> LiveResult:
     """Write a recording of the whole station at a multiple of real time.
 
-    Args:
-        workload: the take; its timestamps are the due times.
-        folder: folder of a store, emptied first.
-        unit: unit of the cameras.
-        speed: multiple of real time.
+    The timestamps of the take are the due times; the folder of the store is emptied first.
     """
     shutil.rmtree(folder, ignore_errors=True)
     attributes = RecordingAttributes(

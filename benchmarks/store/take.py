@@ -24,12 +24,9 @@ _SHAPES = {"keypoints": (25, 3), "wrist": (7,), "head": (7,), "action": (67,)}
 def make_take(
     seconds: float, seed: int, *, on_camera: Callable[[str], None] = lambda _: None
 ) -> Workload:
-    """Generate the streams of one take, deterministic by seed and length.
+    """Generate the streams of one take of whole images, deterministic by seed and length.
 
-    Args:
-        seconds: length, a whole number of images.
-        seed: random seed.
-        on_camera: called with a camera's name before it is rendered, from its thread.
+    `on_camera` is called with a camera's name before it is rendered, from its thread.
     """
     rng = np.random.default_rng(seed)
     camera_rngs = rng.spawn(len(CAMERAS))

@@ -81,10 +81,7 @@ def add_shared_cells(
 ) -> None:
     """Add the checks of rotations, numbers, touch and batches, the same for every world model.
 
-    Args:
-        stage: to add them to.
-        subject: opens what is tried.
-        trained_kpa: the largest pressure that the model was trained on.
+    `subject` opens what is tried, `trained_kpa` tells the largest pressure of its training.
     """
     stage.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")(
         lambda check: check_rotations(check, subject())

@@ -50,10 +50,8 @@ class Played:
 class ContactError:
     """Errors of chunks relative to the default solver, from the same initial states.
 
-    Attributes:
-        force_n: root mean square error over pads and samples with contact.
-        force_rms_n: root mean square of the true forces that are not zero.
-        object_mm: median error of final object positions over chunks and objects.
+    Forces are root mean squares: the error over pads and samples with contact, and the true forces
+    that are not zero. `object_mm` is the median error of final positions over chunks and objects.
     """
 
     force_n: float
@@ -65,10 +63,6 @@ class ContactChunks:
     """Chunks of demonstrations, started from the states that the default solver reaches.
 
     Errors are therefore those of one chunk and do not accumulate.
-
-    Args:
-        task: of the twin.
-        seeds: of the demonstrations.
     """
 
     def __init__(self, task: str, seeds: Sequence[int]) -> None:

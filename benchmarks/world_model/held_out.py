@@ -34,13 +34,7 @@ class HeldOut:
 
 
 def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[HeldOut]:
-    """The twin's demonstrations of these tasks and seeds, seen by the head camera.
-
-    Args:
-        tasks: of the twin.
-        seeds: held-out seeds.
-        image_px: width and height of the images.
-    """
+    """The twin's demonstrations of tasks and seeds, seen by the head camera in square images."""
     settings = TwinSettings(
         cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
     )
