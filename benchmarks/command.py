@@ -12,9 +12,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from benchmarks.chart import draw
 from benchmarks.machine import refuse_shape_checks
-from benchmarks.report import StageReport, show, to_markdown, write_json
+from benchmarks.report import StageReport, show, to_markdown
 from benchmarks.stages import STAGES, load_stage
-from dextouch.command_line import CommandParser, add_json
+from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.errors import UnknownNameError
 
 EXIT_MISSED = 1
@@ -99,9 +99,9 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
     console = Console()
     show(report, console if console.is_terminal else Console(width=WIDTH))
     if options.json is not None:
-        write_json(report, options.json)
+        write_json_text(options.json, report.to_json())
     if options.out is not None:
-        write_json(report, options.out / f"bench_{report.stage}.json")
+        write_json_text(options.out / f"bench_{report.stage}.json", report.to_json())
         text = options.out / f"bench_{report.stage}.md"
         text.write_text(to_markdown(report), encoding="utf-8")
         chart = options.out / f"bench_{report.stage}.svg"

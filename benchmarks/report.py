@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,7 +12,6 @@ from rich.table import Table
 from benchmarks.chart import Panel
 from benchmarks.figures import Figure, Requirement
 from benchmarks.machine import describe_machine
-from dextouch.command_line import write_json_text
 
 
 @dataclass(frozen=True)
@@ -31,11 +29,14 @@ class ResultTable:
 
 def cells(*values: Figure | float) -> tuple[str, ...]:
     """Texts of values: whole numbers, three digits of others, and the spread of figures."""
-    return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
-
-
-def _digits(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.3g}"
+    return tuple(
+        one.text()
+        if isinstance(one, Figure)
+        else f"{one}"
+        if isinstance(one, int)
+        else f"{one:.3g}"
+        for one in values
+    )
 
 
 @dataclass(frozen=True)
@@ -114,11 +115,6 @@ def _acceptance(report: StageReport) -> ResultTable:
         for requirement in report.requirements
     ]
     return ResultTable("Acceptance", ("requirement", "measured", "bound", "verdict"), rows)
-
-
-def write_json(report: StageReport, path: Path) -> None:
-    """Write the report to the path of `--json`, creating its folder."""
-    write_json_text(path, report.to_json())
 
 
 def _table(shown: ResultTable) -> Table:

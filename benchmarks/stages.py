@@ -4,11 +4,12 @@ import argparse
 import importlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 from benchmarks.report import StageReport
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError
 
 # Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
@@ -31,11 +32,12 @@ class Stage(Protocol):
         """
 
 
+@dataclass(frozen=True)
 class Amounts:
     """Amounts that a stage measures by name: usual and quick ones, and options for some."""
 
-    def __init__(self, usual: dict[str, Any], quick: dict[str, Any]) -> None:
-        self.usual, self.quick = usual, quick
+    usual: dict[str, Any]
+    quick: dict[str, Any]
 
     def add_options(self, parser: argparse.ArgumentParser, **what: str) -> None:
         """Add an option for each of these amounts; the texts say of what."""
@@ -256,11 +258,5 @@ STAGES = {
 
 
 def load_stage(name: str) -> Stage:
-    """Import the module of a stage.
-
-    Raises:
-        UnknownNameError: no such stage.
-    """
-    if name not in STAGES:
-        raise UnknownNameError("stage", name, list(STAGES))
+    """Import the module of a known stage."""
     return cast("Stage", importlib.import_module(STAGES[name].module))

@@ -10,11 +10,12 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from benchmarks.figures import Requirement
-from benchmarks.report import ResultTable, StageReport, to_markdown, write_json
+from benchmarks.report import ResultTable, StageReport, to_markdown
 from benchmarks.reproduction.experiments import QUICK, TABLES, Experiments, Sizes, Table
 from benchmarks.reproduction.steps import Step, run
 from benchmarks.reproduction.tables import Page, data_table, make_pages
 from benchmarks.stages import Bar
+from dextouch.command_line import write_json_text
 from dextouch.errors import NotFoundError
 from dextouch.schemas import first_problems
 
@@ -79,7 +80,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     )
     if not options.list:
         (keep / "tables.md").write_text(to_markdown(report), encoding="utf-8")
-        write_json(report, keep / "tables.json")
+        write_json_text(keep / "tables.json", report.to_json())
     return report
 
 
