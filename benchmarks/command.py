@@ -98,8 +98,7 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
     """Print the report; write JSON and chart on request."""
     console = Console()
     show(report, console if console.is_terminal else Console(width=WIDTH))
-    if options.json is not None:
-        write_json_text(options.json, report.to_json())
+    write_json_text(options.json, report.to_json())
     if options.out is not None:
         write_json_text(options.out / f"bench_{report.stage}.json", report.to_json())
         text = options.out / f"bench_{report.stage}.md"

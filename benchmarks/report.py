@@ -29,14 +29,11 @@ class ResultTable:
 
 def cells(*values: Figure | float) -> tuple[str, ...]:
     """Texts of values: whole numbers, three digits of others, and the spread of figures."""
-    return tuple(
-        one.text()
-        if isinstance(one, Figure)
-        else f"{one}"
-        if isinstance(one, int)
-        else f"{one:.3g}"
-        for one in values
-    )
+    return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
+
+
+def _digits(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.3g}"
 
 
 @dataclass(frozen=True)
