@@ -2,15 +2,16 @@
 
 import argparse
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 from benchmarks.report import StageReport
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, UnknownNameError
 
+T = TypeVar("T")
 # Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
@@ -255,6 +256,19 @@ STAGES = {
         "cell fails, also without --check; --quick skips slow cells (docs/stress.md).",
     ),
 }
+
+
+def named(kind: str, known: Mapping[str, T], names: str) -> dict[str, T]:
+    """Those of the comma-separated names.
+
+    Raises:
+        UnknownNameError: a name that there is not.
+    """
+    found = [name.strip() for name in names.split(",")]
+    for name in found:
+        if name not in known:
+            raise UnknownNameError(kind, name, list(known))
+    return {name: known[name] for name in found}
 
 
 def load_stage(name: str) -> Stage:

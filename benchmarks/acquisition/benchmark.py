@@ -48,9 +48,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         judgements = [
             found
             for family in families
-            for found in judge(
-                family, list(family.ways), LINE, plan["packets"], seed=seed, on_block=step
-            )
+            for found in judge(family, LINE, plan["packets"], seed=seed, on_block=step)
         ]
     splits = {
         family.name: count_split_differences(family, LINE, plan["splits"], seed=seed)

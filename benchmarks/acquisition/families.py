@@ -8,11 +8,7 @@ import numpy as np
 
 from dextouch.streams import Sample
 from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
-from services.acquisition.devices.tactile_glove import (
-    MAGIC,
-    PAYLOAD_BYTES,
-    TactileGloveDecoder,
-)
+from services.acquisition.devices.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
 from services.acquisition.devices.wuji_glove import (
     CRC_OFFSET,
     HEAD,

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.errors import UnknownNameError
-
 # The constant path delay, unobservable from one-way timestamps, is subtracted before scoring.
 BASE_DELAY_NS = 2_000_000
 # Crystals drift with the room temperature over minutes.
@@ -108,18 +106,6 @@ STAMPLESS_SCENES = {
     "0.2 % lost": Scene(drops=0.002),
     "2 % lost": Scene(drops=0.02),
 }
-
-
-def find_scene(name: str) -> Scene:
-    """A scene by name.
-
-    Raises:
-        UnknownNameError: no such scene.
-    """
-    known = SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES
-    if name not in known:
-        raise UnknownNameError("scene", name, list(known))
-    return known[name]
 
 
 def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:

@@ -95,16 +95,13 @@ def _worst(results: Sequence[Result], what: str) -> float | None:
     return max((figure.high for figure in figures), default=None)
 
 
-def _names(results: Sequence[Result]) -> tuple[list[str], list[str]]:
-    """Scenes and methods in the order of measurement."""
-    return (
-        list(dict.fromkeys(result.scene for result in results)),
-        list(dict.fromkeys(result.way for result in results)),
-    )
+def _ways(results: Sequence[Result]) -> list[str]:
+    """Methods in the order of measurement."""
+    return list(dict.fromkeys(result.way for result in results))
 
 
 def _error_table(title: str, results: Sequence[Result], what: str) -> ResultTable:
-    scenes, ways = _names(results)
+    scenes, ways = dict.fromkeys(r.scene for r in results), _ways(results)
     cells = {(r.scene, r.way): getattr(r, what).text() for r in results}
     rows = [(scene, *(cells[scene, way] for way in ways)) for scene in scenes]
     return ResultTable(title, ("scene", *ways), rows)
@@ -121,9 +118,8 @@ def _recovery_table(results: Sequence[Result]) -> ResultTable:
 
 
 def _cost_table(results: Sequence[Result]) -> ResultTable:
-    _, ways = _names(results)
     rows = []
-    for way in ways:
+    for way in _ways(results):
         medians = [r.us_per_sample.median for r in results if r.way == way]
         kind = "online" if way in ONLINE else "offline" if way in OFFLINE else "no stamps"
         rows.append((way, kind, f"{np.median(medians):.2f}", f"{max(medians):.2f}"))
@@ -131,9 +127,8 @@ def _cost_table(results: Sequence[Result]) -> ResultTable:
 
 
 def _points(results: Sequence[Result]) -> list[Point]:
-    _, ways = _names(results)
     points = []
-    for way in ways:
+    for way in _ways(results):
         mine = [result for result in results if result.way == way]
         times = Figure.of([max(result.us_per_sample.median, _TINY_US) for result in mine])
         error = max(result.rms_ms.median for result in mine)

@@ -129,7 +129,7 @@ def requirements(
         ),
         at_most(
             f"rows late or dropped, station live at {SPEED:g} times real time",
-            float(max(run.num_untimely for run in live)) if live else None,
+            float(max(run.num_late + run.num_dropped for run in live)) if live else None,
             0.0,
         ),
         _append("numeric append, p99", SPOOL, appends, bound_ms=0.1),

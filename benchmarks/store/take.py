@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import UInt16
 
 from benchmarks.store.scene import make_scene, render
 from benchmarks.store.workload import (
@@ -65,11 +65,8 @@ def _numbers(name: str, count: int, rng: np.random.Generator) -> np.ndarray:
     kind = name.removesuffix("_left").removesuffix("_right")
     if kind == "tactile":
         return _tactile(count, phase=float(name.endswith("right")), rng=rng)
-    return _walk((count, *_SHAPES[kind]), rng)
-
-
-def _walk(shape: tuple[int, ...], rng: np.random.Generator) -> Float32[np.ndarray, "..."]:
-    """Slow motion with the noise of a tracker."""
+    # Slow motion with the noise of a tracker.
+    shape = (count, *_SHAPES[kind])
     motion = np.cumsum(rng.normal(0, 1e-3, shape), axis=0)
     return np.asarray(motion + rng.normal(0, 1e-4, shape), dtype=np.float32)
 
