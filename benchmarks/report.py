@@ -27,7 +27,7 @@ class ResultTable:
     num_text_columns: int = 1
 
 
-def cells(*values: Figure | float) -> tuple[str, ...]:
+def cells(*values: Figure | float | int) -> tuple[str, ...]:
     """Texts of values: whole numbers, three digits of others, and the spread of figures."""
     return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
 

@@ -4,7 +4,6 @@ import gc
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,7 +50,7 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
     gc.collect()
     with bar("hand-eye", len(METHODS) * len(scenes)) as step:
         rounds = interleaved(
-            {method.name: partial(_solve_once, method, scenes) for method in METHODS},
+            {one.name: lambda index, one=one: score(one, scenes[index]) for one in METHODS},
             len(scenes),
             on_step=step,
         )
@@ -81,10 +80,6 @@ def score(method: Method, scene: Scene) -> Solved:
         sigma_deg=float(np.rad2deg(np.sqrt(variances[:3].sum()))),
         sigma_mm=float(np.sqrt(variances[3:].sum()) * 1e3),
     )
-
-
-def _solve_once(method: Method, scenes: Sequence[Scene], round_index: int) -> Solved:
-    return score(method, scenes[round_index])
 
 
 def _result(name: str, solved: Sequence[Solved]) -> MethodResult:

@@ -17,16 +17,10 @@ from benchmarks.retargeting.compare import (
 )
 from benchmarks.retargeting.ours import OURS_EXACT, cold_start
 from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
-from benchmarks.retargeting.rivals import (
-    INSTALL,
-    RIVALS,
-    Rival,
-    find_rival,
-    missing_modules,
-)
+from benchmarks.retargeting.rivals import INSTALL, RIVALS, Rival, missing_modules
 from benchmarks.retargeting.robustness import try_faults
 from benchmarks.retargeting.tables import panels, requirements, tables
-from benchmarks.stages import Amounts, Bar
+from benchmarks.stages import Amounts, Bar, named
 from dextouch.errors import InvalidInputError
 
 AMOUNTS = Amounts(
@@ -94,8 +88,7 @@ def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
     """
     wanted = list(RIVALS.values())
     if words is not None:
-        names = [name.strip() for name in words.split(",")]
-        wanted = [] if names == [_NONE] else [find_rival(name) for name in names]
+        wanted = [] if words == _NONE else list(named("rival", RIVALS, words).values())
     left_out = [rival for rival in wanted if missing_modules(rival)]
     return [rival for rival in wanted if rival not in left_out], left_out
 

@@ -17,12 +17,7 @@ from benchmarks.retargeting import ours
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, Timed
 from benchmarks.retargeting.pinches import PinchMotion, pinch_motions
 from benchmarks.retargeting.rival_process import RivalProcess
-from benchmarks.retargeting.scores import (
-    PinchScore,
-    RobotScore,
-    score_pinches,
-    score_robot,
-)
+from benchmarks.retargeting.scores import PinchScore, RobotScore, score_pinches, score_robot
 from benchmarks.rounds import interleaved
 from benchmarks.simulated.hand_motions import Motion, robot_motion, with_noise
 from benchmarks.stages import Bar
@@ -189,12 +184,6 @@ def _subjects(
     profiles = [ours.profile_of(motion) for motion in motions]
     scales = [scale_of(motion) for motion in motions]
 
-    def batch(index: int) -> Timed:
-        return ours.time_batch(motions[index], profiles[index])
-
-    def live(index: int) -> Timed:
-        return ours.time_live(motions[index], profiles[index])
-
     given_up = set()
 
     def rival(process: RivalProcess, index: int) -> Timed | None:
@@ -205,14 +194,17 @@ def _subjects(
             given_up.add(name)
         return None
 
-    theirs = {name: partial(rival, process) for name, process in rivals.items()}
-    return {OURS: batch, OURS_LIVE: live, **theirs}
+    return {
+        OURS: lambda index: ours.time_batch(motions[index], profiles[index]),
+        OURS_LIVE: lambda index: ours.time_live(motions[index], profiles[index]),
+        **{name: partial(rival, process) for name, process in rivals.items()},
+    }
 
 
 def _speed(method: str, input_name: str, timed: Sequence[Timed]) -> Speed:
     calls_us = np.concatenate([one.call_s for one in timed]) * 1e6
-    share = (
-        (float(np.median(calls_us)), float(np.percentile(calls_us, 99))) if len(calls_us) else None
-    )
+    call_us = None
+    if len(calls_us):
+        call_us = float(np.median(calls_us)), float(np.percentile(calls_us, 99))
     cpu_us = Figure.of([one.cpu_s * 1e6 / len(one.joints_rad) for one in timed])
-    return Speed(method, input_name, cpu_us, share)
+    return Speed(method, input_name, cpu_us, call_us)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.retargeting.hand_urdf import WRIST_LINK, hand_urdf, link_name, tip_name
-from dextouch.errors import UnavailableError, UnknownNameError
+from dextouch.errors import UnavailableError
 from dextouch.hands import CHAINS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 
@@ -67,17 +67,6 @@ class Setup(NamedTuple):
     references: list[Any]
     solve: Solve
     joint_names: list[str]
-
-
-def find_rival(name: str) -> Rival:
-    """The library and objective of this name.
-
-    Raises:
-        UnknownNameError: there is none.
-    """
-    if name not in RIVALS:
-        raise UnknownNameError("rival", name, list(RIVALS))
-    return RIVALS[name]
 
 
 def missing_modules(rival: Rival) -> list[str]:
