@@ -32,7 +32,7 @@ def cells(*values: Figure | float | int) -> tuple[str, ...]:
     return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
 
 
-def _digits(value: float) -> str:
+def _digits(value: float | int) -> str:
     return str(value) if isinstance(value, int) else f"{value:.3g}"
 
 

@@ -8,7 +8,7 @@ from statistics import mean
 from benchmarks.closure.contact_times import timing_errors
 from benchmarks.closure.methods import METHODS, OURS, Method
 from benchmarks.closure.replay import TASKS, ClosureTake, close_take
-from benchmarks.figures import Requirement, at_least
+from benchmarks.figures import at_least
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 
@@ -52,7 +52,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         packages=("numpy", "mujoco", "numba"),
         options={"takes": num_takes, "tasks": tasks},
         tables=[_table(played, num_takes)],
-        requirements=[_requirement(played, task) for task in tasks],
+        requirements=[
+            at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
+            for task in tasks
+        ],
         data={
             "succeeded": {
                 f"{task}: {method.name}": [take.succeeded for take in takes]
@@ -80,10 +83,6 @@ def _table(played: Played, num_takes: int) -> ResultTable:
         COLUMNS,
         rows,
     )
-
-
-def _requirement(played: Played, task: str) -> Requirement:
-    return at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
 
 
 def _rate(takes: Sequence[ClosureTake]) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable, StageReport
@@ -81,8 +81,19 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         ways = [*WAYS, *OTHERS, WATCHED, *([DURABLE] if DURABLE.server in urls else [])]
         times_s, sizes = timed(urls, ways, plan, bar)
         with bar("32 rollouts", len(DEVICES)) as step:
-            crowds = {world: _crowd(urls, world, plan, step) for world in DEVICES}
-        listings_s = _listings_s(urls, plan["watched_rollouts"])
+            crowds = {}
+            for world in DEVICES:
+                step(world)
+                crowds[world] = crowd(urls["ours"], world, NUM_ROLLOUTS, plan["crowd_chunks"])
+        # By where rollouts are kept.
+        kept = {"in memory": "ours", "in Redis": DURABLE.server}
+        listings_s = {
+            where: listing_s(
+                urls[server], num_rollouts=plan["watched_rollouts"], num_listings=NUM_LISTINGS
+            )
+            for where, server in kept.items()
+            if server in urls
+        }
     finally:
         child.close()
     bare_s = {selector: bare_step_s(selector) for selector in (LAST, JPEG, ALL)}
@@ -137,16 +148,6 @@ def timed(
     return {name: Figure.of(values) for name, values in found.items()}, sizes
 
 
-def _listings_s(urls: Mapping[str, str], num_rollouts: int) -> dict[str, list[float]]:
-    """Times of listing one open rollout, by where rollouts are kept."""
-    kept = {"in memory": "ours", "in Redis": DURABLE.server}
-    return {
-        where: listing_s(urls[server], num_rollouts=num_rollouts, num_listings=NUM_LISTINGS)
-        for where, server in kept.items()
-        if server in urls
-    }
-
-
 def _listing_requirements(
     listings_s: Mapping[str, list[float]], num_rollouts: int
 ) -> list[Requirement]:
@@ -180,12 +181,6 @@ def _median_s(chunk: Chunk, count: int) -> float:
         chunk()
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds)
-
-
-def _crowd(urls: Mapping[str, str], world: str, plan: Mapping[str, int], step: Any) -> Crowd:  # noqa: ANN401 - of the bar
-    step(world)
-    num_chunks = plan["crowd_chunks"]
-    return crowd(urls["ours"], world, num_rollouts=NUM_ROLLOUTS, num_chunks=num_chunks)
 
 
 def _name(way: Way) -> str:

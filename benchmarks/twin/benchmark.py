@@ -14,13 +14,7 @@ from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
-from benchmarks.twin.physics import (
-    AS_SERVED,
-    SOLVERS,
-    ContactChunks,
-    ContactError,
-    contact_error,
-)
+from benchmarks.twin.physics import AS_SERVED, SOLVERS, ContactChunks, ContactError, contact_error
 from services.twin.tasks import TASK_NAMES
 
 # Of demonstrations that nothing is trained on.
@@ -116,15 +110,11 @@ def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) ->
 def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> list[Requirement]:
     """Requirements on selectors of the twin."""
     saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
-    share = times_ms[HEAD].median / CHUNK_MS
+    share, equal = times_ms[HEAD].median / CHUNK_MS, float(states_are_equal)
     return [
         at_most(f"{HEAD_LAST}, share of the time of {HEAD}", saved, 0.9),
         at_most(f"{HEAD}, share of real time", share, 0.5),
-        at_least(
-            "selectors that leave the state after a chunk as it is, share",
-            float(states_are_equal),
-            1.0,
-        ),
+        at_least("selectors that leave the state after a chunk as it is, share", equal, 1.0),
     ]
 
 
