@@ -66,11 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Simulate studies with known true rates, and time both methods on one of the paper's size.
-
-    Raises:
-        InvalidInputError: no study.
-    """
+    """Simulate studies with known true rates, and time both methods on one of the paper's size."""
     plan = AMOUNTS.of(options)
     kinds = [(p, d) for p in NUM_POLICIES for d in DISAGREEMENTS]
     found: dict[tuple[int, float], dict[tuple[str, str], Tally]] = {}

@@ -44,11 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time the loader and the training step alternately.
-
-    Raises:
-        InvalidInputError: no episode, round or batch, or invalid numbers of workers.
-    """
+    """Time the loader and the training step alternately."""
     plan, workers = AMOUNTS.of(options), _workers(options.workers)
     url = options.store or _make_episodes(folder / "episodes", plan["episodes"])
     with bar("reading the store once", 1):

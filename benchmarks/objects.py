@@ -77,12 +77,7 @@ class _Found:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Track the objects of takes by both designs, alternately, at several sizes of the image.
-
-    Raises:
-        InvalidInputError: no take.
-        UnknownNameError: no such task.
-    """
+    """Track the objects of takes by both designs, alternately, at several sizes of the image."""
     count = AMOUNTS.of(options)["takes"]
     tasks = named_tasks(options.tasks.split(","))
     sides_px = SIDES_PX[:1] if options.quick else SIDES_PX

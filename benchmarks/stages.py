@@ -24,12 +24,12 @@ class Stage(Protocol):
         """Add the stage's own options; every stage has --quick, --json, --out and --check."""
 
     def measure(self, options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-        """Run the benchmark.
+        """Run the benchmark; the folder is for temporary files, which the caller removes.
 
-        Args:
-            options: parsed command line.
-            folder: for temporary files; the caller removes it.
-            bar: opens a progress bar.
+        Raises:
+            InvalidInputError: options that measure nothing, such as no round, or do not fit.
+            UnknownNameError: a name in the options that there is not.
+            ConflictError: a command that the stage runs failed.
         """
 
 

@@ -108,12 +108,7 @@ class _Read:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Start the state model from all kinds of starts of every task.
-
-    Raises:
-        InvalidInputError: no start.
-        UnknownNameError: no such task.
-    """
+    """Start the state model from all kinds of starts of every task."""
     count = AMOUNTS.of(options)["starts"]
     tasks = named_tasks(options.tasks.split(","))
     judged = _Judged(options.world, SuccessClassifier.load(options.probe))

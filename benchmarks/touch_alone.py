@@ -40,11 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record takes, leave their objects out, train on them, and replay held-out takes.
-
-    Raises:
-        ConflictError: a command failed.
-    """
+    """Record takes, leave their objects out, train on them, and replay held-out takes."""
     keep: Path = options.keep
     data = _step(
         _RECORDED,

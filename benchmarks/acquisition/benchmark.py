@@ -36,11 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Decode from a noisy line, time every decoder and driver, read eight gloves.
-
-    Raises:
-        InvalidInputError: an invalid number.
-    """
+    """Decode from a noisy line, time every decoder and driver, read eight gloves."""
     plan = AMOUNTS.of(options, packets=5, seconds=1e-3)
     seed = options.seed
     families = make_families()

@@ -30,11 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record takes, then align each alternately with every method.
-
-    Raises:
-        InvalidInputError: a take that is too short, or no round.
-    """
+    """Record takes, then align each alternately with every method."""
     lengths_s = _lengths_s(options)
     num_rounds = AMOUNTS.of(options)["rounds"]
     takes = _record(lengths_s, options.seed, folder, bar)

@@ -26,11 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Solve scenes of known mounts and cameras with every method, then degenerate scenes.
-
-    Raises:
-        InvalidInputError: no seed.
-    """
+    """Solve scenes of known mounts and cameras with every method, then degenerate scenes."""
     plan = AMOUNTS.of(options)
     motion = Motion(num_views=options.views)
     with bar("making scenes", plan["seeds"]) as step:

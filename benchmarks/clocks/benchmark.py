@@ -25,12 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run every method on every scene.
-
-    Raises:
-        UnknownNameError: an unknown scene.
-        InvalidInputError: takes that are too short, or no round.
-    """
+    """Run every method on every scene."""
     plan = AMOUNTS.of(options, seconds=MIN_SECONDS)
     scenes = SCENES | MORE_SCENES | STOP_SCENES
     if options.scenes is not None:

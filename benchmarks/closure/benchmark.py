@@ -30,12 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record human takes and replay each of them by every method.
-
-    Raises:
-        InvalidInputError: no take.
-        UnknownNameError: no such task.
-    """
+    """Record human takes and replay each of them by every method."""
     num_takes = AMOUNTS.of(options)["takes"]
     tasks = options.tasks.split(",")
     methods = QUICK_METHODS if options.quick else METHODS

@@ -125,11 +125,7 @@ def _add_rollouts(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Compute missing results, and create the tables.
-
-    Raises:
-        InvalidInputError: options that do not fit.
-    """
+    """Compute missing results, and create the tables."""
     earlier = read_lines(options.repeats) if options.repeats else {}
     plan = _plan(options)
     study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")

@@ -44,12 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run every method on robot motions and on pinching people.
-
-    Raises:
-        UnknownNameError: a rival that there is not.
-        InvalidInputError: no round, or motions of fewer than 30 samples.
-    """
+    """Run every method on robot motions and on pinching people."""
     if options.seed < 0:
         raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
     plan = AMOUNTS.of(options, samples=30)

@@ -64,11 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time chunks of a world that computes nothing, alternating with echoes of the same bytes.
-
-    Raises:
-        InvalidInputError: no round, or more chunks than a rollout may have.
-    """
+    """Time chunks of a world that computes nothing, alternating with echoes of the same bytes."""
     plan = AMOUNTS.of(options, watched_rollouts=0)
     if max(plan["chunks"], plan["crowd_chunks"]) > MAX_CHUNKS:
         raise InvalidInputError(

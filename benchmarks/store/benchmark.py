@@ -46,12 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Write and read one take with every design, then appends and the live run.
-
-    Raises:
-        UnknownNameError: an unknown design.
-        InvalidInputError: a take too short for a window, or no round or window.
-    """
+    """Write and read one take with every design, then appends and the live run."""
     plan = AMOUNTS.of(options, seconds=_MIN_SECONDS)
     known = {design.name: design for design in DESIGNS}
     chosen = known if options.designs is None else named("design", known, options.designs)

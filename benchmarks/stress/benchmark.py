@@ -61,11 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run the matrix, or the given stages and hazards of it.
-
-    Raises:
-        UnknownNameError: no such stage or hazard.
-    """
+    """Run the matrix, or the given stages and hazards of it."""
     for name in options.hazard or ():
         if name not in HAZARDS:
             raise UnknownNameError("hazard", name, list(HAZARDS))

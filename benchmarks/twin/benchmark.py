@@ -34,11 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time a chunk alternately with every selector, then chunks with contact with every solver.
-
-    Raises:
-        InvalidInputError: no round.
-    """
+    """Time a chunk alternately with every selector, then chunks with contact with every solver."""
     plan = AMOUNTS.of(options)
     chunk = TimedChunk(options.task, FIRST_SEED)
     subjects = chunk.subjects()

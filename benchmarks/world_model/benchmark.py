@@ -68,11 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Predict held-out demonstrations with different settings, alternately.
-
-    Raises:
-        InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
-    """
+    """Predict held-out demonstrations with different settings, alternately."""
     plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
