@@ -62,16 +62,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Run the matrix, or the given stages and hazards of it."""
-    for name in options.hazard or ():
-        if name not in HAZARDS:
-            raise UnknownNameError("hazard", name, list(HAZARDS))
-    chosen = sorted(set(options.stage or STAGES), key=_place)
-    cells = [
-        cell
-        for name in chosen
-        for cell in load_cells(name).row()
-        if cell.hazard in (options.hazard or HAZARDS)
-    ]
+    stages, hazards = options.stage or STAGES, options.hazard or HAZARDS
+    for kind, names, known in (("stage", stages, STAGES), ("hazard", hazards, HAZARDS)):
+        for name in names:
+            if name not in known:
+                raise UnknownNameError(kind, name, list(known))
+    chosen = [name for name in STAGES if name in stages]
+    cells = [cell for name in chosen for cell in load_cells(name).row() if cell.hazard in hazards]
     if options.list:
         return _report([_listing(cells)], [], {})
     findings = []
@@ -92,20 +89,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 
 def load_cells(stage: str) -> StageCells:
-    """The row of a stage.
-
-    Raises:
-        UnknownNameError: no such stage.
-    """
-    _place(stage)
+    """The row of a known stage."""
     cells: StageCells = importlib.import_module(f"benchmarks.stress.{STAGES[stage]}").STAGE
     return cells
-
-
-def _place(stage: str) -> int:
-    if stage not in STAGES:
-        raise UnknownNameError("stage", stage, list(STAGES))
-    return list(STAGES).index(stage)
 
 
 def _report(
