@@ -49,11 +49,6 @@ _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    _add_checkpoints(parser)
-    _add_rollouts(parser)
-
-
-def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
     each = "once for all worlds, or once for each"
     for flag, what in {
         "--world": "the world model (committed one); may be repeated for training seeds",
@@ -67,9 +62,6 @@ def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="evaluate every member of a world model's ensemble alone, as a training seed",
     )
-
-
-def _add_rollouts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds",
         default="development",
@@ -255,15 +247,6 @@ def _results(
             yield done.result(), f"{task} {seed}"
 
 
-def _worlds(options: argparse.Namespace) -> Sequence[Path | None]:
-    given: Sequence[Path | None] = options.world or [None]
-    if not options.each_member:
-        return given
-    return [
-        path for world in given for path in write_single_members(world, options.keep / "members")
-    ]
-
-
 def _plan(options: argparse.Namespace) -> StudyPlan:
     num_starts = AMOUNTS.of(options)["starts"]
     if options.jobs < 1:
@@ -273,13 +256,17 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         raise InvalidInputError(
             "evaluator: got --cloned or --policy with --ladder none, expected mistakes only"
         )
+    worlds: Sequence[Path | None] = options.world or [None]
+    if options.each_member:
+        folder = options.keep / "members"
+        worlds = [path for world in worlds for path in write_single_members(world, folder)]
     cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
     servo = options.policy or [_SERVO]
     levels_mm = _QUICK_LEVELS_MM if options.quick else LEVELS_MM
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(
-            _worlds(options),
+            worlds,
             options.probe or [DEFAULT_PROBE],
             options.direct or [],
             options.without_touch or [],

@@ -9,11 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.evaluator.keeping import Row, array_path, read_arrays, write_arrays
-from benchmarks.evaluator.measuring import (
-    chunk_figures,
-    sharpness_of_chunks,
-    wrong_action_figures,
-)
+from benchmarks.evaluator.measuring import chunk_figures, sharpness_of_chunks, wrong_action_figures
 from benchmarks.evaluator.members import Member
 from benchmarks.evaluator.playing import (
     ImaginedRollout,
@@ -82,11 +78,9 @@ class PolicyRollout:
             "verdict without touch": lambda m: asdict(
                 m.probe.verdict(without_touch(self._imagined_ending(m)))
             ),
-            "verdict of the last image": lambda m: asdict(
-                m.probe.verdict(last_image_alone(self._imagined_ending(m)))
-            ),
+            "verdict of the last image": self._last_image_row,
             "sharpness": lambda m: {
-                "sharpness": sharpness_of_chunks(self.real, self.imagined(m))
+                "sharpness": sharpness_of_chunks(self.real, self.imagined(m.world))
             },
             "true context": self._context_row,
             "held still": self._still_row,
@@ -100,7 +94,9 @@ class PolicyRollout:
 
     def wrong_actions(self, member: Member, own: "PolicyRollout") -> Row:
         """Errors where this policy's actions are imagined in place of those of `own`."""
-        return wrong_action_figures(own.real, own.imagined(member), self.imagined(member))
+        return wrong_action_figures(
+            own.real, own.imagined(member.world), self.imagined(member.world)
+        )
 
     @cached_property
     def real(self) -> TrueRollout:
@@ -116,10 +112,7 @@ class PolicyRollout:
         write_arrays(path, vars(real) | {"success": np.array(real.success)})
         return real
 
-    def _imagined(self, member: Member) -> ImaginedRollout:
-        return self._imagined_by(member.world)
-
-    def _imagined_by(self, world: BatchWorld[Any]) -> ImaginedRollout:
+    def _imagined(self, world: BatchWorld[Any]) -> ImaginedRollout:
         path = self._path("imagined", self._twin.description.digest, world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
@@ -143,7 +136,7 @@ class PolicyRollout:
         return self._started.observation.images[HEAD_CAMERA][0]
 
     def _imagined_row(self, member: Member) -> Row:
-        imagined = self.imagined(member)
+        imagined = self.imagined(member.world)
         figures = chunk_figures(
             self.real,
             imagined,
@@ -160,7 +153,7 @@ class PolicyRollout:
         return Ending(self.real.last_images, touch, self._task)
 
     def _imagined_ending(self, member: Member) -> Ending:
-        return self.imagined(member).ending(self._task)
+        return self.imagined(member.world).ending(self._task)
 
     def _context_row(self, member: Member) -> Row:
         contact = contact_with_true_context(
@@ -181,11 +174,16 @@ class PolicyRollout:
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
 
+    def _last_image_row(self, member: Member) -> Row:
+        """Verdict on an ending without touch and without object poses."""
+        ending = replace(without_touch(self._imagined_ending(member)), object_poses=None)
+        return asdict(member.probe.verdict(ending))
+
     def _untouched_row(self, member: Member) -> Row:
         """Verdict on the ending of a world model trained without touch, with touch at zero."""
         if member.untouched is None:
             raise InvalidInputError("evaluator: no world was given by --without-touch")
-        ending = self._imagined_by(member.untouched).ending(self._task)
+        ending = self.imagined(member.untouched).ending(self._task)
         return asdict(member.probe.verdict(without_touch(ending)))
 
     def _direct_row(self, member: Member) -> Row:
@@ -199,8 +197,3 @@ class PolicyRollout:
 def without_touch(ending: Ending) -> Ending:
     """The ending with all taxels at zero."""
     return replace(ending, tactile_kpa=np.zeros_like(ending.tactile_kpa))
-
-
-def last_image_alone(ending: Ending) -> Ending:
-    """The ending without touch and without object poses."""
-    return replace(without_touch(ending), object_poses=None)
