@@ -402,29 +402,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Train a judge, write it, and report its metrics on held-out episodes."""
     torch.set_num_threads(1)
-    settings = JudgeSettings(
-        options.seed,
-        min(options.reader_steps, _QUICK_STEPS) if options.quick else options.reader_steps,
-        min(options.steps, _QUICK_STEPS) if options.quick else options.steps,
-        options.cpu_s,
-    )
+    steps = [options.reader_steps, options.steps]
+    if options.quick:
+        steps = [min(count, _QUICK_STEPS) for count in steps]
+    settings = JudgeSettings(options.seed, *steps, options.cpu_s)
     names = [url.rstrip("/").rpartition("/")[2] for url in options.episodes]
     command = shlex.join(["python", "-m", "benchmarks", "direct-judge", "--episodes", *names])
     episodes, starts = read_takes(options.episodes, tasks=options.tasks)
     checkpoint = train_direct_judge(episodes, starts, settings, command=command)
     save_checkpoint(options.output, checkpoint)
     metrics = checkpoint.metadata.metrics
+    rows = [(name, f"{value:.4g}") for name, value in metrics.items()]
     return StageReport(
         stage="direct-judge",
         packages=("numpy", "torch"),
         options={"episodes": names, "tasks": options.tasks, "training": asdict(settings)},
-        tables=[
-            ResultTable(
-                f"{options.output}, on held-out episodes",
-                ("", "figure"),
-                [(name, f"{value:.4g}") for name, value in metrics.items()],
-            )
-        ],
+        tables=[ResultTable(f"{options.output}, on held-out episodes", ("", "figure"), rows)],
         requirements=[],
         data={"metrics": metrics},
     )

@@ -7,13 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
-from dextouch.schemas import (
-    EVERYTHING,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    WorldDescription,
-)
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, SteppedRollout
 
@@ -99,9 +93,6 @@ class StillWorld:
 
 class Device(StillWorld):
     """Simulated device that computes one rollout at a time."""
-
-    def __init__(self) -> None:
-        super().__init__(is_quick=False)
 
     def step(
         self,
