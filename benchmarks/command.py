@@ -1,6 +1,7 @@
 """Command line of the benchmarks: runs a stage, prints tables, writes chart and JSON."""
 
 import argparse
+import itertools
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -28,11 +29,7 @@ DESCRIPTION = (
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the benchmark of one stage.
-
-    Returns:
-        0; with --check 1 if a requirement is missed or was not measured.
-    """
+    """Run the benchmark of one stage; 1 with --check if a requirement is missed or unmeasured."""
     arguments = list(argv)
     if not arguments or arguments[0] in {"-h", "--help"}:
         print(usage())
@@ -53,21 +50,17 @@ def main(argv: Sequence[str]) -> int:
 
 def usage() -> str:
     """The text of `python -m benchmarks --help`."""
-    rows = [f"  {name:<13}{entry.does}" for name, entry in STAGES.items()]
-    return "\n".join(
-        [
-            "usage: python -m benchmarks STAGE [options]",
-            "",
-            DESCRIPTION,
-            "",
-            *rows,
-            "",
-            "`python -m benchmarks STAGE --help` describes a stage and its options.",
-            "",
-            "example:",
-            "  python -m benchmarks store --quick",
-        ]
-    )
+    rows = "\n".join(f"  {name:<13}{entry.does}" for name, entry in STAGES.items())
+    return f"""usage: python -m benchmarks STAGE [options]
+
+{DESCRIPTION}
+
+{rows}
+
+`python -m benchmarks STAGE --help` describes a stage and its options.
+
+example:
+  python -m benchmarks store --quick"""
 
 
 def stage_parser(name: str) -> argparse.ArgumentParser:
@@ -127,11 +120,9 @@ def _bar(what: str, num_steps: int) -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True)
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task(what, total=num_steps)
-        done = -1
+        done = itertools.count()
 
         def step(name: str) -> None:
-            nonlocal done
-            done += 1
-            progress.update(task, completed=done, description=f"{what}: {name}")
+            progress.update(task, completed=next(done), description=f"{what}: {name}")
 
         yield step

@@ -402,10 +402,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Train a judge, write it, and report its metrics on held-out episodes."""
     torch.set_num_threads(1)
-    steps = [options.reader_steps, options.steps]
+    reader_steps, num_steps = options.reader_steps, options.steps
     if options.quick:
-        steps = [min(count, _QUICK_STEPS) for count in steps]
-    settings = JudgeSettings(options.seed, *steps, options.cpu_s)
+        reader_steps, num_steps = min(reader_steps, _QUICK_STEPS), min(num_steps, _QUICK_STEPS)
+    settings = JudgeSettings(options.seed, reader_steps, num_steps, options.cpu_s)
     names = [url.rstrip("/").rpartition("/")[2] for url in options.episodes]
     command = shlex.join(["python", "-m", "benchmarks", "direct-judge", "--episodes", *names])
     episodes, starts = read_takes(options.episodes, tasks=options.tasks)

@@ -129,9 +129,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[_errors(found), _outcomes(found)],
         requirements=_requirements(found),
         data={
-            task: {
-                kind: [r.error_mm.round(2).tolist() for r in reads] for kind, reads in of.items()
-            }
+            task: {k: [r.error_mm.round(2).tolist() for r in reads] for k, reads in of.items()}
             for task, of in found.items()
         },
     )

@@ -13,7 +13,7 @@ from benchmarks.figures import at_least
 from benchmarks.object_clicks import clicked_image
 from benchmarks.object_touch import GRIPS, described_objects
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.reproduction.steps import Step, run
+from benchmarks.reproduction.steps import Step, run, step_with_result
 from benchmarks.stages import Bar
 from dextouch.episodes import EpisodeGrid, EpisodeStore, split_of
 from dextouch.errors import ConflictError
@@ -42,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Record takes, leave their objects out, train on them, and replay held-out takes."""
     keep: Path = options.keep
-    data = _step(
+    data = step_with_result(
         _RECORDED,
         f"train data --store {_RECORDED}/store --tasks {options.tasks} --count {options.takes} "
         f"--images 4 --jobs {options.jobs}",
@@ -70,13 +70,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         ],
         data={"trust": trust},
     )
-
-
-def _step(
-    name: str, command: str, made: str, needs: tuple[Step, ...] = (), exits: tuple[int, ...] = (0,)
-) -> Step:
-    command += f" --json {name}/result.json"
-    return Step(name, command, (made, "result.json"), needs, exits=exits)
 
 
 def _run(steps: list[Step], keep: Path) -> None:
@@ -123,7 +116,7 @@ def _strip(keep: Path, num_clicked: int) -> None:
 def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:
     reader, core, judge, drawing_s = _QUICK_STEPS if options.quick else _STEPS
     base = "world-model" if options.init is None else f"adapt --init {options.init.resolve()}"
-    model = _step(
+    model = step_with_result(
         "model",
         f"train {base} --episodes {_LAB} --clicks {_OBJECTS} --splits A,B --heldout-share 0.1 "
         f"--reader.num-steps {reader} --core.num-steps {core} --drawing.cpu-budget-s {drawing_s} "
@@ -131,14 +124,14 @@ def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:
         _MODEL,
         needs=(data,),
     )
-    imagined = _step(
+    imagined = step_with_result(
         "imagined",
         f"train imagined --episodes {_LAB} --store imagined/store --checkpoint model/{_MODEL} "
         f"--jobs {options.jobs}",
         "store",
         needs=(model,),
     )
-    judged = _step(
+    judged = step_with_result(
         "judge",
         f"train judge --episodes {_LAB},imagined/store --splits A,B --output judge/{_JUDGE} "
         f"--training.num-training-steps {judge} --training.held-out-share 0.2 "

@@ -29,11 +29,9 @@ MODULE = "benchmarks.acquisition.ptys"
 
 
 def run_ptys(seconds: float) -> dict[str, float]:
-    """Read eight gloves in a fresh process.
+    """Read eight gloves in a fresh process: `seconds` measured, `cpu_s` of all readers, and so on.
 
-    Returns:
-        `seconds` measured, `cpu_s` of all readers, `packets` that arrived in that time and
-        `errors` of any kind.
+    `packets` are those that arrived in that time, `errors` those of any kind.
 
     Raises:
         DeviceError: the process failed.

@@ -47,8 +47,6 @@ OPTIONS = AlignmentOptions()
 # Arrival times are interpolated across every gap.
 ANY_GAP_NS = 10**12
 
-OnStage = Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class MethodResult:
@@ -134,7 +132,7 @@ def _clock_fits_s(recording: RecordingReader) -> float:
 
 
 def align_by_arrivals(
-    store: EpisodeStore, recording_id: str, on_stage: OnStage, *, nearest: bool
+    store: EpisodeStore, recording_id: str, on_stage: Callable[[str], None], *, nearest: bool
 ) -> str:
     """Align a recording of a person as if every sample had been taken when it arrived.
 

@@ -4,6 +4,7 @@ import gc
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,11 +51,18 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
     gc.collect()
     with bar("hand-eye", len(METHODS) * len(scenes)) as step:
         rounds = interleaved(
-            {one.name: lambda index, one=one: score(one, scenes[index]) for one in METHODS},
+            {method.name: partial(_score_at, method, scenes) for method in METHODS},
             len(scenes),
             on_step=step,
         )
-    return {name: _result(name, solved) for name, solved in rounds.items()}
+    results = {}
+    for name, solved in rounds.items():
+        columns: dict[str, Any] = {
+            key: None if None in values else Figure.of(values)
+            for key, values in zip(Solved._fields, zip(*solved, strict=True), strict=True)
+        }
+        results[name] = MethodResult(name, len(solved), **columns)
+    return results
 
 
 def score(method: Method, scene: Scene) -> Solved:
@@ -82,12 +90,8 @@ def score(method: Method, scene: Scene) -> Solved:
     )
 
 
-def _result(name: str, solved: Sequence[Solved]) -> MethodResult:
-    columns: dict[str, Any] = {
-        key: None if None in values else Figure.of(values)
-        for key, values in zip(Solved._fields, zip(*solved, strict=True), strict=True)
-    }
-    return MethodResult(name, len(solved), **columns)
+def _score_at(method: Method, scenes: Sequence[Scene], index: int) -> Solved:
+    return score(method, scenes[index])
 
 
 def not_worse_share(

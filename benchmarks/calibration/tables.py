@@ -9,7 +9,7 @@ from benchmarks.calibration.compare import MethodResult, Results, not_worse_shar
 from benchmarks.calibration.refusals import RIVALS, SceneResult
 from benchmarks.calibration.rivals import OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement, Sense, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 
 PROMISED_VIEWS = 25
@@ -142,15 +142,15 @@ def requirements(
 
 
 def _mount(ours: MethodResult) -> list[Requirement]:
+    what = f"hand-eye, {ours.name}"
     nees = None if ours.nees is None else float(np.mean(ours.nees.values))
-    rows: list[tuple[str, float | None, Sense, float, str]] = [
-        ("rotation, median", ours.error_deg.median, "at most", 0.06, "deg"),
-        ("translation, median", ours.error_mm.median, "at most", 0.8, "mm"),
-        ("NEES by degree of freedom", nees, "at least", 0.5, ""),
-        ("NEES by degree of freedom", nees, "at most", 2.0, ""),
-        ("processor time, median", ours.ms.median, "at most", 100.0, "ms"),
+    return [
+        at_most(f"{what}: rotation, median", ours.error_deg.median, 0.06, "deg"),
+        at_most(f"{what}: translation, median", ours.error_mm.median, 0.8, "mm"),
+        at_least(f"{what}: NEES by degree of freedom", nees, 0.5),
+        at_most(f"{what}: NEES by degree of freedom", nees, 2.0),
+        at_most(f"{what}: processor time, median", ours.ms.median, 100.0, "ms"),
     ]
-    return [Requirement(f"hand-eye, {ours.name}: {row[0]}", *row[1:]) for row in rows]
 
 
 def notes(results: Results) -> list[str]:

@@ -1,6 +1,7 @@
 """Entry point of the benchmark stage `clocks`."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.clocks.compare import STAMPLESS, compare
@@ -40,7 +41,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=tables(results, stampless),
         panels=panels(results),
         requirements=requirements(results, stampless),
-        data={"results": [result.to_data() for result in (*results, *stampless)]},
+        data={
+            "results": [
+                {
+                    "scene": result.scene,
+                    "way": result.way,
+                    "rounds": [asdict(score) for score in result.scores],
+                    "us_per_sample": list(result.us_per_sample.values),
+                }
+                for result in (*results, *stampless)
+            ]
+        },
         notes=[
             f"online errors exclude the first {WARM_UP_S:g} s and, in scenes with a step, 1.2 s "
             "after it; each round is a take with a different seed"

@@ -2,9 +2,8 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -44,15 +43,6 @@ class Result:
         """Recovery time after a step; None in scenes without one."""
         times = [found.recovery_s for found in self.scores if found.recovery_s is not None]
         return Figure.of(times) if times else None
-
-    def to_data(self) -> dict[str, Any]:
-        """Every round, for JSON."""
-        return {
-            "scene": self.scene,
-            "way": self.way,
-            "rounds": [asdict(found) for found in self.scores],
-            "us_per_sample": list(self.us_per_sample.values),
-        }
 
 
 def compare(

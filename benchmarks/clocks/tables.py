@@ -79,15 +79,12 @@ def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list
 
 def _gain(results: Sequence[Result]) -> float | None:
     """Minimum ratio of the arrivals' error to ours; online without scenes that have a step."""
-    gains = []
     arrivals = {r.scene: r.rms_ms for r in results if r.way == ARRIVALS}
-    for result in results:
-        counts = result.way == OURS_OFFLINE or (
-            result.way == OURS_ONLINE and not SCENES[result.scene].step_ms
-        )
-        if counts:
-            gains.append(arrivals[result.scene].over(result.rms_ms).low)
-    return min(gains, default=None)
+    quiet = {name for name, scene in SCENES.items() if not scene.step_ms}
+    counted = [
+        r for r in results if r.way == OURS_OFFLINE or (r.way == OURS_ONLINE and r.scene in quiet)
+    ]
+    return min((arrivals[r.scene].over(r.rms_ms).low for r in counted), default=None)
 
 
 def _worst(results: Sequence[Result], what: str) -> float | None:

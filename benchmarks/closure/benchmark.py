@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from statistics import mean
 
@@ -64,15 +65,10 @@ def _table(played: Played, num_takes: int) -> ResultTable:
     rows = []
     for (task, method), takes in played.items():
         errors = timing_errors([(take.human_contact, take.contact) for take in takes])
-        times_ms = (
-            errors.hand_first_ms,
-            errors.hand_last_ms,
-            errors.pad_first_ms,
-            errors.pad_last_ms,
-        )
-        counts = (str(errors.num_missing), str(errors.num_extra))
-        figures = (f"{_rate(takes):.2f}", *(_mean_ms(values) for values in times_ms), *counts)
-        rows.append((f"{task}: {method.name}", *figures))
+        *late_ms, missing, extra = astuple(errors)
+        means = map(_mean_ms, late_ms)
+        name, rate = f"{task}: {method.name}", f"{_rate(takes):.2f}"
+        rows.append((name, rate, *means, str(missing), str(extra)))
     return ResultTable(
         f"Replays of {num_takes} human takes a task; contact times against the human's in ms",
         COLUMNS,

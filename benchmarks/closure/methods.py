@@ -31,11 +31,7 @@ from services.alignment.synchronization.resampling import (
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, TruthStream
-from services.twin.mjcf import (
-    FINGER_STIFFNESS_NM_RAD,
-    WRIST_STIFFNESS_N_M,
-    WRIST_STIFFNESS_NM_RAD,
-)
+from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.simulation import MODEL_RATE_HZ
 
 Wrist = Literal["copied", "constant", "touch"]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -197,11 +197,10 @@ def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line
         if same[0].worst is not None and len(same) > 1 and np.isfinite(values).all():
             least = same[0].bound[0] == "at least"
             one = same[int(np.argmin(values) if least else np.argmax(values))]
-            worst = Drawn(
-                f"{one.what}, worst training seed", one.value, one.draws, one.num,
-                (one.bound[0], same[0].worst), one.unit,
-            )  # fmt: skip
-            lines.append(_line(task, worst, (worst.value, worst.draws), shown))
+            about = replace(
+                one, what=f"{one.what}, worst training seed", bound=(one.bound[0], same[0].worst)
+            )
+            lines.append(_line(task, about, (one.value, one.draws), shown))
     return lines
 
 

@@ -8,6 +8,7 @@ line that a killed run left incomplete is skipped.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,9 @@ class KeptRows:
         self._rows: dict[tuple[Any, ...], Row] = {}
         if path.is_file():
             for line in path.read_text(encoding="utf-8").splitlines():
-                if (row := _parsed(line)) is not None:
+                # A killed run may have left a part of a line.
+                with suppress(json.JSONDecodeError):
+                    row = json.loads(line)
                     self._rows[row_key(row)] = row
 
     def __len__(self) -> int:
@@ -69,14 +72,6 @@ class KeptRows:
         with self.path.open("rb") as file:
             file.seek(-1, 2)
             return file.read() == b"\n"
-
-
-def _parsed(line: str) -> Row | None:
-    try:
-        row = json.loads(line)
-    except json.JSONDecodeError:
-        return None
-    return row if isinstance(row, dict) and "kind" in row else None
 
 
 def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:

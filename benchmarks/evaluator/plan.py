@@ -106,13 +106,8 @@ def trained_seeds(
                 "all or one for each, in the same order"
             )
     count = len(worlds)
-    judges = list(probes) * (count if len(probes) == 1 else 1)
-    rivals = [_one_each(paths, count) for paths in (directs, untouched)]
-    return tuple(map(Trained, worlds, judges, *rivals))
-
-
-def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
-    return [*paths] * (count if len(paths) == 1 else 1) or [None] * count
+    judges, *rivals = ([*p] * (count if len(p) == 1 else 1) for p in (probes, directs, untouched))
+    return tuple(map(Trained, worlds, judges, *(each or [None] * count for each in rivals)))
 
 
 @dataclass(frozen=True)

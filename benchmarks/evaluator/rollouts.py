@@ -79,9 +79,7 @@ class PolicyRollout:
                 m.probe.verdict(without_touch(self._imagined_ending(m)))
             ),
             "verdict of the last image": self._last_image_row,
-            "sharpness": lambda m: {
-                "sharpness": sharpness_of_chunks(self.real, self.imagined(m.world))
-            },
+            "sharpness": lambda m: {"sharpness": sharpness_of_chunks(self.real, self.imagined(m))},
             "true context": self._context_row,
             "held still": self._still_row,
             "direct verdict": self._direct_row,
@@ -94,9 +92,7 @@ class PolicyRollout:
 
     def wrong_actions(self, member: Member, own: "PolicyRollout") -> Row:
         """Errors where this policy's actions are imagined in place of those of `own`."""
-        return wrong_action_figures(
-            own.real, own.imagined(member.world), self.imagined(member.world)
-        )
+        return wrong_action_figures(own.real, own.imagined(member), self.imagined(member))
 
     @cached_property
     def real(self) -> TrueRollout:
@@ -112,7 +108,10 @@ class PolicyRollout:
         write_arrays(path, vars(real) | {"success": np.array(real.success)})
         return real
 
-    def _imagined(self, world: BatchWorld[Any]) -> ImaginedRollout:
+    def _imagined(self, member: Member) -> ImaginedRollout:
+        return self._imagined_by(member.world)
+
+    def _imagined_by(self, world: BatchWorld[Any]) -> ImaginedRollout:
         path = self._path("imagined", self._twin.description.digest, world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
@@ -136,7 +135,7 @@ class PolicyRollout:
         return self._started.observation.images[HEAD_CAMERA][0]
 
     def _imagined_row(self, member: Member) -> Row:
-        imagined = self.imagined(member.world)
+        imagined = self.imagined(member)
         figures = chunk_figures(
             self.real,
             imagined,
@@ -153,7 +152,7 @@ class PolicyRollout:
         return Ending(self.real.last_images, touch, self._task)
 
     def _imagined_ending(self, member: Member) -> Ending:
-        return self.imagined(member.world).ending(self._task)
+        return self.imagined(member).ending(self._task)
 
     def _context_row(self, member: Member) -> Row:
         contact = contact_with_true_context(
@@ -183,7 +182,7 @@ class PolicyRollout:
         """Verdict on the ending of a world model trained without touch, with touch at zero."""
         if member.untouched is None:
             raise InvalidInputError("evaluator: no world was given by --without-touch")
-        ending = self.imagined(member.untouched).ending(self._task)
+        ending = self._imagined_by(member.untouched).ending(self._task)
         return asdict(member.probe.verdict(without_touch(ending)))
 
     def _direct_row(self, member: Member) -> Row:

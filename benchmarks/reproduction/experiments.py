@@ -4,11 +4,11 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 from pydantic import Field
 
-from benchmarks.reproduction.steps import Step
+from benchmarks.reproduction.steps import Step, step_with_result
 from dextouch.frozen_model import FrozenModel
 from services.twin.names import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
 
@@ -206,7 +206,7 @@ class Experiments:
             heldout = f"{amounts[name][1]} --first {_FIRST_HELDOUT_SEED}"
             amounts[f"{name}-heldout"] = (sizes.heldout_per_task, heldout)
         return {
-            name: _step(
+            name: step_with_result(
                 f"data/{name}",
                 f"train data --store data/{name}/store --tasks {words} --count {count} --jobs 1",
                 "store",
@@ -219,7 +219,7 @@ class Experiments:
         for kind in TOKENIZERS.values():
             for seed in self.seeds:
                 name, made = f"tokenizer/{kind}/seed-{seed}", "tokenizer.safetensors"
-                yield _step(
+                yield step_with_result(
                     name,
                     f"train tokenizer --episodes data/robot/store --tokenizer {kind} --seed {seed} "
                     f"--cpu-budget-s {self.sizes.tokenizer_cpu_s} --output {name}/{made}",
@@ -272,7 +272,7 @@ class Experiments:
         if num_human:
             needs.append(self._data["human"])
             flags += f" --human data/human/store --human-episodes {num_human}"
-        return _step(
+        return step_with_result(
             name,
             f"train world-model --episodes data/{robot}/store --heldout data/robot-heldout/store "
             f"{flags} --seed {seed} --num-members 1 --jobs 1 "
@@ -288,7 +288,7 @@ class Experiments:
         name = f"{column}/seed-{seed}/model"
         is_option = column.startswith("options/")
         cpu_s = self.sizes.option_cpu_s if is_option else self.sizes.train_cpu_s
-        return _step(
+        return step_with_result(
             name,
             f"train world-model --preset tiny {flags} --episodes data/{data}/store "
             f"--heldout data/{data}-heldout/store --seed {seed} --cpu-budget-s {cpu_s} --resume "
@@ -310,7 +310,7 @@ class Experiments:
         metrics: str = "",
     ) -> Step:
         """Errors of a model's predictions on held-out episodes, beside those of baselines."""
-        return _step(
+        return step_with_result(
             f"{model.name.removesuffix('model')}prediction",
             f"evaluate prediction --checkpoint {model.name}/{_MODEL} --horizon {horizon} "
             f"--episodes data/{data}-heldout/store {metrics} --baselines {','.join(baselines)}",
@@ -346,7 +346,7 @@ class Experiments:
             "--human data/downstream-human/store",
         }
         name = f"evaluator/{world}/seed-{seed}/model"
-        return _step(
+        return step_with_result(
             name,
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
             f"--splits B,C {flags[world]} --heldout data/downstream-heldout/store --seed {seed} "
@@ -362,7 +362,7 @@ class Experiments:
         model = self._adapted(world, seed)
         name = f"evaluator/{world}/seed-{seed}/imagined"
         chosen = f"--split {_UNSEEN_SPLIT} --jobs 1"
-        imagined = _step(
+        imagined = step_with_result(
             name,
             f"train imagined --episodes data/downstream/store --store {name}/store {chosen} "
             f"--checkpoint {model.name}/{_MODEL}",
@@ -370,7 +370,7 @@ class Experiments:
             needs=(self._data["downstream"], model),
         )
         name = f"evaluator/{world}/seed-{seed}/judge"
-        return _step(
+        return step_with_result(
             name,
             f"train judge --base package --splits {_UNSEEN_SPLIT} "
             f"--episodes data/downstream/store,{imagined.name}/store --output {name}/{_JUDGE}",
@@ -385,7 +385,7 @@ class Experiments:
         judges = {f"{world} {seed}": self._judge(world, seed) for world, seed in named}
         for model in worlds.values():
             yield self._rolled_out(model, "downstream")
-        cloned = _step(
+        cloned = step_with_result(
             "evaluator/policy",
             "train policy --episodes data/downstream/store --splits A,B --early-at 0.15 "
             f"--training.num-training-steps {self.sizes.policy_steps} "
@@ -417,7 +417,7 @@ class Experiments:
                     needs.append(self._demonstrations(column, model, seed))
                     flags += f" --imagined {needs[-1].name}/store"
                 name = f"generation/{column}/seed-{seed}/policy"
-                policies[policy_of(column, seed)] = _step(
+                policies[policy_of(column, seed)] = step_with_result(
                     name,
                     f"train policy --episodes data/demonstrations/store {flags} "
                     f"--places {model.name}/{_MODEL} --output {name}/{_POLICY}",
@@ -429,7 +429,7 @@ class Experiments:
 
     def _demonstrations(self, column: str, model: Step, seed: int) -> Step:
         name = f"generation/{column}/seed-{seed}/demonstrations"
-        return _step(
+        return step_with_result(
             name,
             f"generate --episodes data/demonstrations/store --split {_UNSEEN_SPLIT} "
             f"--store {name}/store --checkpoint {model.name}/{_MODEL} "
@@ -463,7 +463,7 @@ class Experiments:
             lines += [f'[policies."{policy}"]', 'builtin = "behaviour-cloning"']
             lines += [f'checkpoint = "{path}"']
         name = f"{table}/study"
-        return _step(
+        return step_with_result(
             name,
             f"study run {name}/study.toml --folder {name}/results",
             needs=needs,
@@ -479,9 +479,3 @@ def policy_of(column: str, seed: int) -> str:
 def folder_of(column: str) -> str:
     """Name of the folder of a table's column."""
     return column.replace(",", "").replace(" ", "-")
-
-
-def _step(name: str, command: str, *makes: str, **more: Any) -> Step:  # noqa: ANN401 - of `Step`
-    """A step whose command also writes its result as JSON."""
-    words = f"{' '.join(command.split())} --json {name}/result.json"
-    return Step(name, words, ("result.json", *makes), **more)

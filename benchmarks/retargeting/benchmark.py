@@ -13,7 +13,6 @@ from benchmarks.retargeting.compare import (
     compare_speed,
     pinch_set,
     robot_sets,
-    to_data,
 )
 from benchmarks.retargeting.ours import OURS_EXACT, cold_start
 from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
@@ -66,8 +65,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         requirements=requirements(speeds, robot, pinches, cold),
         data={
             "speed": [asdict(speed) for speed in speeds],
-            "robot": to_data(robot),
-            "pinches": to_data(pinches),
+            "robot": {
+                name: {method: asdict(score) for method, score in scores.items()}
+                for name, scores in robot.items()
+            },
+            "pinches": {method: asdict(score) for method, score in pinches.items()},
             "cold_start": cold._asdict(),
             "faults": [asdict(outcome) for outcome in outcomes],
         },

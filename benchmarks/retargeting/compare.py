@@ -6,9 +6,8 @@ A library that does not finish has no score or speed; results of the others are 
 import gc
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -146,14 +145,6 @@ def scale_of(motion: Motion) -> float:
     """Ratio of the robot's finger lengths to the tracked ones, the scale given to rivals."""
     tracked_m = ours.profile_of(motion).bone_m.sum()
     return float(robot_bone_m(RobotHand(motion.side)).sum() / tracked_m)
-
-
-def to_data(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Scores of each name, for JSON."""
-    return {
-        name: to_data(score) if isinstance(score, Mapping) else asdict(score)
-        for name, score in scores.items()
-    }
 
 
 def _answer(name: str, motion: Motion, rivals: Rivals) -> np.ndarray:

@@ -10,7 +10,6 @@ import importlib
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -113,11 +112,11 @@ def set_up(
     config["scaling_factor"] = scale
     wanted = references(rival, keypoints_m, scale)
     if rival.library == DEX:
-        _library("torch").set_num_threads(1)
-        module = _library("dex_retargeting.retargeting_config")
+        importlib.import_module("torch").set_num_threads(1)
+        module = importlib.import_module("dex_retargeting.retargeting_config")
         built = module.RetargetingConfig.from_dict(config).build()
         return Setup(list(wanted), built.retarget, list(built.joint_names))
-    built = _library("dexi_rs").load_config(config).build()
+    built = importlib.import_module("dexi_rs").load_config(config).build()
     flat = wanted.reshape(len(wanted), -1).tolist()
     return Setup(flat, built.retarget, list(built.joint_names))
 
@@ -138,8 +137,3 @@ def _config(objective: str) -> dict[str, Any]:
         }
     tips = [tip_name(chain) for chain in CHAINS]
     return {"type": "dexpilot", "wrist_link_name": WRIST_LINK, "finger_tip_link_names": tips}
-
-
-def _library(name: str) -> ModuleType:
-    """Import by name, since it is an optional dependency."""
-    return importlib.import_module(name)

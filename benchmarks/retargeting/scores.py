@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from benchmarks.retargeting.pinches import PinchMotion
 from benchmarks.simulated.hand_motions import Motion
@@ -85,7 +84,9 @@ def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray])
     _check(motions, answers)
     gaps, angles = [], []
     for motion, answer in zip(motions, answers, strict=True):
-        gaps.append(robot_gaps_m(motion.side, answer)[motion.pinched] * 1e3)
+        tips = RobotHand(motion.side).fingertips_m(answer)
+        gaps_m = np.linalg.norm(tips[:, 1:] - tips[:, :1], axis=-1)
+        gaps.append(gaps_m[motion.pinched] * 1e3)
         angles.append(np.rad2deg(np.abs(answer - motion.joints_rad)).ravel())
     gap_mm = np.concatenate(gaps)
     if not gap_mm.size:
@@ -98,12 +99,6 @@ def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray])
         _num_outside(motions, answers),
         gap_mm.size,
     )
-
-
-def robot_gaps_m(side: str, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 4"]:
-    """Distance of the robot's thumb tip to its other four, metres, for joint angles [T, 20]."""
-    tips = RobotHand(side).fingertips_m(joints_rad)
-    return np.asarray(np.linalg.norm(tips[:, 1:] - tips[:, :1], axis=-1))
 
 
 def max_step_deg(answers: Sequence[np.ndarray]) -> float:

@@ -21,8 +21,7 @@ from benchmarks.retargeting.compare import (
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from benchmarks.retargeting.robustness import HAND_LOST, NODE_LOST, NODES_LOST, Outcome
-from benchmarks.retargeting.robustness import table_rows as fault_rows
-from benchmarks.retargeting.scores import PinchScore
+from benchmarks.retargeting.scores import PinchScore, RobotScore
 from benchmarks.simulated.hand_motions import RATE_HZ
 from services.alignment.retargeting import RetargetOptions
 
@@ -41,10 +40,26 @@ def tables(
     rivals: Sequence[str] = (),
 ) -> list[ResultTable]:
     """All tables of the stage; libraries without a result are marked as not finished."""
+    what = "means, joints beyond limits, largest turn a sample"
     return [
         *[_speed_table(speeds, motion, rivals) for motion in (ROBOT_INPUT, PINCH_INPUT)],
-        *[_robot_table(robot, name, rivals) for name in robot],
-        _pinch_table(pinches, rivals),
+        *[
+            ResultTable(
+                f"The robot's own hands, {name}: {what}",
+                ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
+                [(method, *cells(*astuple(score))) for method, score in scores.items()]
+                + _unfinished(rivals, scores, 8),
+            )
+            for name, scores in robot.items()
+        ],
+        ResultTable(
+            "Pinches of people: the robot's gap where the human one is below 3 mm; a joint may "
+            f"turn {velocity_limit_deg():.3g} deg a sample",
+            ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
+            # All but the number of pinches.
+            [(method, *cells(*astuple(score)[:-1])) for method, score in pinches.items()]
+            + _unfinished(rivals, pinches, 6),
+        ),
         ResultTable(
             "Cold start: fingers of random postures solved within 0.1 mm",
             ("fingers", "with one start", "with retries"),
@@ -53,7 +68,10 @@ def tables(
         ResultTable(
             "Behaviour on lost samples and nodes (robot motion, one second)",
             ("method", NODE_LOST, HAND_LOST, NODES_LOST),
-            fault_rows(outcomes),
+            [
+                (method, *(one.text for one in outcomes if one.method == method))
+                for method in dict.fromkeys(one.method for one in outcomes)
+            ],
         ),
     ]
 
@@ -105,29 +123,6 @@ def _speed_table(speeds: Sequence[Speed], motion: str, rivals: Sequence[str]) ->
     return ResultTable(title, ("method", "cpu (µs)", *columns), rows)
 
 
-def _robot_table(robot: RobotScores, name: str, rivals: Sequence[str]) -> ResultTable:
-    return ResultTable(
-        f"The robot's own hands, {name}: means, joints beyond limits, largest turn a sample",
-        ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
-        [(method, *cells(*astuple(score))) for method, score in robot[name].items()]
-        + _unfinished(rivals, robot[name], 8),
-    )
-
-
-def _pinch_table(pinches: Mapping[str, PinchScore], rivals: Sequence[str]) -> ResultTable:
-    return ResultTable(
-        "Pinches of people: the robot's gap where the human one is below 3 mm; a joint may turn "
-        f"{velocity_limit_deg():.3g} deg a sample",
-        ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
-        [
-            # All but the number of pinches.
-            (method, *cells(*astuple(score)[:-1]))
-            for method, score in pinches.items()
-        ]
-        + _unfinished(rivals, pinches, 6),
-    )
-
-
 def requirements(
     speeds: Sequence[Speed],
     robot: RobotScores,
@@ -140,7 +135,7 @@ def requirements(
     noisy = [robot[name][OURS] for name in (NATURAL_NOISE, FULL_NOISE)]
     noisy_mm, noisy_deg = max(s.tip_mean_mm for s in noisy), max(s.joint_mean_deg for s in noisy)
     pinched = pinches[OURS]
-    every = [*(found[OURS] for found in robot.values()), pinched]
+    every: list[RobotScore | PinchScore] = [*(found[OURS] for found in robot.values()), pinched]
     step_deg, bound_deg = max(s.max_step_deg for s in every), velocity_limit_deg() + _ROUNDING_DEG
     once, retried = cold.num_found_once / cold.num_fingers, cold.num_found / cold.num_fingers
     rivals = [(Rival(library, VECTOR).name, bound) for library, bound in PROMISED_SPEED]

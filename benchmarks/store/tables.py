@@ -64,9 +64,9 @@ def read_table(results: Mapping[str, DesignResult]) -> ResultTable:
     rows = [
         (
             result.name,
-            _rate(result.window_ms),
-            _rate(result.three_cameras_ms),
-            _rate(result.three_cameras_threaded_ms),
+            result.window_ms.inverse(1e3).text(),
+            result.three_cameras_ms.inverse(1e3).text(),
+            result.three_cameras_threaded_ms.inverse(1e3).text(),
             "" if result.touch_ms is None else result.touch_ms.text(),
         )
         for result in results.values()
@@ -106,10 +106,6 @@ def rms_levels(psnr_db: float) -> float:
 
 def _megabytes(result: DesignResult) -> str:
     return f"{result.num_bytes / 1e6 * 60 / result.seconds:.0f}"
-
-
-def _rate(milliseconds: Figure) -> str:
-    return milliseconds.inverse(1e3).text()
 
 
 def requirements(

@@ -84,7 +84,13 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     requirements = [
         at_most(f"{name}: cells that fail", float(failed[name]), 0.0) for name in chosen
     ]
-    data = {"counts": counts, "cells": [_row_of_json(one) for one in findings]}
+    rows = []
+    for one in findings:
+        figures = {
+            name: value if math.isfinite(value) else None for name, value in one.figures.items()
+        }
+        rows.append({**asdict(one), "figures": figures})
+    data = {"counts": counts, "cells": rows}
     return _report([_matrix(findings), _results(findings)], requirements, data)
 
 
@@ -142,9 +148,3 @@ def _listing(cells: Sequence[Cell | Exemption]) -> ResultTable:
     ]
     columns = ("stage", "hazard", "input, or why it does not apply", "takes")
     return ResultTable(f"{len(cells)} cells", columns, rows, num_text_columns=4)
-
-
-def _row_of_json(finding: Finding) -> dict[str, Any]:
-    """A finding; figures that are not finite are null."""
-    figures = {n: value if math.isfinite(value) else None for n, value in finding.figures.items()}
-    return {**asdict(finding), "figures": figures}

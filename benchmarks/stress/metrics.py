@@ -8,11 +8,7 @@ from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.metrics import image, policy, tactile
-from services.evaluation.statistics import (
-    area_under_roc,
-    bootstrap_mean_interval,
-    wilson_interval,
-)
+from services.evaluation.statistics import area_under_roc, bootstrap_mean_interval, wilson_interval
 
 STAGE = StageCells("metrics")
 

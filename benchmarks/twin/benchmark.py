@@ -42,12 +42,27 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         found = interleaved(subjects, plan["rounds"], on_step=step)
     times_ms = {name: Figure.of(values) for name, values in found.items()}
     solver_ms, errors, num_chunks = _solvers(options.task, plan, bar)
+    points = [
+        Point.of(name, solver_ms[name], error.force_n, is_ours=name == AS_SERVED)
+        for name, error in errors.items()
+    ]
+    label = "RMS error of pad forces after one chunk (N)"
     return StageReport(
         stage="twin",
         packages=("numpy", "mujoco-core"),
         options={**plan, "task": options.task, "chunks_with_contact": num_chunks},
-        tables=[selector_table(times_ms), solver_table(solver_ms, errors, num_chunks)],
-        panels=[panel(solver_ms, errors)],
+        tables=[
+            ResultTable(
+                "A chunk of 16 steps by requested observation",
+                ("requested", "ms", "times real time"),
+                [
+                    (name, figure.text(), figure.inverse(CHUNK_MS).text())
+                    for name, figure in times_ms.items()
+                ],
+            ),
+            solver_table(solver_ms, errors, num_chunks),
+        ],
+        panels=[Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)],
         requirements=requirements(times_ms, states_are_equal=chunk.states_are_equal()),
         data={
             "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
@@ -58,18 +73,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             },
         },
         notes=["times are processor time of the whole process, with one thread"],
-    )
-
-
-def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
-    """Milliseconds of a chunk, and its speed relative to real time."""
-    return ResultTable(
-        "A chunk of 16 steps by requested observation",
-        ("requested", "ms", "times real time"),
-        [
-            (name, figure.text(), figure.inverse(CHUNK_MS).text())
-            for name, figure in times_ms.items()
-        ],
     )
 
 
@@ -91,16 +94,6 @@ def solver_table(
             for name, error in errors.items()
         ],
     )
-
-
-def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) -> Panel:
-    """Time of a chunk against its contact error, relative to the default solver."""
-    points = [
-        Point.of(name, times_ms[name], error.force_n, is_ours=name == AS_SERVED)
-        for name, error in errors.items()
-    ]
-    label = "RMS error of pad forces after one chunk (N)"
-    return Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)
 
 
 def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> list[Requirement]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Figure
-from benchmarks.report import StageReport
+from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.world_model.held_out import HeldOut, held_out
@@ -18,7 +18,6 @@ from benchmarks.world_model.tables import (
     STATE_BATCHES,
     Variant,
     asked_name,
-    cost_table,
     error_table,
     panels,
     requirements,
@@ -31,11 +30,7 @@ from dextouch.worlds import BatchWorld, CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
 from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
 from services.world_model.network.model import Sampling
-from services.world_model.shipped_checkpoints import (
-    PRETRAINED,
-    STATE_MODEL,
-    paper_form_checkpoint,
-)
+from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL, paper_form_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 
@@ -107,7 +102,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         options={**plan, "tasks": tasks, "checkpoint": world.description.name, "served": served},
         tables=[
             error_table(times_ms, errors, served, len(episodes)),
-            cost_table(costs_ms, served),
+            ResultTable(
+                f"{served}: a chunk of one rollout, by requested images and batch size",
+                ("requested", "ms"),
+                [(name, figure.text()) for name, figure in costs_ms.items()],
+            ),
             state_model_table(state_ms, state_world.description.name),
         ],
         panels=panels(times_ms, errors, served),
