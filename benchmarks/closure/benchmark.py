@@ -17,7 +17,6 @@ FIRST_SEED = 100
 AMOUNTS = Amounts(usual={"takes": 20}, quick={"takes": 1})
 MIN_SUCCESS = 0.8
 QUICK_METHODS = (METHODS[0], OURS)
-COLUMNS = ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra")
 
 Played = Mapping[tuple[str, Method], Sequence[ClosureTake]]
 
@@ -71,7 +70,7 @@ def _table(played: Played, num_takes: int) -> ResultTable:
         rows.append((name, rate, *means, str(missing), str(extra)))
     return ResultTable(
         f"Replays of {num_takes} human takes a task; contact times against the human's in ms",
-        COLUMNS,
+        ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra"),
         rows,
     )
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from benchmarks.evaluator.kinds import KindsPlan
 from dextouch.errors import InvalidInputError
@@ -106,8 +106,11 @@ def trained_seeds(
                 "all or one for each, in the same order"
             )
     count = len(worlds)
-    judges, *rivals = ([*p] * (count if len(p) == 1 else 1) for p in (probes, directs, untouched))
-    return tuple(map(Trained, worlds, judges, *(each or [None] * count for each in rivals)))
+    columns: list[Sequence[Any]] = [
+        [*paths] * (count if len(paths) == 1 else 1) or [None] * count
+        for paths in (probes, directs, untouched)
+    ]
+    return tuple(Trained(*row) for row in zip(worlds, *columns, strict=True))
 
 
 @dataclass(frozen=True)
