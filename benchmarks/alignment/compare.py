@@ -20,7 +20,6 @@ from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization import STAGE_BEGINS
 from services.alignment.synchronization.grid_actions import (
     REQUIRED,
     GriddedStreams,
@@ -115,7 +114,8 @@ def _run(recorded: RecordedTake, method: str, folder: Path, round_index: int) ->
     end_s, wall_s = time.process_time(), time.perf_counter() - wall_s
     # After the alignment, when the same files were just read.
     fits_s = _clock_fits_s(store.recording(recording_id))
-    edges = [begin_s, *(marks[stage] for stage in list(STAGE_BEGINS)[1:]), end_s]
+    # These takes have no objects, whose stage therefore never begins.
+    edges = [begin_s, *(marks[stage] for stage in ("placing", "retargeting", "writing")), end_s]
     dating_s, *others_s = np.diff(edges).tolist()
     times = [storing_s, fits_s if method == OURS else 0.0, max(dating_s - fits_s, 0.0), *others_s]
     errors = {} if round_index else _errors(store, recorded, episode_id)
