@@ -12,11 +12,7 @@ EXIT_INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark of one stage.
-
-    Returns:
-        Its exit status; 3 for a refusal or a missing package, with the reason on stderr.
-    """
+    """Run the benchmark of one stage; 3 for a refusal or a missing package, told on stderr."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         from benchmarks import command

@@ -4,7 +4,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,6 @@ from scipy.special import ndtri
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Amounts, Bar
@@ -49,18 +48,6 @@ AMOUNTS: Final = Amounts(
 
 
 @dataclass(frozen=True)
-class Truth:
-    """True success rates of policies in both worlds."""
-
-    real: np.ndarray
-    imagined: np.ndarray
-
-    def figure(self, name: str) -> float:
-        """An agreement figure of the true rates."""
-        return FIGURES[name](real=self.real, imagined=self.imagined)
-
-
-@dataclass(frozen=True)
 class Tally:
     """Coverage and median width of a method's intervals."""
 
@@ -69,18 +56,17 @@ class Tally:
     undefined: int
 
 
+# By numbers of policies and disagreements, then by methods and figures.
+Found = Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]]
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     AMOUNTS.add_options(parser, studies="simulated studies of each kind")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Simulate studies with known true rates, and time both methods on one of the paper's size.
-
-    Raises:
-        InvalidInputError: no study.
-    """
-    del folder
+    """Simulate studies with known true rates, and time both methods on one of the paper's size."""
     plan = AMOUNTS.of(options)
     kinds = [(p, d) for p in NUM_POLICIES for d in DISAGREEMENTS]
     found: dict[tuple[int, float], dict[tuple[str, str], Tally]] = {}
@@ -94,15 +80,21 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     times_s = timed(plan["rounds"])
     return StageReport(
         stage="agreement",
-        machine=describe_machine(("numpy", "scipy")),
+        packages=("numpy", "scipy"),
         options=plan,
-        tables=[coverage_table(name, found) for name in MEASURED] + [time_table(times_s)],
+        tables=[
+            *(coverage_table(name, found) for name in MEASURED),
+            ResultTable(
+                "4 tasks of 3 policies, 10 starts, 5 raters",
+                ("method", "s"),
+                [(name, figure.text()) for name, figure in times_s.items()],
+            ),
+        ],
         panels=[panel(found, times_s)],
         requirements=requirements(found, times_s),
         data={
             "coverage": [
-                {"policies": p, "disagreement": d, "method": method, "figure": name}
-                | {"held": tally.held, "width": tally.width, "undefined": tally.undefined}
+                {"policies": p, "disagreement": d, "method": method, "figure": name} | asdict(tally)
                 for (p, d), tallies in found.items()
                 for (method, name), tally in tallies.items()
             ],
@@ -117,8 +109,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 def simulated_study(
     num_policies: int, disagreement: float, generator: np.random.Generator
-) -> tuple[Truth, MatchedScores]:
-    """A study of policies of random skill from ten starts, with their true rates."""
+) -> tuple[dict[str, np.ndarray], MatchedScores]:
+    """True success rates of policies of random skill in both worlds, and a study of ten starts."""
     real = generator.uniform(0.05, 0.95, num_policies)
     imagined = np.clip(real + generator.normal(0, disagreement, num_policies), 0.02, 0.98)
     luck = generator.standard_normal(NUM_STARTS)
@@ -128,7 +120,8 @@ def simulated_study(
         skill = math.sqrt(SHARED) * luck + math.sqrt(1 - SHARED) * own
         return (skill < ndtri(rates)[:, None]).astype(np.float64)[:, :, None]
 
-    return Truth(real, imagined), MatchedScores(outcomes(real), outcomes(imagined))
+    rates = {"real": real, "imagined": imagined}
+    return rates, MatchedScores(outcomes(real), outcomes(imagined))
 
 
 def coverage(
@@ -153,7 +146,7 @@ def coverage(
                 shortest = method == OURS and name in CORRELATIONS
                 interval = (shortest_interval if shortest else central_interval)(defined)
                 # A true value at its limit (r = 1) counts as covered within a thousandth.
-                hit = interval.low - 1e-3 <= truth.figure(name) <= interval.high + 1e-3
+                hit = interval.low - 1e-3 <= FIGURES[name](**truth) <= interval.high + 1e-3
                 held[method, name].append((hit, interval.high - interval.low))
     return {
         key: Tally(
@@ -168,8 +161,7 @@ def coverage(
 def timed(num_rounds: int) -> dict[str, Figure]:
     """Processor seconds of 10,000 draws of every task of the paper's largest study."""
     generator = np.random.default_rng(0)
-    sides = [generator.integers(0, 5, PAPER) / 4 for _ in range(2)]
-    scores = MatchedScores(*sides)
+    scores = MatchedScores(*(generator.integers(0, 5, PAPER) / 4 for _ in range(2)))
 
     def once(draw: Draw, round_index: int) -> float:
         started = time.process_time()
@@ -181,9 +173,7 @@ def timed(num_rounds: int) -> dict[str, Figure]:
     return {name: Figure.of(values) for name, values in interleaved(subjects, num_rounds).items()}
 
 
-def coverage_table(
-    name: str, found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]]
-) -> ResultTable:
+def coverage_table(name: str, found: Found) -> ResultTable:
     """Coverage and median width of the 95 % intervals of a figure."""
     rows = []
     for (num_policies, disagreement), tallies in found.items():
@@ -196,24 +186,12 @@ def coverage_table(
     return ResultTable(f"95 % intervals of {name}", ("studies", *columns), rows)
 
 
-def time_table(times_s: Mapping[str, Figure]) -> ResultTable:
-    """Seconds of both methods."""
-    rows = [(name, figure.text()) for name, figure in times_s.items()]
-    return ResultTable("4 tasks of 3 policies, 10 starts, 5 raters", ("method", "s"), rows)
-
-
-def mean_held(
-    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]], method: str, name: str
-) -> float:
+def mean_held(found: Found, method: str, name: str) -> float:
     """Share of all simulated studies whose interval contains the true value."""
-    held = [tallies[method, name].held for tallies in found.values()]
-    return float(np.nanmean(held))
+    return float(np.nanmean([tallies[method, name].held for tallies in found.values()]))
 
 
-def panel(
-    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
-    times_s: Mapping[str, Figure],
-) -> Panel:
+def panel(found: Found, times_s: Mapping[str, Figure]) -> Panel:
     """Time of a study against the distance of the coverage for Pearson's r from 95 %."""
     points = [
         Point.of(name, figure, abs(mean_held(found, name, "pearson") - 0.95), is_ours=name == OURS)
@@ -223,24 +201,11 @@ def panel(
     return Panel("95 % intervals of Pearson's r", "processor s a study", label, points)
 
 
-def requirements(
-    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
-    times_s: Mapping[str, Figure],
-) -> list[Requirement]:
+def requirements(found: Found, times_s: Mapping[str, Figure]) -> list[Requirement]:
     """Requirements on the intervals of an evaluation."""
+    what = "studies whose 95 % interval holds the truth"
+    paper = "hierarchical bootstrap of the paper's largest study, 10,000 draws"
     return [
-        *(
-            at_least(
-                f"{name}: studies whose 95 % interval holds the truth",
-                mean_held(found, OURS, name),
-                0.92,
-            )
-            for name in MEASURED
-        ),
-        at_most(
-            "hierarchical bootstrap of the paper's largest study, 10,000 draws",
-            times_s["bootstrap"].median,
-            1.0,
-            "s",
-        ),
+        *(at_least(f"{name}: {what}", mean_held(found, OURS, name), 0.92) for name in MEASURED),
+        at_most(paper, times_s["bootstrap"].median, 1.0, "s"),
     ]

@@ -1,6 +1,7 @@
 """Command line of the benchmarks: runs a stage, prints tables, writes chart and JSON."""
 
 import argparse
+import itertools
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -12,9 +13,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from benchmarks.chart import draw
 from benchmarks.machine import refuse_shape_checks
-from benchmarks.report import StageReport, show, to_markdown, write_json
+from benchmarks.report import StageReport, show, to_markdown
 from benchmarks.stages import STAGES, load_stage
-from dextouch.command_line import CommandParser, add_json
+from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.errors import UnknownNameError
 
 EXIT_MISSED = 1
@@ -28,11 +29,7 @@ DESCRIPTION = (
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the benchmark of one stage.
-
-    Returns:
-        0; with --check 1 if a requirement is missed or was not measured.
-    """
+    """Run the benchmark of one stage; 1 with --check if a requirement is missed or unmeasured."""
     arguments = list(argv)
     if not arguments or arguments[0] in {"-h", "--help"}:
         print(usage())
@@ -53,21 +50,17 @@ def main(argv: Sequence[str]) -> int:
 
 def usage() -> str:
     """The text of `python -m benchmarks --help`."""
-    rows = [f"  {name:<13}{entry.does}" for name, entry in STAGES.items()]
-    return "\n".join(
-        [
-            "usage: python -m benchmarks STAGE [options]",
-            "",
-            DESCRIPTION,
-            "",
-            *rows,
-            "",
-            "`python -m benchmarks STAGE --help` describes a stage and its options.",
-            "",
-            "example:",
-            "  python -m benchmarks store --quick",
-        ]
-    )
+    rows = "\n".join(f"  {name:<13}{entry.does}" for name, entry in STAGES.items())
+    return f"""usage: python -m benchmarks STAGE [options]
+
+{DESCRIPTION}
+
+{rows}
+
+`python -m benchmarks STAGE --help` describes a stage and its options.
+
+example:
+  python -m benchmarks store --quick"""
 
 
 def stage_parser(name: str) -> argparse.ArgumentParser:
@@ -98,10 +91,9 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
     """Print the report; write JSON and chart on request."""
     console = Console()
     show(report, console if console.is_terminal else Console(width=WIDTH))
-    if options.json is not None:
-        write_json(report, options.json)
+    write_json_text(options.json, report.to_json())
     if options.out is not None:
-        write_json(report, options.out / f"bench_{report.stage}.json")
+        write_json_text(options.out / f"bench_{report.stage}.json", report.to_json())
         text = options.out / f"bench_{report.stage}.md"
         text.write_text(to_markdown(report), encoding="utf-8")
         chart = options.out / f"bench_{report.stage}.svg"
@@ -128,11 +120,9 @@ def _bar(what: str, num_steps: int) -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True)
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task(what, total=num_steps)
-        done = -1
+        done = itertools.count()
 
         def step(name: str) -> None:
-            nonlocal done
-            done += 1
-            progress.update(task, completed=done, description=f"{what}: {name}")
+            progress.update(task, completed=next(done), description=f"{what}: {name}")
 
         yield step

@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float32, Float64
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.episodes import (
@@ -112,8 +111,7 @@ class Attempts:
 class DirectNetwork(nn.Module):
     """Gated recurrent network on commands relative to the objects that a start reader finds.
 
-    Args:
-        config: tasks, objects and images; of the state model it has the reader only.
+    Of the state model that `config` describes, it has the reader only.
     """
 
     boxes_m: Tensor
@@ -164,10 +162,7 @@ class DirectNetwork(nn.Module):
 
 
 class DirectJudge:
-    """A trained direct judge.
-
-    Args:
-        checkpoint: from `load_checkpoint` or from training.
+    """A trained direct judge, from `load_checkpoint` or from training.
 
     Raises:
         InvalidInputError: the weights do not match the configuration in the metadata.
@@ -191,11 +186,7 @@ class DirectJudge:
 
     @torch.no_grad()
     def probability(self, start: RolloutStart, actions: Float64[np.ndarray, "steps 67"]) -> float:
-        """Calibrated probability that commands succeed.
-
-        Args:
-            start: with the first observation, the anchor and K_head.
-            actions: commands of all 4k steps after it, relative to the anchor.
+        """Calibrated probability that commands (4k steps, relative to the anchor) succeed.
 
         Raises:
             UnknownNameError: a task that the judge was not trained for.
@@ -255,13 +246,8 @@ def train_direct_judge(
 ) -> Checkpoint:
     """Train a start reader on object poses, then the recurrent network on outcomes.
 
-    A share of the scenes is held out for early stopping, calibration and metrics.
-
-    Args:
-        episodes: with known outcomes.
-        starts: digests of their first observations, to store in the checkpoint.
-        settings: training settings.
-        command: command to store in the checkpoint.
+    A share of the scenes is held out for early stopping, calibration and metrics. The digests of
+    the first observations and the command are stored in the checkpoint.
 
     Raises:
         InvalidInputError: only one outcome, or too few scenes to hold some out.
@@ -415,32 +401,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Train a judge, write it, and report its metrics on held-out episodes."""
-    del folder, bar
     torch.set_num_threads(1)
-    settings = JudgeSettings(
-        options.seed,
-        min(options.reader_steps, _QUICK_STEPS) if options.quick else options.reader_steps,
-        min(options.steps, _QUICK_STEPS) if options.quick else options.steps,
-        options.cpu_s,
-    )
+    reader_steps, num_steps = options.reader_steps, options.steps
+    if options.quick:
+        reader_steps, num_steps = min(reader_steps, _QUICK_STEPS), min(num_steps, _QUICK_STEPS)
+    settings = JudgeSettings(options.seed, reader_steps, num_steps, options.cpu_s)
     names = [url.rstrip("/").rpartition("/")[2] for url in options.episodes]
     command = shlex.join(["python", "-m", "benchmarks", "direct-judge", "--episodes", *names])
     episodes, starts = read_takes(options.episodes, tasks=options.tasks)
     checkpoint = train_direct_judge(episodes, starts, settings, command=command)
     save_checkpoint(options.output, checkpoint)
     metrics = checkpoint.metadata.metrics
+    rows = [(name, f"{value:.4g}") for name, value in metrics.items()]
     return StageReport(
         stage="direct-judge",
-        machine=describe_machine(("numpy", "torch")),
+        packages=("numpy", "torch"),
         options={"episodes": names, "tasks": options.tasks, "training": asdict(settings)},
-        tables=[
-            ResultTable(
-                f"{options.output}, on held-out episodes",
-                ("", "figure"),
-                [(name, f"{value:.4g}") for name, value in metrics.items()],
-            )
-        ],
-        panels=[],
+        tables=[ResultTable(f"{options.output}, on held-out episodes", ("", "figure"), rows)],
         requirements=[],
         data={"metrics": metrics},
     )

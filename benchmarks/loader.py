@@ -2,7 +2,8 @@
 
 import argparse
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -10,7 +11,6 @@ from pathlib import Path
 import torch
 
 from benchmarks.figures import Figure, Requirement, at_least
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
@@ -22,7 +22,6 @@ from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
 from services.world_model.training.trainer import TrainingRun
 
-PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
 # Default of `dextouch train world-model --streaming`.
 USUAL_WORKERS = 0
@@ -45,25 +44,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time the loader and the training step alternately.
-
-    Raises:
-        InvalidInputError: no episode, round or batch, or invalid numbers of workers.
-    """
+    """Time the loader and the training step alternately."""
     plan, workers = AMOUNTS.of(options), _workers(options.workers)
     url = options.store or _make_episodes(folder / "episodes", plan["episodes"])
     with bar("reading the store once", 1):
         pace = TrainingPace(url, fit_windows=plan["fit_windows"])
-    subjects = _subjects(pace, workers, plan["batches"])
+    batches = plan["batches"]
+    subjects = {LEARNING: every_round(partial(pace.learning, batches))}
+    for name_of, measured in ((loading, pace.loading), (training, pace.both)):
+        for count in workers:
+            subjects[name_of(count)] = every_round(partial(measured, batches, num_workers=count))
     with bar("measuring", plan["rounds"] * len(subjects)) as step:
         found = interleaved(subjects, plan["rounds"], on_step=step)
     rates = {name: Figure.of(values) for name, values in found.items()}
     return StageReport(
         stage="loader",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "zstandard"),
         options={**plan, "episodes": pace.num_episodes, "batch": pace.batch, "workers": workers},
         tables=[rate_table(rates, pace.num_episodes)],
-        panels=[],
         requirements=[requirement(rates)],
         data={"windows_per_s": {name: list(figure.values) for name, figure in rates.items()}},
         notes=["the episodes are in the page cache, so disk latency is not included"],
@@ -73,6 +71,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def loading(num_workers: int) -> str:
     """The name of a loader in tables."""
     return f"loader, {num_workers} worker processes"
+
+
+def training(num_workers: int) -> str:
+    """The name of training from a loader in tables."""
+    return f"training from the disk, {num_workers} worker processes"
 
 
 def rate_table(rates: Mapping[str, Figure], num_episodes: int) -> ResultTable:
@@ -98,11 +101,7 @@ class TrainingPace:
     """Windows per second of the loader and the training step, separately and together.
 
     All measurements use the same network, the same sampling of windows and one thread, and exclude
-    one-time work: codecs are fitted and worker processes started beforehand.
-
-    Args:
-        url: URL of an episode store.
-        fit_windows: windows the codecs are fitted on.
+    one-time work: codecs are fitted on `fit_windows` and worker processes started beforehand.
     """
 
     def __init__(self, url: str, *, fit_windows: int = 256) -> None:
@@ -127,25 +126,18 @@ class TrainingPace:
 
     def loading(self, num_batches: int, *, num_workers: int) -> float:
         """Windows per second of the loader alone."""
-        batches = self._batches(num_workers)
-        start_s = time.perf_counter()
-        for _ in islice(batches, num_batches):
-            pass
-        elapsed_s = time.perf_counter() - start_s
-        batches.close()
-        return num_batches * self.batch / elapsed_s
+        with closing(self._batches(num_workers)) as batches:
+            return self._rate(batches, num_batches, lambda _: None)
 
     def learning(self, num_batches: int) -> float:
         """Windows per second of training on windows in memory."""
         ready = list(islice(self._batches(0), num_batches))
-        return self._learn(iter(ready), num_batches)
+        return self._rate(ready, num_batches, self._run.learn)
 
     def both(self, num_batches: int, *, num_workers: int) -> float:
         """Windows per second of training on windows read from disk."""
-        batches = self._batches(num_workers)
-        rate = self._learn(batches, num_batches)
-        batches.close()
-        return rate
+        with closing(self._batches(num_workers)) as batches:
+            return self._rate(batches, num_batches, self._run.learn)
 
     def _batches(self, num_workers: int) -> Generator[WindowBatch, None, None]:
         batches = read_batches(self._episodes, self._run.places(), num_workers=num_workers)
@@ -154,23 +146,16 @@ class TrainingPace:
             pass
         return batches
 
-    def _learn(self, batches: Iterator[WindowBatch], num_batches: int) -> float:
+    def _rate(
+        self,
+        batches: Iterable[WindowBatch],
+        num_batches: int,
+        use: Callable[[WindowBatch], object],
+    ) -> float:
         start_s = time.perf_counter()
         for batch in islice(batches, num_batches):
-            self._run.learn(batch)
+            use(batch)
         return num_batches * self.batch / (time.perf_counter() - start_s)
-
-
-def _subjects(
-    pace: TrainingPace, workers: list[int], num_batches: int
-) -> dict[str, Callable[[int], float]]:
-    subjects = {LEARNING: partial(pace.learning, num_batches)}
-    for count in workers:
-        subjects[loading(count)] = partial(pace.loading, num_batches, num_workers=count)
-    for count in workers:
-        name = f"training from the disk, {count} worker processes"
-        subjects[name] = partial(pace.both, num_batches, num_workers=count)
-    return {name: every_round(measure) for name, measure in subjects.items()}
 
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:

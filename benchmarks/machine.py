@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -16,17 +17,13 @@ NOT_INSTALLED = "not installed"
 
 
 def describe_machine(packages: Sequence[str]) -> dict[str, str]:
-    """Processor, memory, system, load and versions, for the head of a report.
-
-    Args:
-        packages: distributions whose versions matter to the stage.
-    """
+    """Processor, memory, system, load and versions of packages, for the head of a report."""
     about = {
         "dextouch": dextouch.__version__,
-        "commit": commit(),
-        "processor": _first_value(Path("/proc/cpuinfo"), "model name") or platform.machine(),
+        "commit": _commit(),
+        "processor": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
-        "memory": _memory(),
+        "memory": f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "load of the last minute": f"{os.getloadavg()[0]:.2f}",
@@ -35,20 +32,16 @@ def describe_machine(packages: Sequence[str]) -> dict[str, str]:
     return about | {name: _version(name) for name in packages}
 
 
-def commit() -> str:
+def _commit() -> str:
     """Commit of the running code, with a mark if files are modified."""
     git, root = shutil.which("git"), Path(__file__).resolve().parents[1]
     if git is None or not (root / ".git").exists():
         return "unknown"
-    answers = [
-        subprocess.run(  # noqa: S603 (a fixed command in our own folder)
-            [git, "-C", str(root), *arguments], capture_output=True, text=True, check=False
-        )
-        for arguments in (("rev-parse", "--short=12", "HEAD"), ("diff", "--quiet", "HEAD"))
-    ]
-    if answers[0].returncode != 0:
-        return "unknown"
-    return answers[0].stdout.strip() + (" with changes" if answers[1].returncode else "")
+    command = [git, "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=12"]
+    answer = subprocess.run(  # noqa: S603 (a fixed command in our own folder)
+        [*command, "--dirty= with changes"], capture_output=True, text=True, check=False
+    )
+    return answer.stdout.strip() or "unknown"
 
 
 def refuse_shape_checks() -> None:
@@ -71,17 +64,8 @@ def _version(name: str) -> str:
         return NOT_INSTALLED
 
 
-def _memory() -> str:
-    kilobytes = _first_value(Path("/proc/meminfo"), "MemTotal").removesuffix(" kB")
-    return f"{int(kilobytes) / 2**20:.1f} GiB" if kilobytes.isdigit() else "unknown"
-
-
-def _first_value(path: Path, key: str) -> str:
-    """The first `key : value` of a kernel file; empty if there is none."""
-    if not path.is_file():
-        return ""
-    for line in path.read_text(encoding="utf-8").splitlines():
-        name, _, value = line.partition(":")
-        if name.strip() == key:
-            return value.strip()
-    return ""
+def _processor() -> str:
+    found = re.search(
+        r"^model name\s*: (.*)", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE
+    )
+    return found[1] if found else platform.machine()

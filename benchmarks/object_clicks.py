@@ -151,12 +151,9 @@ def _errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> ClickError
             exact_px = _places_px(one, start.T_world_camera, K, true)
             for _ in range(NUM_DRAWS):
                 noisy = (exact_px + noise_px * draw.normal(size=(2, 2))).clip(0, side_px)
-                point_px, heading_px = ((u, v) for u, v in noisy.tolist())
-                click = ObjectClick(
-                    point_px=point_px, heading_px=None if one.click.symmetric else heading_px
-                )
+                clicks = EpisodeClicks(objects={one.name: _click(one, noisy)})
                 try:
-                    found = clicked_poses(about, objects, EpisodeClicks(objects={one.name: click}))
+                    found = clicked_poses(about, objects, clicks)
                 except InvalidInputError:
                     num_refused += 1
                     continue
@@ -187,15 +184,19 @@ def clicked_image(
     for one, T in zip(objects, Ts, strict=True):
         exact_px = _places_px(one, take.anchor.T_world_camera_head, take.K_head, T)
         noisy = exact_px + noise_px * side_px / 480 * draw.normal(size=(2, 2))
-        point_px, heading_px = ((u, v) for u, v in noisy.clip(0, side_px).tolist())
-        length_px = np.linalg.norm(np.subtract(heading_px, point_px))
+        inside = noisy.clip(0, side_px)
+        length_px = np.linalg.norm(inside[1] - inside[0])
         is_seen = (noisy[0] >= 0).all() and (noisy[0] <= side_px).all()
         if is_seen and (one.click.symmetric or length_px > _LEAST_WAY * side_px):
-            heading = None if one.click.symmetric else heading_px
-            clicks[one.name] = ObjectClick(point_px=point_px, heading_px=heading)
+            clicks[one.name] = _click(one, inside)
         else:
             clicks[one.name] = ObjectClick(state="hidden")
     return EpisodeClicks(objects=clicks)
+
+
+def _click(one: SceneObject, places_px: Float64[np.ndarray, "2 2"]) -> ObjectClick:
+    point_px, heading_px = ((u, v) for u, v in places_px.tolist())
+    return ObjectClick(point_px=point_px, heading_px=None if one.click.symmetric else heading_px)
 
 
 def _places_px(

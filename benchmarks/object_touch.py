@@ -91,16 +91,12 @@ def _takes(task: str, seeds: Iterable[int], folder: Path) -> tuple[list[EpisodeG
 
 def described_objects(take: EpisodeGrid) -> tuple[SceneObject, ...]:
     """Objects of a take of the twin as a lab describes them."""
-    each = zip(take.object_names, take.boxes_m, _true_poses(take)[0], strict=True)
-    return tuple(
-        described(name, box_m, T).model_copy(
-            update={
-                "touch": TouchedAt.model_validate(GRIPS[take.task][name]),
-                "fixed": name in _FIXED,
-            }
-        )
-        for name, box_m, T in each
-    )
+    listed = []
+    for name, box_m, T in zip(take.object_names, take.boxes_m, _true_poses(take)[0], strict=True):
+        touch = TouchedAt.model_validate(GRIPS[take.task][name])
+        more = {"touch": touch, "fixed": name in _FIXED}
+        listed.append(described(name, box_m, T).model_copy(update=more))
+    return tuple(listed)
 
 
 def _true_poses(take: EpisodeGrid) -> Float64[np.ndarray, "steps objects 4 4"]:

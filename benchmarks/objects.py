@@ -13,7 +13,6 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.figures import at_most
-from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.object_touch import TouchErrors, touch_errors
 from benchmarks.report import ResultTable, StageReport
@@ -30,7 +29,6 @@ from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 
-PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
 FIRST_SEED = 46_000
 AMOUNTS: Final = Amounts(usual={"takes": 4}, quick={"takes": 1})
 # Takes without images are cheap: so many for one with them.
@@ -79,13 +77,7 @@ class _Found:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Track the objects of takes by both designs, alternately, at several sizes of the image.
-
-    Raises:
-        InvalidInputError: no take.
-        UnknownNameError: no such task.
-    """
-    del folder
+    """Track the objects of takes by both designs, alternately, at several sizes of the image."""
     count = AMOUNTS.of(options)["takes"]
     tasks = named_tasks(options.tasks.split(","))
     sides_px = SIDES_PX[:1] if options.quick else SIDES_PX
@@ -105,20 +97,16 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     clicked = click_errors(tasks, range(FIRST_SEED, FIRST_SEED + count))
     touched = touch_errors(tasks, range(FIRST_SEED, FIRST_SEED + TAKES_OF_TOUCH * count))
     best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
+    depth_mm = _quantile(_all(best, "depth_mm"))
     return StageReport(
         stage="objects",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "opencv-contrib-python-headless", "mujoco"),
         options={"takes": count, "tasks": ", ".join(tasks)},
         tables=[_table(found), _click_table(clicked), _touch_table(touched)],
-        panels=[],
         requirements=[
             at_most("median error, sharp (mm)", _quantile(_all(best, "off_mm")), 1.0),
             at_most("95 % error, sharp (mm)", _quantile(_all(best, "off_mm"), 0.95), 5.0),
-            at_most(
-                "median error along the view, sharp (mm)",
-                abs(_quantile(_all(best, "depth_mm"))),
-                0.5,
-            ),
+            at_most("median error along the view, sharp (mm)", abs(depth_mm), 0.5),
             at_most("95 % error of exact clicks (mm)", _quantile(exact.off_mm, 0.95), 1.0),
             at_most("median error of clicks, 3 px of 480 (mm)", _quantile(usual.off_mm), 8.0),
             *(
@@ -184,9 +172,7 @@ def _ours(take: _Take, images: Images) -> dict[str, Poses]:
     for index, image in enumerate(images):
         tracker.add(index * period_ns, image, take.Ts_world_camera[index])
     return {
-        name: {
-            t // period_ns: T for t, T in zip(one.t_ns.tolist(), one.Ts_world_object, strict=True)
-        }
+        name: dict(zip((one.t_ns // period_ns).tolist(), one.Ts_world_object, strict=True))
         for name, one in tracker.tracked().items()
     }
 
@@ -209,10 +195,8 @@ def _usual(take: _Take, images: Images) -> dict[str, Poses]:
             if not markers:
                 continue
             largest = max(markers, key=lambda marker: cv2.contourArea(seen[marker.id]))
-            half = 0.5 * largest.size_m
-            flat = np.array(
-                [[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]]
-            )
+            square = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+            flat = 0.5 * largest.size_m * square
             _, turn, shift = cv2.solvePnP(
                 flat, seen[largest.id].reshape(4, 2), K, np.zeros(5),
                 flags=cv2.SOLVEPNP_IPPE_SQUARE,
@@ -285,14 +269,8 @@ def _click_table(clicked: Mapping[tuple[int, int], ClickErrors]) -> ResultTable:
         )
         for (side_px, noise_px), one in clicked.items()
     ]
-    columns = (
-        "images",
-        "noise of a click (sd)",
-        "error (mm)",
-        "heading (deg)",
-        "as stated (mm)",
-        "refused",
-    )
+    columns = ("images", "noise of a click (sd)", "error (mm)", "heading (deg)", "as stated (mm)",
+               "refused")  # fmt: skip
     return ResultTable("Poses of objects from clicks; errors: median / 95 %", columns, rows)
 
 

@@ -2,8 +2,8 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 from rich.console import Console
@@ -11,7 +11,7 @@ from rich.table import Table
 
 from benchmarks.chart import Panel
 from benchmarks.figures import Figure, Requirement
-from dextouch.command_line import write_json_text
+from benchmarks.machine import describe_machine
 
 
 @dataclass(frozen=True)
@@ -27,30 +27,35 @@ class ResultTable:
     num_text_columns: int = 1
 
 
-def cells(*values: Figure | float) -> tuple[str, ...]:
+def cells(*values: Figure | float | int) -> tuple[str, ...]:
     """Texts of values: whole numbers, three digits of others, and the spread of figures."""
     return tuple(one.text() if isinstance(one, Figure) else _digits(one) for one in values)
 
 
-def _digits(value: float) -> str:
+def _digits(value: float | int) -> str:
     return str(value) if isinstance(value, int) else f"{value:.3g}"
 
 
 @dataclass(frozen=True)
 class StageReport:
-    """Results of one run of a stage.
+    """Results of one run of a stage; `packages` are distributions whose versions matter to it.
 
     `data` holds the raw measurements for JSON: every round of every figure.
     """
 
     stage: str
-    machine: dict[str, str]
+    packages: Sequence[str]
     options: dict[str, Any]
     tables: Sequence[ResultTable]
-    panels: Sequence[Panel]
     requirements: Sequence[Requirement]
     data: dict[str, Any]
-    notes: Sequence[str] = field(default=())
+    panels: Sequence[Panel] = ()
+    notes: Sequence[str] = ()
+
+    @cached_property
+    def machine(self) -> dict[str, str]:
+        """Description of the machine."""
+        return describe_machine(self.packages)
 
     @property
     def is_met(self) -> bool:
@@ -107,11 +112,6 @@ def _acceptance(report: StageReport) -> ResultTable:
         for requirement in report.requirements
     ]
     return ResultTable("Acceptance", ("requirement", "measured", "bound", "verdict"), rows)
-
-
-def write_json(report: StageReport, path: Path) -> None:
-    """Write the report to the path of `--json`, creating its folder."""
-    write_json_text(path, report.to_json())
 
 
 def _table(shown: ResultTable) -> Table:

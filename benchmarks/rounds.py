@@ -19,17 +19,10 @@ def interleaved(
     *,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> dict[str, list[T]]:
-    """Measure all subjects once per round, rotating the first one.
+    """Measure all subjects once per round, rotating the first one; returns the results of each.
 
-    Other load of the machine and cache effects then affect all subjects alike.
-
-    Args:
-        subjects: name → function that measures it once, given the round's index.
-        num_rounds: at least 1.
-        on_step: called with a subject's name before it is measured.
-
-    Returns:
-        The results of each subject, round by round.
+    Other load of the machine and cache effects then affect all subjects alike. A subject is given
+    the round's index, `on_step` its name before it is measured.
 
     Raises:
         InvalidInputError: no round.

@@ -2,14 +2,16 @@
 
 import argparse
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 from benchmarks.report import StageReport
 from dextouch.errors import InvalidInputError, UnknownNameError
 
+T = TypeVar("T")
 # Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
@@ -22,25 +24,21 @@ class Stage(Protocol):
         """Add the stage's own options; every stage has --quick, --json, --out and --check."""
 
     def measure(self, options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-        """Run the benchmark.
+        """Run the benchmark; the folder is for temporary files, which the caller removes.
 
-        Args:
-            options: parsed command line.
-            folder: for temporary files; the caller removes it.
-            bar: opens a progress bar.
+        Raises:
+            InvalidInputError: options that measure nothing, such as no round, or do not fit.
+            UnknownNameError: a name in the options that there is not.
+            ConflictError: a command that the stage runs failed.
         """
 
 
+@dataclass(frozen=True)
 class Amounts:
-    """Amounts that a stage measures: their usual values, those of --quick, and options for some.
+    """Amounts that a stage measures by name: usual and quick ones, and options for some."""
 
-    Args:
-        usual: values by name.
-        quick: likewise, with --quick.
-    """
-
-    def __init__(self, usual: dict[str, Any], quick: dict[str, Any]) -> None:
-        self.usual, self.quick = usual, quick
+    usual: dict[str, Any]
+    quick: dict[str, Any]
 
     def add_options(self, parser: argparse.ArgumentParser, **what: str) -> None:
         """Add an option for each of these amounts; the texts say of what."""
@@ -52,12 +50,8 @@ class Amounts:
     def of(self, options: argparse.Namespace, **least: int | float) -> dict[str, Any]:
         """The amounts of a run, those that options set instead of the default ones.
 
-        Args:
-            options: parsed command line.
-            least: smallest amounts other than 1.
-
         Raises:
-            InvalidInputError: an option that is too small.
+            InvalidInputError: an option that is less than 1, or than `least` says.
         """
         plan = {}
         for name, default in (self.quick if options.quick else self.usual).items():
@@ -264,12 +258,19 @@ STAGES = {
 }
 
 
-def load_stage(name: str) -> Stage:
-    """Import the module of a stage.
+def named(kind: str, known: Mapping[str, T], names: str) -> dict[str, T]:
+    """Those of the comma-separated names.
 
     Raises:
-        UnknownNameError: no such stage.
+        UnknownNameError: a name that there is not.
     """
-    if name not in STAGES:
-        raise UnknownNameError("stage", name, list(STAGES))
+    found = [name.strip() for name in names.split(",")]
+    for name in found:
+        if name not in known:
+            raise UnknownNameError(kind, name, list(known))
+    return {name: known[name] for name in found}
+
+
+def load_stage(name: str) -> Stage:
+    """Import the module of a known stage."""
     return cast("Stage", importlib.import_module(STAGES[name].module))

@@ -19,7 +19,6 @@ from benchmarks.evaluator.playing import (
     start_in_twin,
 )
 from benchmarks.figures import Requirement, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.clients import PolicyStart
@@ -36,7 +35,6 @@ from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
-PACKAGES: Final = ("numpy", "mujoco", "torch")
 FIRST_SEED = 45_000
 AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 STEPS: Final = (32, 64)
@@ -57,22 +55,14 @@ def _gain(factor: float, red: float = 1.0, blue: float = 1.0) -> Camera:
     return Camera(lambda image, _: image * factor * np.array([red, 1.0, blue]))
 
 
-def _contrast(factor: float) -> Camera:
-    return Camera(lambda image, _: image.mean() + factor * (image - image.mean()))
-
-
 def _mild(image: np.ndarray, draw: np.random.Generator) -> np.ndarray:
     changed = 0.5 + 0.9 * (image * 1.1 * np.array([1.06, 1.0, 0.94]) - 0.5)
     changed = gaussian_filter(changed, (0.4, 0.4, 0)) + draw.normal(scale=0.01, size=image.shape)
-    return _jpeg(60)(changed.clip(0, 1), draw)
+    return _jpeg(changed.clip(0, 1), 60)
 
 
-def _jpeg(quality: int) -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:
-    def compressed(image: np.ndarray, draw: np.random.Generator) -> np.ndarray:
-        del draw
-        return decode_jpeg(encode_jpeg(_pixels(image), quality=quality)) / 255.0
-
-    return compressed
+def _jpeg(image: np.ndarray, quality: int) -> np.ndarray:
+    return decode_jpeg(encode_jpeg(_pixels(image), quality=quality)) / 255.0
 
 
 CAMERAS: Final[dict[str, Camera]] = {
@@ -80,10 +70,10 @@ CAMERAS: Final[dict[str, Camera]] = {
     "brighter by 15 %": _gain(1.15),
     "darker by 15 %": _gain(0.85),
     "warmer": _gain(1.0, red=1.12, blue=0.88),
-    "contrast less by 20 %": _contrast(0.8),
+    "contrast less by 20 %": Camera(lambda image, _: image.mean() + 0.8 * (image - image.mean())),
     "blurred by 0.7 px": Camera(lambda image, _: gaussian_filter(image, (0.7, 0.7, 0))),
     "noise of 2 %": Camera(lambda image, draw: image + draw.normal(scale=0.02, size=image.shape)),
-    "JPEG of quality 30": Camera(_jpeg(30)),
+    "JPEG of quality 30": Camera(lambda image, _: _jpeg(image, 30)),
     "shifted by a known pixel": Camera(lambda image, _: image, (1, -1)),
     "all mild ones together": Camera(_mild, (1, 0)),
 }
@@ -111,13 +101,7 @@ class _Read:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Start the state model from all kinds of starts of every task.
-
-    Raises:
-        InvalidInputError: no start.
-        UnknownNameError: no such task.
-    """
-    del folder
+    """Start the state model from all kinds of starts of every task."""
     count = AMOUNTS.of(options)["starts"]
     tasks = named_tasks(options.tasks.split(","))
     judged = _Judged(options.world, SuccessClassifier.load(options.probe))
@@ -129,25 +113,23 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             for task in tasks:
                 by_kind = found.setdefault(task, {})
                 for seed in range(options.first_seed, options.first_seed + count):
-                    reads = judged.usual(twin, task, seed) if width == 1.0 else {}
-                    if width != 1.0 and task != "open_drawer":
+                    reads = {}
+                    if width == 1.0:
+                        reads = judged.usual(twin, task, seed)
+                        step(f"{task} {seed}")
+                    elif task != "open_drawer":
                         name = f"objects {width:g} times as wide"
                         reads = {name: judged.played(twin, task, seed)}
                     for kind, read in reads.items():
                         by_kind.setdefault(kind, []).append(read)
-                    if width == 1.0:
-                        step(f"{task} {seed}")
     return StageReport(
         stage="starts",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco", "torch"),
         options={"starts": count, "first seed": options.first_seed},
         tables=[_errors(found), _outcomes(found)],
-        panels=[],
         requirements=_requirements(found),
         data={
-            task: {
-                kind: [r.error_mm.round(2).tolist() for r in reads] for kind, reads in of.items()
-            }
+            task: {k: [r.error_mm.round(2).tolist() for r in reads] for k, reads in of.items()}
             for task, of in found.items()
         },
     )

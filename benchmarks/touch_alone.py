@@ -10,17 +10,15 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.figures import at_least
-from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import clicked_image
 from benchmarks.object_touch import GRIPS, described_objects
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.reproduction.steps import Step, run
+from benchmarks.reproduction.steps import Step, run, step_with_result
 from benchmarks.stages import Bar
 from dextouch.episodes import EpisodeGrid, EpisodeStore, split_of
 from dextouch.errors import ConflictError
 from dextouch.schemas import EpisodeClicks, ObjectClicks, SceneObject
 
-PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 NUM_TAKES: Final = 84
 _OBJECTS, _LAB, _RECORDED = "objects.json", "lab", "recorded"
 _MODEL, _JUDGE, _SCORES = "model.safetensors", "judge.safetensors", "scores.json"
@@ -42,14 +40,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record takes, leave their objects out, train on them, and replay held-out takes.
-
-    Raises:
-        ConflictError: a command failed.
-    """
-    del folder, bar
+    """Record takes, leave their objects out, train on them, and replay held-out takes."""
     keep: Path = options.keep
-    data = _step(
+    data = step_with_result(
         _RECORDED,
         f"train data --store {_RECORDED}/store --tasks {options.tasks} --count {options.takes} "
         f"--images 4 --jobs {options.jobs}",
@@ -63,7 +56,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     trust: dict[str, dict[str, Any]] = scores["trust"]
     return StageReport(
         stage="touch",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={
             "takes": options.takes,
             "tasks": options.tasks,
@@ -71,20 +64,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "init": options.init is not None,
         },
         tables=[_table(trust)],
-        panels=[],
         requirements=[
             at_least(f"AUC, {task}", float(one.get("auc") or "nan"), 0.80)
             for task, one in trust.items()
         ],
         data={"trust": trust},
     )
-
-
-def _step(
-    name: str, command: str, made: str, needs: tuple[Step, ...] = (), exits: tuple[int, ...] = (0,)
-) -> Step:
-    command += f" --json {name}/result.json"
-    return Step(name, command, (made, "result.json"), needs, exits=exits)
 
 
 def _run(steps: list[Step], keep: Path) -> None:
@@ -131,7 +116,7 @@ def _strip(keep: Path, num_clicked: int) -> None:
 def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:
     reader, core, judge, drawing_s = _QUICK_STEPS if options.quick else _STEPS
     base = "world-model" if options.init is None else f"adapt --init {options.init.resolve()}"
-    model = _step(
+    model = step_with_result(
         "model",
         f"train {base} --episodes {_LAB} --clicks {_OBJECTS} --splits A,B --heldout-share 0.1 "
         f"--reader.num-steps {reader} --core.num-steps {core} --drawing.cpu-budget-s {drawing_s} "
@@ -139,14 +124,14 @@ def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:
         _MODEL,
         needs=(data,),
     )
-    imagined = _step(
+    imagined = step_with_result(
         "imagined",
         f"train imagined --episodes {_LAB} --store imagined/store --checkpoint model/{_MODEL} "
         f"--jobs {options.jobs}",
         "store",
         needs=(model,),
     )
-    judged = _step(
+    judged = step_with_result(
         "judge",
         f"train judge --episodes {_LAB},imagined/store --splits A,B --output judge/{_JUDGE} "
         f"--training.num-training-steps {judge} --training.held-out-share 0.2 "

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -21,10 +22,11 @@ import numpy as np
 
 import dextouch
 import services
+from benchmarks.rollouts.worlds import resting_actions
 from dextouch.clients import EpisodeStoreClient, PolicyStart, Rollout, RolloutClient
 from dextouch.clocks import OnlineClock
 from dextouch.command_line import add_json, write_result
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation, SaveTake, TakePrompt
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.acquisition.clock import VirtualClock
@@ -49,11 +51,7 @@ _PREFIXES = tuple(f"{root}/" for root in _ROOTS)
 
 @dataclass
 class Walk:
-    """Files and functions that a piece of data passed through.
-
-    Attributes:
-        calls: number of calls by (thread, file, function).
-    """
+    """Files and functions that data passed through: calls by (thread, file, function)."""
 
     name: str
     calls: Counter[tuple[str, str, str]] = field(default_factory=Counter)
@@ -87,18 +85,13 @@ class Tracer:
         self.walk = Walk(name)
         self.is_on = False
         self._threads = threads
-        self._known: dict[CodeType, tuple[str, str] | None] = {}
         self._lock = threading.Lock()
 
     def __call__(self, frame: FrameType, event: str, argument: object) -> None:
         """See `sys.setprofile`."""
-        del argument
         if event != "call" or not self.is_on:
             return
-        code = frame.f_code
-        if code not in self._known:
-            self._known[code] = _place(code)
-        place = self._known[code]
+        place = _place(frame.f_code)
         if place is None:
             return
         thread = threading.current_thread().name
@@ -128,6 +121,7 @@ class Tracer:
             self.is_on = False
 
 
+@cache
 def _place(code: CodeType) -> tuple[str, str] | None:
     """File and function of one of our functions, except those of mock devices."""
     prefix = next((p for p in _PREFIXES if code.co_filename.startswith(p)), None)
@@ -140,12 +134,7 @@ def _place(code: CodeType) -> tuple[str, str] | None:
 
 
 def packet_to_spool(stream: str, *, links: MockLinks | None = None) -> Walk:
-    """From the read of a packet or image to its record in the spool, in the reader's thread.
-
-    Args:
-        stream: `tactile_left` or a camera's.
-        links: how the mock device is connected.
-    """
+    """From the read of a packet or image to its record in the spool, in the reader's thread."""
     device = stream.replace("tactile_", "glove_")
     tracer = Tracer(f"{stream} → spool", threads=f"read-{device}")
     streams = [s for s in pattern_streams(TAKE_S) if s.descriptor.name == stream]
@@ -188,8 +177,7 @@ def upload() -> Walk:
 def action_chunk_walk(world: World[Any] | None = None) -> Walk:
     """From a policy's chunk to its observation, on both sides of HTTP.
 
-    Args:
-        world: world to serve; default: the baseline, which computes nothing.
+    The default world is the baseline, which computes nothing.
     """
     shown = world or CopyFirstWorld(tasks=(TASK,))
     tracer = Tracer(f"action chunk, {shown.description.name}")
@@ -212,23 +200,16 @@ def action_chunk_walk(world: World[Any] | None = None) -> Walk:
 
 
 def _started(client: RolloutClient, world: World[Any]) -> Rollout:
-    description = world.description
-    task = description.tasks[0]
+    description, task = world.description, world.description.tasks[0]
     init = None
     if "task_seed" not in description.starts_from:
-        holding = np.zeros((1, 67))
-        for part in POSE_SLICES:
-            holding[:, part] = IDENTITY_POSE_9D
         size = (1, description.image_height_px, description.image_width_px, 3)
         first = Observation(
             first_step=0,
             images={camera: np.zeros(size, dtype=np.uint8) for camera in description.cameras},
             tactile_kpa=np.zeros((1, 2, 320), dtype=np.float32),
-            action_reached=holding,
+            action_reached=resting_actions(1),
             reached_is_measured=True,
-            object_poses=None,
-            success=None,
-            uncertainty=None,
         )
         init = (first, AnchorPoses(np.eye(4), np.eye(4), np.eye(4)), np.eye(3))
     return client.start(world="world", task=task, seed=0, instruction=task, init=init)
@@ -256,9 +237,8 @@ def clock_stamp() -> Walk:
     with tracer.installed(), tracer.on():
         for index in range(600):
             t_device_ns = index * 16_666_667
-            clock.update(
-                t_host_ns=10**15 + t_device_ns + index % 7 * 10**5, t_device_ns=t_device_ns
-            )
+            t_host_ns = 10**15 + t_device_ns + index % 7 * 10**5
+            clock.update(t_host_ns=t_host_ns, t_device_ns=t_device_ns)
     return tracer.walk
 
 

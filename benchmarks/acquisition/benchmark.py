@@ -11,12 +11,10 @@ from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.speed import measure_speed
 from benchmarks.acquisition.tables import panels, requirements, tables
 from benchmarks.figures import Figure
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 
 LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
-PACKAGES = ("numpy", "pyserial")
 AMOUNTS = Amounts(
     usual={"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60},
     quick={"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5},
@@ -38,12 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Decode from a noisy line, time every decoder and driver, read eight gloves.
-
-    Raises:
-        InvalidInputError: an invalid number.
-    """
-    del folder
+    """Decode from a noisy line, time every decoder and driver, read eight gloves."""
     plan = AMOUNTS.of(options, packets=5, seconds=1e-3)
     seed = options.seed
     families = make_families()
@@ -51,9 +44,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         judgements = [
             found
             for family in families
-            for found in judge(
-                family, list(family.ways), LINE, plan["packets"], seed=seed, on_block=step
-            )
+            for found in judge(family, LINE, plan["packets"], seed=seed, on_block=step)
         ]
     splits = {
         family.name: count_split_differences(family, LINE, plan["splits"], seed=seed)
@@ -74,7 +65,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     share = Figure.of([100 * run["cpu_s"] / run["seconds"] / NUM_STREAMS for run in runs])
     return StageReport(
         stage="acquisition",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "pyserial"),
         options={**plan, "seed": seed},
         tables=tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
         panels=panels(judgements, speeds),

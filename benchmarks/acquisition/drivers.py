@@ -12,10 +12,7 @@ from benchmarks.figures import Figure
 from benchmarks.rounds import every_round, interleaved
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.camera import (
-    CameraDecoder,
-    camera_descriptor,
-)
+from services.acquisition.devices.camera import CameraDecoder, camera_descriptor
 from services.acquisition.devices.finger_tracker import (
     BridgeFingerTrackerDecoder,
     FingerTrackerDecoder,
@@ -78,7 +75,21 @@ class DeviceTalk:
 def make_talks(*, seed: int) -> list[DeviceTalk]:
     """One device of each kind, without faults."""
     rng = np.random.default_rng(seed)
-    return [*_gloves(rng), *_trackers(rng), _robot(rng), *_cameras()]
+    gloves = [
+        DeviceTalk(
+            f"glove {family.name}",
+            family.decoder,
+            [[family.make(index, rng)] for index in range(NUM_PACKETS)],
+        )
+        for family in make_families()
+    ]
+    trackers = _trackers(rng)
+    streams = {
+        name: _stream(robot_descriptor(name), rng.uniform(-1.0, 1.0, size))
+        for name, size in STREAM_SIZES.items()
+    }
+    robot = DeviceTalk("robot state", RobotStateDecoder, _packets(RobotStateSource(streams)))
+    return [*gloves, *trackers, robot, *_cameras()]
 
 
 def measure_drivers(
@@ -107,17 +118,6 @@ def _once(talk: DeviceTalk) -> float:
     start_s = time.thread_time()
     decode_all(talk, decoder)
     return (time.thread_time() - start_s) / len(talk.packets) * 1e6
-
-
-def _gloves(rng: np.random.Generator) -> list[DeviceTalk]:
-    return [
-        DeviceTalk(
-            f"glove {family.name}",
-            family.decoder,
-            [[family.make(index, rng)] for index in range(NUM_PACKETS)],
-        )
-        for family in make_families()
-    ]
 
 
 def _trackers(rng: np.random.Generator) -> list[DeviceTalk]:
@@ -151,14 +151,6 @@ def _trackers(rng: np.random.Generator) -> list[DeviceTalk]:
             [bridged_poses.hello],
         ),
     ]
-
-
-def _robot(rng: np.random.Generator) -> DeviceTalk:
-    streams = {
-        name: _stream(robot_descriptor(name), rng.uniform(-1.0, 1.0, size))
-        for name, size in STREAM_SIZES.items()
-    }
-    return DeviceTalk("robot state", RobotStateDecoder, _packets(RobotStateSource(streams)))
 
 
 def _cameras() -> list[DeviceTalk]:

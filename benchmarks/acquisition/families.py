@@ -8,11 +8,7 @@ import numpy as np
 
 from dextouch.streams import Sample
 from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
-from services.acquisition.devices.tactile_glove import (
-    MAGIC,
-    PAYLOAD_BYTES,
-    TactileGloveDecoder,
-)
+from services.acquisition.devices.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
 from services.acquisition.devices.wuji_glove import (
     CRC_OFFSET,
     HEAD,
@@ -152,7 +148,6 @@ def _make_wuji(index: int, rng: np.random.Generator) -> bytes:
 
 
 def _make_justfloat(index: int, rng: np.random.Generator) -> bytes:
-    del index
     counts = rng.integers(0, round(FULL_SCALE) + 1, NUM_VALUES)
     counts[rng.random(NUM_VALUES) >= TOUCHED_SHARE] = 0
     return encode_justfloat(counts.astype(np.float32))

@@ -40,7 +40,6 @@ class Judgement:
 
 def judge(
     family: Family,
-    ways: Sequence[str],
     line: Line,
     num_packets: int,
     *,
@@ -53,9 +52,9 @@ def judge(
     synchronize, and the last one may still be pending.
     """
     rng = np.random.default_rng(seed)
-    feeds = {way: family.ways[way]() for way in ways}
-    seen = {way: np.zeros(num_packets, dtype=np.bool_) for way in ways}
-    counts = {way: [0, 0] for way in ways}
+    feeds = {way: make() for way, make in family.ways.items()}
+    seen = {way: np.zeros(num_packets, dtype=np.bool_) for way in feeds}
+    counts = {way: [0, 0] for way in feeds}
     touched = np.zeros(num_packets, dtype=np.bool_)
     index_of: dict[int, int] = {}
     for first in range(0, num_packets, BLOCK_PACKETS):
@@ -84,7 +83,7 @@ def judge(
             counts[way][1],
             int((~seen[way] & ~touched)[judged].sum()),
         )
-        for way in ways
+        for way in feeds
     ]
 
 

@@ -29,11 +29,9 @@ MODULE = "benchmarks.acquisition.ptys"
 
 
 def run_ptys(seconds: float) -> dict[str, float]:
-    """Read eight gloves in a fresh process.
+    """Read eight gloves in a fresh process: `seconds` measured, `cpu_s` of all readers, and so on.
 
-    Returns:
-        `seconds` measured, `cpu_s` of all readers, `packets` that arrived in that time and
-        `errors` of any kind.
+    `packets` are those that arrived in that time, `errors` those of any kind.
 
     Raises:
         DeviceError: the process failed.
@@ -55,7 +53,15 @@ def read_all(seconds: float) -> dict[str, float]:
     pairs = [os.openpty() for _ in range(NUM_STREAMS)]
     for _, slave in pairs:
         tty.setraw(slave)
-    drivers = [_driver(index, os.ttyname(slave)) for index, (_, slave) in enumerate(pairs)]
+    drivers = [
+        Driver(
+            f"glove_{index}",
+            transport=SerialTransport(partial(str, os.ttyname(slave))),
+            decoder=TactileGloveDecoder("left"),
+            clock=StationClock(),
+        )
+        for index, (_, slave) in enumerate(pairs)
+    ]
     for driver in drivers:
         driver.open()
     masters = [master for master, _ in pairs]
@@ -98,15 +104,6 @@ def send_all(seconds: float, masters: Sequence[int]) -> None:
             time.sleep(max(0.0, due_s - time.monotonic()))
             packet = Packet(VERSION, SOURCES["left"], tick, tick, rng.bytes(720))
             os.write(master, encode_packet(MAGIC, packet))
-
-
-def _driver(index: int, port: str) -> Driver:
-    return Driver(
-        f"glove_{index}",
-        transport=SerialTransport(partial(str, port)),
-        decoder=TactileGloveDecoder("left"),
-        clock=StationClock(),
-    )
 
 
 def _read(driver: Driver, stopping: threading.Event) -> None:

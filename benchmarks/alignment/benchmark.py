@@ -5,15 +5,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.alignment.compare import compare
-from benchmarks.alignment.recordings import RecordedTake, record
+from benchmarks.alignment.recordings import record
 from benchmarks.alignment.tables import panels, requirements, tables
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_retargeter import warm_up
 
-PACKAGES = ("numpy", "numba", "scipy", "zstandard")
 QUICK_SECONDS, USUAL_SECONDS = "3", "10,60"
 AMOUNTS = Amounts(usual={"rounds": 5}, quick={"rounds": 1})
 # Shorter takes have no stretch of 17 steps.
@@ -32,20 +30,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record takes, then align each alternately with every method.
-
-    Raises:
-        InvalidInputError: a take that is too short, or no round.
-    """
+    """Record takes, then align each alternately with every method."""
     lengths_s = _lengths_s(options)
     num_rounds = AMOUNTS.of(options)["rounds"]
-    takes = _record(lengths_s, options.seed, folder, bar)
+    takes = []
+    with bar("recording", len(lengths_s)) as step:
+        for seconds in lengths_s:
+            step(f"{seconds:g} s")
+            takes.append(record(seconds, options.seed, folder / f"take_{seconds:g}s"))
     warm_up()
     results = [compare(take, num_rounds, folder, bar=bar) for take in takes]
     longest = results[-1]
     return StageReport(
         stage="alignment",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "numba", "scipy", "zstandard"),
         options={"seconds": lengths_s, "rounds": num_rounds, "seed": options.seed},
         tables=tables(results),
         panels=panels(longest),
@@ -58,15 +56,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "path delays have errors of 0.2 ms (sigma); the transfer over HTTP is not included",
         ],
     )
-
-
-def _record(lengths_s: list[float], seed: int, folder: Path, bar: Bar) -> list[RecordedTake]:
-    takes = []
-    with bar("recording", len(lengths_s)) as step:
-        for seconds in lengths_s:
-            step(f"{seconds:g} s")
-            takes.append(record(seconds, seed, folder / f"take_{seconds:g}s"))
-    return takes
 
 
 def _lengths_s(options: argparse.Namespace) -> list[float]:

@@ -20,7 +20,6 @@ from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization import STAGE_BEGINS
 from services.alignment.synchronization.grid_actions import (
     REQUIRED,
     GriddedStreams,
@@ -46,8 +45,6 @@ STEPS = (STORING, FITS, CALIBRATION, "resampling", "retargeting", "writing")
 OPTIONS = AlignmentOptions()
 # Arrival times are interpolated across every gap.
 ANY_GAP_NS = 10**12
-
-OnStage = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -81,14 +78,7 @@ class _Run:
 def compare(
     take: RecordedTake, num_rounds: int, folder: Path, *, bar: Bar
 ) -> dict[str, MethodResult]:
-    """Align a take alternately with every method, each time in a new store.
-
-    Args:
-        take: in the spool.
-        num_rounds: at least 1; errors are those of the first round.
-        folder: for the stores; they are removed.
-        bar: opens a progress bar.
-    """
+    """Align a take of the spool alternately with every method, each time in a new store."""
     subjects = {name: partial(_run, take, name, folder / "store") for name in METHODS}
     with bar(f"take of {take.seconds:g} s", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
@@ -124,7 +114,8 @@ def _run(recorded: RecordedTake, method: str, folder: Path, round_index: int) ->
     end_s, wall_s = time.process_time(), time.perf_counter() - wall_s
     # After the alignment, when the same files were just read.
     fits_s = _clock_fits_s(store.recording(recording_id))
-    edges = [begin_s, *(marks[stage] for stage in list(STAGE_BEGINS)[1:]), end_s]
+    # These takes have no objects, whose stage therefore never begins.
+    edges = [begin_s, *(marks[stage] for stage in ("placing", "retargeting", "writing")), end_s]
     dating_s, *others_s = np.diff(edges).tolist()
     times = [storing_s, fits_s if method == OURS else 0.0, max(dating_s - fits_s, 0.0), *others_s]
     errors = {} if round_index else _errors(store, recorded, episode_id)
@@ -141,18 +132,13 @@ def _clock_fits_s(recording: RecordingReader) -> float:
 
 
 def align_by_arrivals(
-    store: EpisodeStore, recording_id: str, on_stage: OnStage, *, nearest: bool
+    store: EpisodeStore, recording_id: str, on_stage: Callable[[str], None], *, nearest: bool
 ) -> str:
-    """Align a recording as if every sample had been taken when it arrived.
+    """Align a recording of a person as if every sample had been taken when it arrived.
 
     There is no clock model, no path delay and no gap; values are converted and hands retargeted as
-    in the service. Returns the episode's id.
-
-    Args:
-        store: of recording and episode.
-        recording_id: of a take of a person.
-        on_stage: called at the beginning of each stage.
-        nearest: steps take the nearest sample instead of interpolating.
+    in the service. With `nearest`, steps take the nearest sample instead of interpolating. Returns
+    the episode's id.
     """
     recording = store.recording(recording_id)
     # The clock fits inside are timed separately and subtracted.

@@ -43,11 +43,6 @@ def record(seconds: float, seed: int, folder: Path) -> RecordedTake:
     The devices have the clock drift, jitter, delays, noise and losses of `FaultScript.first_light`,
     and the gloves are calibrated with a separate take. The hands are those of the robot, so that
     the true joint angles are known; only the ground truth contains them, as `joints_measured`.
-
-    Args:
-        seconds: length of the take.
-        seed: of motions, noise and faults.
-        folder: for truth and spool.
     """
     store = EpisodeStore(folder / "truth")
     rng = np.random.default_rng([seed, 1])

@@ -8,12 +8,10 @@ from benchmarks.calibration.cameras import measure_cameras
 from benchmarks.calibration.compare import compare
 from benchmarks.calibration.refusals import try_scenes
 from benchmarks.calibration.tables import notes, panels, requirements, tables
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.simulated.board_scenes import Motion, make_scene
 from benchmarks.stages import Amounts, Bar
 
-PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 AMOUNTS = Amounts(
     usual={"seeds": 100, "camera_seeds": 20, "scenes": 20, "healthy": 50},
     quick={"seeds": 4, "camera_seeds": 2, "scenes": 2, "healthy": 2},
@@ -28,12 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Solve scenes of known mounts and cameras with every method, then degenerate scenes.
-
-    Raises:
-        InvalidInputError: no seed.
-    """
-    del folder
+    """Solve scenes of known mounts and cameras with every method, then degenerate scenes."""
     plan = AMOUNTS.of(options)
     motion = Motion(num_views=options.views)
     with bar("making scenes", plan["seeds"]) as step:
@@ -47,7 +40,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     refusals = try_scenes(plan["scenes"], plan["healthy"], bar)
     return StageReport(
         stage="calibration",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "scipy", "opencv-contrib-python-headless"),
         options={**plan, "motion": asdict(motion)},
         tables=tables(results, cameras, refusals),
         panels=panels(results),

@@ -20,15 +20,10 @@ MIN_SEEDS = 10
 class CameraResult:
     """Cameras calibrated from `num_views` views, in the order of the seeds.
 
-    Attributes:
-        num_views: of each.
-        focal_error: |df| / f.
-        centre_px: distance of the principal point.
-        rms_px: calibration residual, which is not a measure of accuracy.
-        coverage: share of the image covered by corners.
-        ms: processor time of this thread.
-        sigma_over_spread: parameter → reported sigma (RMS over the seeds) over the spread of the
-            errors; ideally 1. Empty for few seeds.
+    `focal_error` is |df| / f, `centre_px` the distance of the principal point, `rms_px` the
+    residual, which is no measure of accuracy, `coverage` the share of the image that corners cover,
+    `ms` processor time of this thread. `sigma_over_spread` is, by parameter, the reported sigma
+    (RMS over the seeds) over the spread of the errors; ideally 1, empty for few seeds.
     """
 
     num_views: int

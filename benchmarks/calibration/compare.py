@@ -51,11 +51,18 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
     gc.collect()
     with bar("hand-eye", len(METHODS) * len(scenes)) as step:
         rounds = interleaved(
-            {method.name: partial(_solve_once, method, scenes) for method in METHODS},
+            {method.name: partial(_score_at, method, scenes) for method in METHODS},
             len(scenes),
             on_step=step,
         )
-    return {name: _result(name, solved) for name, solved in rounds.items()}
+    results = {}
+    for name, solved in rounds.items():
+        columns: dict[str, Any] = {
+            key: None if None in values else Figure.of(values)
+            for key, values in zip(Solved._fields, zip(*solved, strict=True), strict=True)
+        }
+        results[name] = MethodResult(name, len(solved), **columns)
+    return results
 
 
 def score(method: Method, scene: Scene) -> Solved:
@@ -83,16 +90,8 @@ def score(method: Method, scene: Scene) -> Solved:
     )
 
 
-def _solve_once(method: Method, scenes: Sequence[Scene], round_index: int) -> Solved:
-    return score(method, scenes[round_index])
-
-
-def _result(name: str, solved: Sequence[Solved]) -> MethodResult:
-    columns: dict[str, Any] = {
-        key: None if None in values else Figure.of(values)
-        for key, values in zip(Solved._fields, zip(*solved, strict=True), strict=True)
-    }
-    return MethodResult(name, len(solved), **columns)
+def _score_at(method: Method, scenes: Sequence[Scene], index: int) -> Solved:
+    return score(method, scenes[index])
 
 
 def not_worse_share(
@@ -100,8 +99,7 @@ def not_worse_share(
 ) -> tuple[float, float]:
     """Share of seeds with an error of at most the rival's plus a tolerance in our sigmas.
 
-    Returns:
-        Share by rotation, by translation.
+    Returns the share by rotation and that by translation.
 
     Raises:
         InvalidInputError: ours has no sigma.

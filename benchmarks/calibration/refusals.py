@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,16 +19,11 @@ RIVALS = ("tsai", "park", "daniilidis", "li")
 
 @dataclass(frozen=True)
 class SceneResult:
-    """One kind of scene.
+    """One kind of scene, and how ours and the other methods treat it.
 
-    Attributes:
-        name: what is wrong with it.
-        is_healthy: whether it should be solved.
-        num_seeds: number of scenes.
-        num_refused: number of refusals by ours.
-        num_named: number of refusals that name axes to add.
-        cause: message of the first refusal.
-        rivals: other method → median error, or that it refuses or returns NaN.
+    Of `num_refused` refusals by ours, `num_named` name axes to add, and `cause` is the message of
+    the first; `rivals` has the median errors of the other methods, or that they refuse or return
+    NaN.
     """
 
     name: str
@@ -43,12 +39,11 @@ def scene_makers() -> dict[str, tuple[Maker, bool]]:
     """Kind of scene → factory by seed, and whether it is healthy."""
     makers: dict[str, tuple[Maker, bool]] = {"healthy": (make_scene, True)}
     for axis, axes in TURN_AXES.items():
-        makers[f"turns about the camera's {axis} only"] = (
-            _maker(Motion(tilt_deg=40.0, axes=axes)),
-            False,
-        )
-    makers["turns of 4 degrees at most"] = (_maker(Motion(tilt_deg=4.0)), False)
-    makers["no turns"] = (_maker(Motion(tilt_deg=0.0)), False)
+        make = partial(make_scene, motion=Motion(tilt_deg=40.0, axes=axes))
+        makers[f"turns about the camera's {axis} only"] = (make, False)
+    small, none = (partial(make_scene, motion=Motion(tilt_deg=tilt)) for tilt in (4.0, 0.0))
+    makers["turns of 4 degrees at most"] = (small, False)
+    makers["no turns"] = (none, False)
     makers["one view, repeated"] = (_repeating(1), False)
     makers["two views, repeated"] = (_repeating(2), False)
     return makers
@@ -69,8 +64,17 @@ def try_scenes(num_seeds: int, num_healthy: int, bar: Bar) -> list[SceneResult]:
 
 
 def _try(name: str, scenes: list[Scene], ours: Method, *, is_healthy: bool) -> SceneResult:
-    causes = [cause for scene in scenes if (cause := _refusal(ours, scene)) is not None]
-    named = [cause for cause in causes if _names_axes(cause)]
+    causes: list[InvalidInputError] = []
+    for scene in scenes:
+        try:
+            ours.solve(scene)
+        except InvalidInputError as refusal:
+            causes.append(refusal)
+    named = [
+        cause
+        for cause in causes
+        if isinstance(cause, DegenerateMotionError) and cause.details["missing_axes"]
+    ]
     return SceneResult(
         name,
         is_healthy,
@@ -80,18 +84,6 @@ def _try(name: str, scenes: list[Scene], ours: Method, *, is_healthy: bool) -> S
         cause=causes[0].message if causes else "",
         rivals={m.name: _what_it_does(m, scenes) for m in METHODS if m.name in RIVALS},
     )
-
-
-def _names_axes(cause: InvalidInputError) -> bool:
-    return isinstance(cause, DegenerateMotionError) and bool(cause.details["missing_axes"])
-
-
-def _refusal(method: Method, scene: Scene) -> InvalidInputError | None:
-    try:
-        method.solve(scene)
-    except InvalidInputError as refusal:
-        return refusal
-    return None
 
 
 def _what_it_does(method: Method, scenes: list[Scene]) -> str:
@@ -109,10 +101,6 @@ def _what_it_does(method: Method, scenes: list[Scene]) -> str:
     degrees = np.median([one.error_deg for one in solved])
     millimetres = np.median([one.error_mm for one in solved])
     return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {told}" if told else "")
-
-
-def _maker(motion: Motion) -> Maker:
-    return lambda seed: make_scene(seed, motion)
 
 
 def _repeating(num_views: int) -> Maker:

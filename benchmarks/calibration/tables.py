@@ -9,7 +9,7 @@ from benchmarks.calibration.compare import MethodResult, Results, not_worse_shar
 from benchmarks.calibration.refusals import RIVALS, SceneResult
 from benchmarks.calibration.rivals import OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement, Sense, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most
 from benchmarks.report import ResultTable
 
 PROMISED_VIEWS = 25
@@ -114,36 +114,42 @@ def requirements(
     results: Results, cameras: Sequence[CameraResult], refusals: Sequence[SceneResult]
 ) -> list[Requirement]:
     """Build the table of requirements; some may be unmeasured in this run."""
+    known, park = results[OURS_SIZE_KNOWN], results[PARK]
+    shares = not_worse_share(known, park, tolerance_sigmas=TOLERANCE_SIGMAS)
+    worse = f"seeds not worse than Park by {TOLERANCE_SIGMAS:g} sigma"
+    promised = [camera for camera in cameras if camera.num_views == PROMISED_VIEWS]
+    focal = promised[0].focal_error.median if promised else None
+    ratios = promised[0].sigma_over_spread.values() if promised else ()
+    least, most = min(ratios, default=None), max(ratios, default=None)
+    what = f"intrinsics, {PROMISED_VIEWS} views"
+    bad = [scene for scene in refusals if not scene.is_healthy]
+    num_bad = sum(scene.num_seeds for scene in bad)
+    axes_named = sum(scene.num_named for scene in bad) / num_bad if num_bad else None
+    healthy = [scene.num_refused for scene in refusals if scene.is_healthy]
     return [
         *_mount(results[OURS]),
         *_mount(results[OURS_POSES]),
-        *_against_park(results),
-        *_camera(cameras),
-        *_refused(refusals),
+        *(
+            at_least(f"hand-eye, {kind}: {worse}", share, 0.9)
+            for kind, share in zip(("rotation", "translation"), shares, strict=True)
+        ),
+        at_most(f"{what}: focal error, median", focal, 0.003),
+        at_least(f"{what}: sigma over spread, smallest of 9", least, 0.5),
+        at_most(f"{what}: sigma over spread, largest of 9", most, 2.0),
+        at_least("degenerate scenes refused, axes to add named", axes_named, 1.0),
+        at_most("healthy scenes refused", float(sum(healthy)) if healthy else None, 0.0),
     ]
 
 
 def _mount(ours: MethodResult) -> list[Requirement]:
+    what = f"hand-eye, {ours.name}"
     nees = None if ours.nees is None else float(np.mean(ours.nees.values))
-    rows: list[tuple[str, float | None, Sense, float, str]] = [
-        ("rotation, median", ours.error_deg.median, "at most", 0.06, "deg"),
-        ("translation, median", ours.error_mm.median, "at most", 0.8, "mm"),
-        ("NEES by degree of freedom", nees, "at least", 0.5, ""),
-        ("NEES by degree of freedom", nees, "at most", 2.0, ""),
-        ("processor time, median", ours.ms.median, "at most", 100.0, "ms"),
-    ]
-    return [Requirement(f"hand-eye, {ours.name}: {row[0]}", *row[1:]) for row in rows]
-
-
-def _against_park(results: Results) -> list[Requirement]:
-    share = not_worse_share(
-        results[OURS_SIZE_KNOWN], results[PARK], tolerance_sigmas=TOLERANCE_SIGMAS
-    )
     return [
-        at_least(
-            f"hand-eye, {kind}: seeds not worse than Park by {TOLERANCE_SIGMAS:g} sigma", value, 0.9
-        )
-        for kind, value in zip(("rotation", "translation"), share, strict=True)
+        at_most(f"{what}: rotation, median", ours.error_deg.median, 0.06, "deg"),
+        at_most(f"{what}: translation, median", ours.error_mm.median, 0.8, "mm"),
+        at_least(f"{what}: NEES by degree of freedom", nees, 0.5),
+        at_most(f"{what}: NEES by degree of freedom", nees, 2.0),
+        at_most(f"{what}: processor time, median", ours.ms.median, 100.0, "ms"),
     ]
 
 
@@ -158,26 +164,3 @@ def notes(results: Results) -> list[str]:
             "even the better estimator does not have the smaller error in every seed."
         )
     return told
-
-
-def _camera(cameras: Sequence[CameraResult]) -> list[Requirement]:
-    found = [camera for camera in cameras if camera.num_views == PROMISED_VIEWS]
-    focal = found[0].focal_error.median if found else None
-    ratios = list(found[0].sigma_over_spread.values()) if found else []
-    what = f"intrinsics, {PROMISED_VIEWS} views"
-    return [
-        at_most(f"{what}: focal error, median", focal, 0.003),
-        at_least(f"{what}: sigma over spread, smallest of 9", min(ratios) if ratios else None, 0.5),
-        at_most(f"{what}: sigma over spread, largest of 9", max(ratios) if ratios else None, 2.0),
-    ]
-
-
-def _refused(refusals: Sequence[SceneResult]) -> list[Requirement]:
-    bad = [scene for scene in refusals if not scene.is_healthy]
-    num_bad = sum(scene.num_seeds for scene in bad)
-    named = sum(scene.num_named for scene in bad) / num_bad if num_bad else None
-    healthy = [scene.num_refused for scene in refusals if scene.is_healthy]
-    return [
-        at_least("degenerate scenes refused, axes to add named", named, 1.0),
-        at_most("healthy scenes refused", float(sum(healthy)) if healthy else None, 0.0),
-    ]

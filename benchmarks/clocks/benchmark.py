@@ -1,17 +1,17 @@
 """Entry point of the benchmark stage `clocks`."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.clocks.compare import compare, compare_stampless
-from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STOP_SCENES, find_scene
+from benchmarks.clocks.compare import STAMPLESS, compare
+from benchmarks.clocks.rivals import OFFLINE, ONLINE
+from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STAMPLESS_SCENES, STOP_SCENES
 from benchmarks.clocks.scores import WARM_UP_S
 from benchmarks.clocks.tables import panels, requirements, tables
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Amounts, Bar
+from benchmarks.stages import Amounts, Bar, named
 
-PACKAGES = ("numpy",)
 AMOUNTS = Amounts(usual={"seconds": 600.0, "rounds": 5}, quick={"seconds": 60.0, "rounds": 1})
 # Online errors count after the warm-up, and a step comes in the middle.
 MIN_SECONDS = 2 * WARM_UP_S + 2
@@ -26,28 +26,32 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run every method on every scene.
-
-    Raises:
-        UnknownNameError: an unknown scene.
-        InvalidInputError: takes that are too short, or no round.
-    """
+    """Run every method on every scene."""
     plan = AMOUNTS.of(options, seconds=MIN_SECONDS)
-    names = list(SCENES | MORE_SCENES | STOP_SCENES)
+    scenes = SCENES | MORE_SCENES | STOP_SCENES
     if options.scenes is not None:
-        names = [name.strip() for name in options.scenes.split(",")]
-    scenes = {name: find_scene(name) for name in names}
-    effort = {"seconds": plan["seconds"], "num_rounds": plan["rounds"], "seed": options.seed}
-    results = compare(scenes, **effort, bar=bar)
-    stampless = compare_stampless(**effort, bar=bar)
+        scenes = named("scene", scenes | STAMPLESS_SCENES, options.scenes)
+    seconds, seeds = plan["seconds"], range(options.seed, options.seed + plan["rounds"])
+    results = compare(scenes, ONLINE | OFFLINE, seconds, seeds, bar)
+    stampless = compare(STAMPLESS_SCENES, STAMPLESS, seconds, seeds, bar)
     return StageReport(
         stage="clocks",
-        machine=describe_machine(PACKAGES),
-        options={**plan, "seed": options.seed, "scenes": names},
+        packages=("numpy",),
+        options={**plan, "seed": options.seed, "scenes": list(scenes)},
         tables=tables(results, stampless),
         panels=panels(results),
         requirements=requirements(results, stampless),
-        data={"results": [result.to_data() for result in (*results, *stampless)]},
+        data={
+            "results": [
+                {
+                    "scene": result.scene,
+                    "way": result.way,
+                    "rounds": [asdict(score) for score in result.scores],
+                    "us_per_sample": list(result.us_per_sample.values),
+                }
+                for result in (*results, *stampless)
+            ]
+        },
         notes=[
             f"online errors exclude the first {WARM_UP_S:g} s and, in scenes with a step, 1.2 s "
             "after it; each round is a take with a different seed"

@@ -2,14 +2,13 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from benchmarks.clocks.rivals import OFFLINE, ONLINE, descriptor
-from benchmarks.clocks.scenes import STAMPLESS_SCENES, Scene, Take, simulate
+from benchmarks.clocks.scenes import Scene, Take, simulate
 from benchmarks.clocks.scores import Score, score
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
@@ -45,62 +44,30 @@ class Result:
         times = [found.recovery_s for found in self.scores if found.recovery_s is not None]
         return Figure.of(times) if times else None
 
-    def to_data(self) -> dict[str, Any]:
-        """Every round, for JSON."""
-        return {
-            "scene": self.scene,
-            "way": self.way,
-            "rounds": [asdict(found) for found in self.scores],
-            "us_per_sample": list(self.us_per_sample.values),
-        }
-
 
 def compare(
-    scenes: Mapping[str, Scene], *, seconds: float, num_rounds: int, seed: int, bar: Bar
+    scenes: Mapping[str, Scene], ways: Mapping[str, Way], seconds: float, seeds: range, bar: Bar
 ) -> list[Result]:
-    """Run all methods alternately in every scene."""
-    ways: list[tuple[str, Way, bool]] = [(name, way, True) for name, way in ONLINE.items()]
-    ways += [(name, way, False) for name, way in OFFLINE.items()]
-    return _compare(scenes, ways, (seconds, num_rounds, seed), bar)
-
-
-def compare_stampless(*, seconds: float, num_rounds: int, seed: int, bar: Bar) -> list[Result]:
-    """Compare on streams with sequence numbers only or no counter, at several loss rates."""
-    ways: list[tuple[str, Way, bool]] = [
-        (COUNTED, _counted, True),
-        (NUMBERED, _numbered, True),
-        ("arrival stamps", ONLINE["arrival stamps"], True),
-    ]
-    return _compare(STAMPLESS_SCENES, ways, (seconds, num_rounds, seed), bar)
-
-
-def _compare(
-    scenes: Mapping[str, Scene],
-    ways: list[tuple[str, Way, bool]],
-    effort: tuple[float, int, int],
-    bar: Bar,
-) -> list[Result]:
-    seconds, num_rounds, seed = effort
+    """Run all methods alternately in every scene, on a take for each seed."""
     results = []
-    with bar("dating", len(scenes) * len(ways) * num_rounds) as step:
+    with bar("dating", len(scenes) * len(ways) * len(seeds)) as step:
         for scene_name, scene in scenes.items():
-            takes = [simulate(scene, seconds=seconds, seed=seed + k) for k in range(num_rounds)]
-            subjects = {
-                name: partial(_measure, way, takes, is_online) for name, way, is_online in ways
-            }
-            for name, found in interleaved(subjects, num_rounds, on_step=step).items():
+            takes = [simulate(scene, seconds=seconds, seed=seed) for seed in seeds]
+            subjects = {name: partial(_measure, name, way, takes) for name, way in ways.items()}
+            for name, found in interleaved(subjects, len(seeds), on_step=step).items():
                 scores = tuple(scored for scored, _ in found)
                 results.append(Result(scene_name, name, scores, Figure.of([us for _, us in found])))
     return results
 
 
-def _measure(way: Way, takes: list[Take], is_online: bool, index: int) -> tuple[Score, float]:  # noqa: FBT001 (bound by partial)
+def _measure(name: str, way: Way, takes: list[Take], index: int) -> tuple[Score, float]:
     take = takes[index]
     began_ns = time.thread_time_ns()
     estimate_ns = way(take)
     spent_ns = time.thread_time_ns() - began_ns
+    scored = score(estimate_ns, take, is_online=name not in OFFLINE)
     # Copying arrivals takes less time than the clock can resolve.
-    return score(estimate_ns, take, is_online=is_online), max(spent_ns, 1) / 1e3 / len(take)
+    return scored, max(spent_ns, 1) / 1e3 / len(take)
 
 
 def _counted(take: Take) -> np.ndarray:
@@ -112,3 +79,11 @@ def _numbered(take: Take) -> np.ndarray:
     clock = OnlineClock(descriptor(take.scene, has_time=False))
     pairs = zip(take.t_host_ns.tolist(), (take.sequence % 2**16).tolist(), strict=True)
     return np.array([clock.update(t_host_ns=host, sequence=number) for host, number in pairs])
+
+
+# For streams with sequence numbers only or without any counter.
+STAMPLESS: dict[str, Way] = {
+    COUNTED: _counted,
+    NUMBERED: _numbered,
+    "arrival stamps": ONLINE["arrival stamps"],
+}

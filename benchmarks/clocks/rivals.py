@@ -15,9 +15,7 @@ LINE_BLOCKS = 60
 OUTLIER_SPREADS = 3.0
 
 
-def descriptor(
-    scene: Scene, *, has_time: bool = True, has_sequence: bool = True
-) -> StreamDescriptor:
+def descriptor(scene: Scene, *, has_time: bool = True) -> StreamDescriptor:
     """Stream descriptor of a glove in this scene: 16-bit sequence, 32-bit ticks."""
     return StreamDescriptor(
         name="glove",
@@ -27,7 +25,7 @@ def descriptor(
         unit="counts",
         nominal_rate_hz=scene.rate_hz,
         capabilities=ClockCapabilities(
-            sequence=has_sequence,
+            sequence=True,
             sequence_bits=16,
             device_time=has_time,
             device_time_bits=32 if scene.tick_ns > 1 else 64,

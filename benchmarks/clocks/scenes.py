@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.errors import UnknownNameError
-
 # The constant path delay, unobservable from one-way timestamps, is subtracted before scoring.
 BASE_DELAY_NS = 2_000_000
 # Crystals drift with the room temperature over minutes.
@@ -60,14 +58,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class Take:
-    """A simulated take: recorded data and ground truth.
+    """A simulated take: what was recorded of the samples that arrived, and their true times.
 
-    Attributes:
-        sequence: numbers of the samples that arrived, counted by the device.
-        t_device_ns: the device's timestamps.
-        t_host_ns: arrivals on the host's clock.
-        true_ns: true sampling times, on the host's clock.
-        step_true_ns: time of the clock step; None if there is none.
+    `sequence` is counted by the device; arrivals and true times are on the host's clock.
+    `step_true_ns` is the time of the clock step; None if there is none.
     """
 
     scene: Scene
@@ -112,18 +106,6 @@ STAMPLESS_SCENES = {
     "0.2 % lost": Scene(drops=0.002),
     "2 % lost": Scene(drops=0.02),
 }
-
-
-def find_scene(name: str) -> Scene:
-    """A scene by name.
-
-    Raises:
-        UnknownNameError: no such scene.
-    """
-    known = SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES
-    if name not in known:
-        raise UnknownNameError("scene", name, list(known))
-    return known[name]
 
 
 def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:

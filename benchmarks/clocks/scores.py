@@ -18,11 +18,8 @@ BOUND_MS = 0.3
 class Score:
     """Errors of one take, after subtraction of the constant path delay.
 
-    Attributes:
-        rms_ms: root mean square over the scored samples.
-        p99_ms: 99th percentile of the absolute error.
-        recovery_s: time after the clock's step until the error falls below 0.3 ms (RMS over half a
-            second); None in scenes without a step.
+    `recovery_s` is the time after the clock's step until the error falls below 0.3 ms (RMS over
+    half a second); None in scenes without a step.
     """
 
     rms_ms: float

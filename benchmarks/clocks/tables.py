@@ -79,15 +79,12 @@ def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list
 
 def _gain(results: Sequence[Result]) -> float | None:
     """Minimum ratio of the arrivals' error to ours; online without scenes that have a step."""
-    gains = []
     arrivals = {r.scene: r.rms_ms for r in results if r.way == ARRIVALS}
-    for result in results:
-        counts = result.way == OURS_OFFLINE or (
-            result.way == OURS_ONLINE and not SCENES[result.scene].step_ms
-        )
-        if counts:
-            gains.append(arrivals[result.scene].over(result.rms_ms).low)
-    return min(gains, default=None)
+    quiet = {name for name, scene in SCENES.items() if not scene.step_ms}
+    counted = [
+        r for r in results if r.way == OURS_OFFLINE or (r.way == OURS_ONLINE and r.scene in quiet)
+    ]
+    return min((arrivals[r.scene].over(r.rms_ms).low for r in counted), default=None)
 
 
 def _worst(results: Sequence[Result], what: str) -> float | None:
@@ -95,16 +92,13 @@ def _worst(results: Sequence[Result], what: str) -> float | None:
     return max((figure.high for figure in figures), default=None)
 
 
-def _names(results: Sequence[Result]) -> tuple[list[str], list[str]]:
-    """Scenes and methods in the order of measurement."""
-    return (
-        list(dict.fromkeys(result.scene for result in results)),
-        list(dict.fromkeys(result.way for result in results)),
-    )
+def _ways(results: Sequence[Result]) -> list[str]:
+    """Methods in the order of measurement."""
+    return list(dict.fromkeys(result.way for result in results))
 
 
 def _error_table(title: str, results: Sequence[Result], what: str) -> ResultTable:
-    scenes, ways = _names(results)
+    scenes, ways = dict.fromkeys(r.scene for r in results), _ways(results)
     cells = {(r.scene, r.way): getattr(r, what).text() for r in results}
     rows = [(scene, *(cells[scene, way] for way in ways)) for scene in scenes]
     return ResultTable(title, ("scene", *ways), rows)
@@ -121,9 +115,8 @@ def _recovery_table(results: Sequence[Result]) -> ResultTable:
 
 
 def _cost_table(results: Sequence[Result]) -> ResultTable:
-    _, ways = _names(results)
     rows = []
-    for way in ways:
+    for way in _ways(results):
         medians = [r.us_per_sample.median for r in results if r.way == way]
         kind = "online" if way in ONLINE else "offline" if way in OFFLINE else "no stamps"
         rows.append((way, kind, f"{np.median(medians):.2f}", f"{max(medians):.2f}"))
@@ -131,9 +124,8 @@ def _cost_table(results: Sequence[Result]) -> ResultTable:
 
 
 def _points(results: Sequence[Result]) -> list[Point]:
-    _, ways = _names(results)
     points = []
-    for way in ways:
+    for way in _ways(results):
         mine = [result for result in results if result.way == way]
         times = Figure.of([max(result.us_per_sample.median, _TINY_US) for result in mine])
         error = max(result.rms_ms.median for result in mine)

@@ -2,23 +2,21 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from statistics import mean
 
 from benchmarks.closure.contact_times import timing_errors
 from benchmarks.closure.methods import METHODS, OURS, Method
 from benchmarks.closure.replay import TASKS, ClosureTake, close_take
-from benchmarks.figures import Requirement, at_least
-from benchmarks.machine import describe_machine
+from benchmarks.figures import at_least
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 
-PACKAGES = ("numpy", "mujoco", "numba")
 FIRST_SEED = 100
 AMOUNTS = Amounts(usual={"takes": 20}, quick={"takes": 1})
 MIN_SUCCESS = 0.8
 QUICK_METHODS = (METHODS[0], OURS)
-COLUMNS = ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra")
 
 Played = Mapping[tuple[str, Method], Sequence[ClosureTake]]
 
@@ -32,13 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record human takes and replay each of them by every method.
-
-    Raises:
-        InvalidInputError: no take.
-        UnknownNameError: no such task.
-    """
-    del folder
+    """Record human takes and replay each of them by every method."""
     num_takes = AMOUNTS.of(options)["takes"]
     tasks = options.tasks.split(",")
     methods = QUICK_METHODS if options.quick else METHODS
@@ -52,11 +44,13 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                     played[task, take.method].append(take)
     return StageReport(
         stage="closure",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco", "numba"),
         options={"takes": num_takes, "tasks": tasks},
         tables=[_table(played, num_takes)],
-        panels=[],
-        requirements=[_requirement(played, task) for task in tasks],
+        requirements=[
+            at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
+            for task in tasks
+        ],
         data={
             "succeeded": {
                 f"{task}: {method.name}": [take.succeeded for take in takes]
@@ -70,24 +64,15 @@ def _table(played: Played, num_takes: int) -> ResultTable:
     rows = []
     for (task, method), takes in played.items():
         errors = timing_errors([(take.human_contact, take.contact) for take in takes])
-        times_ms = (
-            errors.hand_first_ms,
-            errors.hand_last_ms,
-            errors.pad_first_ms,
-            errors.pad_last_ms,
-        )
-        counts = (str(errors.num_missing), str(errors.num_extra))
-        figures = (f"{_rate(takes):.2f}", *(_mean_ms(values) for values in times_ms), *counts)
-        rows.append((f"{task}: {method.name}", *figures))
+        *late_ms, missing, extra = astuple(errors)
+        means = map(_mean_ms, late_ms)
+        name, rate = f"{task}: {method.name}", f"{_rate(takes):.2f}"
+        rows.append((name, rate, *means, str(missing), str(extra)))
     return ResultTable(
         f"Replays of {num_takes} human takes a task; contact times against the human's in ms",
-        COLUMNS,
+        ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra"),
         rows,
     )
-
-
-def _requirement(played: Played, task: str) -> Requirement:
-    return at_least(f"{task}: success of {OURS.name}", _rate(played[task, OURS]), MIN_SUCCESS)
 
 
 def _rate(takes: Sequence[ClosureTake]) -> float:

@@ -6,11 +6,7 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.closure.touch_commands import (
-    HandCommands,
-    HandServos,
-    commands_from_touch,
-)
+from benchmarks.closure.touch_commands import HandCommands, HandServos, commands_from_touch
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
 from dextouch.hands.robot_hand import RobotHand
@@ -35,11 +31,7 @@ from services.alignment.synchronization.resampling import (
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, TruthStream
-from services.twin.mjcf import (
-    FINGER_STIFFNESS_NM_RAD,
-    WRIST_STIFFNESS_N_M,
-    WRIST_STIFFNESS_NM_RAD,
-)
+from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.simulation import MODEL_RATE_HZ
 
 Wrist = Literal["copied", "constant", "touch"]
@@ -97,11 +89,10 @@ class RetargetedHand:
 
     def offset_m(self, wrist: Wrist) -> Float64[np.ndarray, "steps 3"]:
         """Offset of the robot's wrist in the human wrist frame, at every step."""
-        num_steps = len(self.joints_rad)
         if wrist == "touch":
             return touch_offsets_m(self.points, self.pad_forces_n, _GRID_S)
         offset = np.zeros(3) if wrist == "copied" else constant_offset_m(self.points)
-        return np.tile(offset, (num_steps, 1))
+        return np.tile(offset, (len(self.joints_rad), 1))
 
     def commands(self, method: Method) -> HandCommands:
         """Commands of this hand at every step."""

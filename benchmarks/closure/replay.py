@@ -6,12 +6,7 @@ from functools import lru_cache
 from typing import Final
 
 from benchmarks.closure.contact_times import ContactTimes, contact_times
-from benchmarks.closure.methods import (
-    Method,
-    RetargetedTake,
-    retarget_take,
-    robot_trajectory,
-)
+from benchmarks.closure.methods import Method, RetargetedTake, retarget_take, robot_trajectory
 from dextouch.hands.actions import HandTrajectory, actions_from_poses, poses_from_actions
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import Recorder, TakeOptions, TruthStream, record
@@ -24,19 +19,10 @@ _IMAGE_PX: Final = 128
 
 
 @dataclass(frozen=True)
-class Replay:
-    """Result of replaying one take with the robot hand."""
-
-    succeeded: bool
-    streams: dict[str, TruthStream]
-
-
-@dataclass(frozen=True)
 class ClosureTake:
     """One human take and its replay by one method."""
 
     task: str
-    seed: int
     method: Method
     human_succeeded: bool
     succeeded: bool
@@ -50,8 +36,10 @@ def closure_stage(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings(image_height_px=_IMAGE_PX, image_width_px=_IMAGE_PX))
 
 
-def replay(task: str, take: RetargetedTake, trajectory: HandTrajectory) -> Replay:
-    """Play a trajectory with the robot hand, from the initial object poses of the human take.
+def replay(
+    task: str, take: RetargetedTake, trajectory: HandTrajectory
+) -> tuple[bool, dict[str, TruthStream]]:
+    """Success and streams of the robot hand, from the initial object poses of the human take.
 
     The trajectory is converted to 67-D actions and back, as in every episode.
     """
@@ -63,11 +51,14 @@ def replay(task: str, take: RetargetedTake, trajectory: HandTrajectory) -> Repla
     for row in range(1, NUM_GRID_STEPS):
         for step_index in stage.simulation.advance(command_row(commands, row)):
             recorder.sample(step_index)
-    return Replay(stage.task.succeeded(stage.simulation), recorder.streams())
+    return stage.task.succeeded(stage.simulation), recorder.streams()
 
 
 def close_take(
-    task: str, seed: int, methods: Iterable[Method], done: Callable[[str], None] | None = None
+    task: str,
+    seed: int,
+    methods: Iterable[Method],
+    on_step: Callable[[str], None] = lambda _: None,
 ) -> list[ClosureTake]:
     """Replay one human take with every method."""
     episode = record(closure_stage(task, "human"), seed, TakeOptions(images=()))
@@ -75,18 +66,9 @@ def close_take(
     human_contact = contact_times(episode.streams)
     results = []
     for method in methods:
-        if done is not None:
-            done(f"{task} {seed}: {method.name}")
-        played = replay(task, take, robot_trajectory(take, method))
-        results.append(
-            ClosureTake(
-                task,
-                seed,
-                method,
-                bool(episode.attributes.success),
-                played.succeeded,
-                human_contact,
-                contact_times(played.streams),
-            )
-        )
+        on_step(f"{task} {seed}: {method.name}")
+        succeeded, streams = replay(task, take, robot_trajectory(take, method))
+        contact = contact_times(streams)
+        human = bool(episode.attributes.success)
+        results.append(ClosureTake(task, method, human, succeeded, human_contact, contact))
     return results

@@ -36,13 +36,7 @@ _PALM_SIGN: Final = {"left": -1.0, "right": 1.0}
 
 @dataclass(frozen=True)
 class HandServos:
-    """Stiffness of a position-controlled hand and its arm, measured or from the manufacturer.
-
-    Args:
-        finger_nm_rad: stiffness of every finger joint.
-        wrist_n_m: translational stiffness of the wrist.
-        wrist_nm_rad: rotational stiffness of the wrist.
-    """
+    """Stiffness of every finger joint of a position-controlled hand, and of its wrist."""
 
     finger_nm_rad: float
     wrist_n_m: float
@@ -66,25 +60,19 @@ def commands_from_touch(
 ) -> HandCommands:
     """Commands of one hand; without contact, exactly the poses to be reached.
 
-    Args:
-        hand: kinematics.
-        Ts_world_wrist: [T, 4, 4], target poses of the robot's wrist.
-        joints_rad: [T, 20], target angles, inside the limits.
-        pad_forces_n: [T, 6], target forces of thumb … little fingertip and palm.
-        servos: stiffness of the commanded hand.
+    Poses are those of the robot's wrist [T, 4, 4], joint angles [T, 20] inside the limits, forces
+    [T, 6] those of thumb … little fingertip and palm; the servos are those of the commanded hand.
     """
-    Ts = np.asarray(Ts_world_wrist, dtype=np.float64)
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    forces_n = pressing_forces_n(hand, joints, pad_forces_n)
-    _, jacobian = fingertip_jacobians(hand, joints)
+    forces_n = pressing_forces_n(hand, joints_rad, pad_forces_n)
+    _, jacobian = fingertip_jacobians(hand, joints_rad)
     torques_nm = (np.swapaxes(jacobian, -1, -2) @ forces_n[:, :NUM_FINGERS, :, None])[..., 0]
-    led = joints + torques_nm.reshape(-1, NUM_JOINTS) / servos.finger_nm_rad
-    turn_nm = np.cross(robot_places_m(joints, hand), forces_n).sum(axis=1)
+    led = joints_rad + torques_nm.reshape(-1, NUM_JOINTS) / servos.finger_nm_rad
+    turn_nm = np.cross(robot_places_m(joints_rad, hand), forces_n).sum(axis=1)
     lead = transform(
         rotation_from_vector(turn_nm / servos.wrist_nm_rad),
         forces_n.sum(axis=1) / servos.wrist_n_m,
     )
-    return HandCommands(Ts @ lead, np.clip(led, hand.lower_rad, hand.upper_rad))
+    return HandCommands(Ts_world_wrist @ lead, np.clip(led, hand.lower_rad, hand.upper_rad))
 
 
 def pressing_forces_n(
@@ -95,11 +83,10 @@ def pressing_forces_n(
     Minimises Σ |f_i - F_i n_i|² / F_i, with the measured F_i along the normal n_i of pad i, plus
     the squared imbalance (of forces, and of moments about the centre of contact) over a slack.
     """
-    felt_n = np.asarray(pad_forces_n, dtype=np.float64)
-    forces = np.zeros((*felt_n.shape, 3))
-    touched = np.flatnonzero(felt_n.any(axis=1))
+    forces = np.zeros((*pad_forces_n.shape, 3))
+    touched = np.flatnonzero(pad_forces_n.any(axis=1))
     if touched.size:
-        joints, felt = np.asarray(joints_rad, dtype=np.float64)[touched], felt_n[touched]
+        joints, felt = joints_rad[touched], pad_forces_n[touched]
         along = _normals(hand, joints) * felt[..., None]
         balanced = _balanced(robot_places_m(joints, hand), along, felt)
         left = (balanced * along).sum(axis=(1, 2)) / (along**2).sum(axis=(1, 2))

@@ -26,7 +26,6 @@ from benchmarks.evaluator.plan import (
 from benchmarks.evaluator.repetition import read_lines, repetition
 from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
@@ -36,7 +35,6 @@ from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED
 
-PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
 AMOUNTS: Final = Amounts(usual={"starts": 20}, quick={"starts": 2})
 # Titles of the tables, by their names in `evaluator.json`.
@@ -51,11 +49,6 @@ _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    _add_checkpoints(parser)
-    _add_rollouts(parser)
-
-
-def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
     each = "once for all worlds, or once for each"
     for flag, what in {
         "--world": "the world model (committed one); may be repeated for training seeds",
@@ -69,9 +62,6 @@ def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="evaluate every member of a world model's ensemble alone, as a training seed",
     )
-
-
-def _add_rollouts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds",
         default="development",
@@ -127,12 +117,7 @@ def _add_rollouts(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Compute missing results, and create the tables.
-
-    Raises:
-        InvalidInputError: options that do not fit.
-    """
-    del folder
+    """Compute missing results, and create the tables."""
     earlier = read_lines(options.repeats) if options.repeats else {}
     plan = _plan(options)
     study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
@@ -168,7 +153,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     (plan.keep / "evaluator.json").write_text(text + "\n", encoding="utf-8")
     return StageReport(
         stage="evaluator",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco"),
         options={
             "tasks": study.tasks,
             "starts": len(plan.seeds),
@@ -176,7 +161,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "kinds": plan.kinds and asdict(plan.kinds),
         },
         tables=tables,
-        panels=[],
         requirements=[
             *(line.requirement() for line in lines),
             *(repetition(lines, earlier) if options.repeats else ()),
@@ -263,15 +247,6 @@ def _results(
             yield done.result(), f"{task} {seed}"
 
 
-def _worlds(options: argparse.Namespace) -> Sequence[Path | None]:
-    given: Sequence[Path | None] = options.world or [None]
-    if not options.each_member:
-        return given
-    return [
-        path for world in given for path in write_single_members(world, options.keep / "members")
-    ]
-
-
 def _plan(options: argparse.Namespace) -> StudyPlan:
     num_starts = AMOUNTS.of(options)["starts"]
     if options.jobs < 1:
@@ -281,13 +256,17 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         raise InvalidInputError(
             "evaluator: got --cloned or --policy with --ladder none, expected mistakes only"
         )
+    worlds: Sequence[Path | None] = options.world or [None]
+    if options.each_member:
+        folder = options.keep / "members"
+        worlds = [path for world in worlds for path in write_single_members(world, folder)]
     cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
     servo = options.policy or [_SERVO]
     levels_mm = _QUICK_LEVELS_MM if options.quick else LEVELS_MM
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(
-            _worlds(options),
+            worlds,
             options.probe or [DEFAULT_PROBE],
             options.direct or [],
             options.without_touch or [],

@@ -21,11 +21,8 @@ def f1(counts: np.ndarray) -> Float64[np.ndarray, "*batch"]:
 
 def chunk_figures_drawn(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
     """All lines of the chunks of one training seed."""
-    return [
-        *_contact(sampling, scripts),
-        *_images(sampling, scripts),
-        _sharpness(sampling, scripts),
-    ]
+    contact, images = _contact(sampling, scripts), _images(sampling, scripts)
+    return [*contact, *images, _sharpness(sampling, scripts)]
 
 
 def _contact(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
@@ -35,27 +32,21 @@ def _contact(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
     mine = [one for one in scripts if "true context" in one.rows]
     moves = moving(mine)
     if not moves.any():
-        return [
-            undefined(what, ("at least", bound)) for what, bound in zip(names, bounds, strict=True)
-        ]
+        return [undefined(what, ("at least", b)) for what, b in zip(names, bounds, strict=True)]
     chained, copied, context = (
         [f1(total[..., moves.any(axis=0), :]) for total in sampling.sums(counts, mine)]
         for counts in contact_counts_of(mine)
     )
-    pairs = [
-        [ours - theirs for ours, theirs in zip(chained, copied, strict=True)],
-        [_share(ours, theirs) for ours, theirs in zip(chained, context, strict=True)],
+    less = [ours - theirs for ours, theirs in zip(chained, copied, strict=True)]
+    # A share of 1 where neither is right about anything.
+    shares = [
+        np.where(theirs > 0, ours / np.where(theirs > 0, theirs, 1.0), 1.0)
+        for ours, theirs in zip(chained, context, strict=True)
     ]
     return [
         Drawn(what, float(value.min()), draws.min(axis=1), len(mine), ("at least", bound))
-        for what, (value, draws), bound in zip(names, pairs, bounds, strict=True)
+        for what, (value, draws), bound in zip(names, (less, shares), bounds, strict=True)
     ]
-
-
-def _share(chained: np.ndarray, context: np.ndarray) -> np.ndarray:
-    """Chained F1 as a share of that with true context; 1 where neither is right about anything."""
-    safe = np.where(context > 0, context, 1.0)
-    return np.where(context > 0, chained / safe, 1.0)
 
 
 def moving(scripts: Sequence[Rolled]) -> np.ndarray:
@@ -95,11 +86,8 @@ def _images(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
 
 def image_figures(scripts: Sequence[Rolled], name: str) -> tuple[list[Rolled], np.ndarray]:
     """Scripts whose every chunk has this figure, and PSNR [rollouts, chunks, 2] of them."""
-    whole = [
-        one
-        for one in scripts
-        if len(one.rows["imagined"][name]) == len(one.rows["imagined"]["psnr"])
-    ]
+    rows = [(one, one.rows["imagined"]) for one in scripts]
+    whole = [one for one, row in rows if len(row[name]) == len(row["psnr"])]
     return whole, np.array([one.rows["imagined"][name] for one in whole])
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -88,11 +88,7 @@ class Drawn:
 
 
 class Sampling:
-    """Draws of the starts of a task, the same for every figure.
-
-    Args:
-        rollouts: whose starts are drawn.
-    """
+    """Draws of the starts of a task, the same for every figure."""
 
     def __init__(self, rollouts: Iterable[Rolled]) -> None:
         self.seeds = sorted({one.seed for one in rollouts})
@@ -191,12 +187,7 @@ def probabilities(rollouts: Iterable[Rolled], kind: str) -> np.ndarray:
 
 
 def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line]:
-    """The mean of every figure over the training seeds, and the worst seed where it has a bound.
-
-    Args:
-        task: its name.
-        by_seed: the same figures of every training seed, in the same order.
-    """
+    """The mean of every figure over the training seeds, and the worst seed where it has a bound."""
     lines = []
     for same in zip(*by_seed, strict=True):
         values = [one.value for one in same]
@@ -206,11 +197,10 @@ def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line
         if same[0].worst is not None and len(same) > 1 and np.isfinite(values).all():
             least = same[0].bound[0] == "at least"
             one = same[int(np.argmin(values) if least else np.argmax(values))]
-            worst = Drawn(
-                f"{one.what}, worst training seed", one.value, one.draws, one.num,
-                (one.bound[0], same[0].worst), one.unit,
-            )  # fmt: skip
-            lines.append(_line(task, worst, (worst.value, worst.draws), shown))
+            about = replace(
+                one, what=f"{one.what}, worst training seed", bound=(one.bound[0], same[0].worst)
+            )
+            lines.append(_line(task, about, (one.value, one.draws), shown))
     return lines
 
 

@@ -8,6 +8,7 @@ line that a killed run left incomplete is skipped.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,16 @@ def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 class KeptRows:
-    """All rows of a file; added rows are written immediately.
-
-    Args:
-        path: file; it and its folder are created with the first row.
-    """
+    """All rows of a file, which is created with the first; added rows are written at once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._rows: dict[tuple[Any, ...], Row] = {}
         if path.is_file():
             for line in path.read_text(encoding="utf-8").splitlines():
-                if (row := _parsed(line)) is not None:
+                # A killed run may have left a part of a line.
+                with suppress(json.JSONDecodeError):
+                    row = json.loads(line)
                     self._rows[row_key(row)] = row
 
     def __len__(self) -> int:
@@ -73,14 +72,6 @@ class KeptRows:
         with self.path.open("rb") as file:
             file.seek(-1, 2)
             return file.read() == b"\n"
-
-
-def _parsed(line: str) -> Row | None:
-    try:
-        row = json.loads(line)
-    except json.JSONDecodeError:
-        return None
-    return row if isinstance(row, dict) and "kind" in row else None
 
 
 def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -30,13 +31,10 @@ BySeed = Sequence[Sequence[Rolled]]
 
 
 class KindFigures:
-    """Figures of one task about scripts with mistakes.
+    """Figures of one task about scripts with mistakes of a set of kinds.
 
-    Args:
-        task: its name.
-        name: of the set of kinds.
-        by_seed: their rollouts, for every training seed the same ones in the same order.
-        ladder: rollouts of the scripts that err in position only, to stand beside them.
+    The rollouts are the same ones for every training seed, in the same order; beside them stand
+    those of the scripts that err in position only, the ladder.
     """
 
     def __init__(self, task: str, name: str, by_seed: BySeed, ladder: BySeed) -> None:
@@ -49,7 +47,10 @@ class KindFigures:
 
     def _drawn(self, rollouts: Sequence[Rolled]) -> list[Drawn]:
         what = f"mistakes ({self._name})"
-        policies = {"kinds and strengths": policy_name, "kinds": kind_of}
+        policies: dict[str, Callable[[Rolled], str]] = {
+            "kinds and strengths": attrgetter("policy"),
+            "kinds": kind_of,
+        }
         return [
             *group_figures(self._sampling, what, rollouts),
             *(
@@ -83,14 +84,17 @@ class KindFigures:
 
     def _row(self, by_seed: BySeed) -> dict[str, Any]:
         found = [group_figures(self._sampling, "", seed) for seed in by_seed]
-        figures = dict(zip(_COLUMNS, _means(found), strict=True))
+        means = [float(np.mean([one.value for one in same])) for same in zip(*found, strict=True)]
         first = by_seed[0]
         told = [[one.rows[IMAGINED]["likely_success"] for one in seed] for seed in by_seed]
         row: dict[str, Any] = {
             "rollouts": len(first),
             "real": float(np.mean([one.success for one in first])),
             "imagined": float(np.mean(told)),
-            **figures,
+            **{
+                name: mean if math.isfinite(mean) else None
+                for name, mean in zip(_COLUMNS, means, strict=True)
+            },
         }
         areas = [seed[0].value for seed in found]
         if len(areas) > 1 and np.isfinite(areas).all():
@@ -109,10 +113,12 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
     """Figures of single rollouts of one training seed, in the order of the table's columns."""
     each = f"{what}, imagined against real, each rollout"
     success = np.array([one.success for one in rollouts], dtype=bool)
-    likely, decided = (_of_verdicts(rollouts, about) for about in (_is_likely, _is_decided))
+    verdicts = [one.rows[IMAGINED] for one in rollouts]
+    likely = np.array([verdict["likely_success"] for verdict in verdicts], dtype=bool)
+    decided = np.array([_is_decided(verdict) for verdict in verdicts], dtype=bool)
     wrong = likely != success
     told = [one for one, sure in zip(rollouts, decided, strict=True) if sure]
-    uncertainty = np.array([uncertainty_of(one.rows[IMAGINED]) for one in rollouts])
+    uncertainty = np.array([uncertainty_of(verdict) for verdict in verdicts])
     too_many: Bound = ("at most", 0.08)
     off = sampling.mean(
         f"{what}, bias of the success rate", likely.astype(float) - success, rollouts, too_many
@@ -136,12 +142,6 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
     ]  # fmt: skip
 
 
-def _means(by_seed: Sequence[Sequence[Drawn]]) -> list[float | None]:
-    """Mean of every figure over the training seeds; None where it is undefined."""
-    means = [float(np.mean([one.value for one in same])) for same in zip(*by_seed, strict=True)]
-    return [mean if math.isfinite(mean) else None for mean in means]
-
-
 def policy_figures(
     sampling: Sampling,
     what: str,
@@ -151,12 +151,7 @@ def policy_figures(
 ) -> list[Drawn]:
     """Agreement of success rates over policies, each from its own starts.
 
-    Args:
-        sampling: of the starts.
-        what: name of the figures.
-        rollouts: of all policies.
-        policy_of: the policy of a rollout.
-        bounds: least correlation and greatest MMRV.
+    `bounds` are the least correlation and the greatest MMRV.
     """
     names = list(dict.fromkeys(map(policy_of, rollouts)))
     shape = (len(names), len(sampling.seeds))
@@ -198,25 +193,10 @@ def kind_of(one: Rolled) -> str:
     return mistake.kind
 
 
-def policy_name(one: Rolled) -> str:
-    """The policy of a rollout."""
-    return one.policy
-
-
 def uncertainty_of(verdict: Mapping[str, Any]) -> float:
     """How unreliable a verdict is: more than 1 if it is left open, otherwise by its probability."""
     return float(not _is_decided(verdict)) + 1 - abs(2 * float(verdict["probability"]) - 1)
 
 
-def _is_likely(verdict: Mapping[str, Any]) -> bool:
-    return bool(verdict["likely_success"])
-
-
 def _is_decided(verdict: Mapping[str, Any]) -> bool:
     return bool(verdict["decision"] != "cannot tell")
-
-
-def _of_verdicts(
-    rollouts: Sequence[Rolled], about: Callable[[Mapping[str, Any]], bool]
-) -> np.ndarray:
-    return np.array([about(one.rows[IMAGINED]) for one in rollouts], dtype=bool)

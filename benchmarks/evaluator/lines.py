@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,7 @@ from benchmarks.evaluator.drawn import (
     lines_over_seeds,
     undefined,
 )
-from benchmarks.evaluator.kind_lines import (
-    IMAGINED,
-    TRUE,
-    KindFigures,
-    policy_figures,
-    policy_name,
-)
+from benchmarks.evaluator.kind_lines import IMAGINED, TRUE, KindFigures, policy_figures
 from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from services.evaluation.settings import RISK_OF_DECIDED
@@ -35,12 +30,8 @@ _LAST_IMAGE = "verdict of the last image"
 class TaskFigures:
     """All figures of one task.
 
-    Args:
-        task: its name.
-        by_seed: for every training seed the rollouts completed in both worlds, the same ones in
-            the same order.
-        scripts: names of the scripted policies.
-        kinds: name of the set of kinds of mistakes.
+    The rollouts were completed in both worlds; they are the same ones for every training seed, in
+    the same order. `kinds` is the name of the set of kinds of mistakes.
     """
 
     def __init__(
@@ -75,8 +66,7 @@ class TaskFigures:
     def _drawn(self, scripts: Sequence[Rolled], others: Sequence[Rolled]) -> list[Drawn]:
         sampling, everything = self._sampling, [*scripts, *others]
         return [
-            *_judge_figures(sampling, scripts),
-            *_rollout_figures(sampling, scripts),
+            *_single_figures(sampling, scripts),
             *_decision_figures(sampling, scripts),
             *_policy_figures(sampling, scripts, everything),
             *_idle_figures(sampling, everything),
@@ -120,19 +110,15 @@ class TaskFigures:
         ]
 
 
-def _judge_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    what = "judge on true endings"
+def _single_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
+    """The judge on true endings, and imagined against real success of single rollouts."""
+    judge, what = "judge on true endings", "imagined against real, each rollout"
+    image = "judge of the last imagined image alone"
     return [
-        sampling.area(f"{what}, AUC", TRUE, scripts, 0.97, None),
-        sampling.balanced(f"{what}, balanced accuracy", TRUE, scripts, 0.90),
+        sampling.area(f"{judge}, AUC", TRUE, scripts, 0.97, None),
+        sampling.balanced(f"{judge}, balanced accuracy", TRUE, scripts, 0.90),
         sampling.calibration("calibration error of true endings", TRUE, scripts, 0.08),
         sampling.calibration("calibration error of imagined endings", IMAGINED, scripts, 0.08),
-    ]
-
-
-def _rollout_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    what, image = "imagined against real, each rollout", "judge of the last imagined image alone"
-    return [
         sampling.area(f"{what}, AUC", IMAGINED, scripts, 0.93, 0.87),
         sampling.balanced(f"{what}, balanced accuracy", IMAGINED, scripts, 0.83),
         sampling.area(f"{image}, AUC", _LAST_IMAGE, scripts, 0.93, None),
@@ -162,10 +148,10 @@ def _policy_figures(
         ("scripts", scripts, (0.93, 0.05)),
         ("all", everything, (0.90, 0.08)),
     ):
-        starts = Counter(map(policy_name, rollouts))
+        starts = Counter(one.policy for one in rollouts)
         whole = [one for one in rollouts if starts[one.policy] == len(sampling.seeds)]
         what = f"{POLICIES} ({name})"
-        figures += policy_figures(sampling, what, whole, policy_name, bounds)
+        figures += policy_figures(sampling, what, whole, attrgetter("policy"), bounds)
     return figures
 
 

@@ -52,8 +52,7 @@ def chunk_figures(
             image.shape[:2],
         )
         pair = (imagined.images_of_chunks[index], warped)
-        everywhere = np.ones_like(region)
-        found["psnr"].append([psnr_within(one, image, everywhere) for one in pair])
+        found["psnr"].append([psnr_within(one, image) for one in pair])
         if region.any():
             found["psnr_of_objects"].append([psnr_within(one, image, region) for one in pair])
     return found
@@ -65,8 +64,10 @@ def contact_counts(predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> list[floa
     return [float((told & came).sum()), float(told.sum()), float(came.sum())]
 
 
-def psnr_within(predicted: np.ndarray, true: np.ndarray, region: np.ndarray) -> float:
-    """PSNR in dB over the pixels of a region."""
+def psnr_within(
+    predicted: np.ndarray, true: np.ndarray, region: np.ndarray | slice = slice(None)
+) -> float:
+    """PSNR in dB over the pixels of a region, or of the whole image."""
     error = predicted[region].astype(np.float64) - true[region].astype(np.float64)
     return float(decibels(np.mean(error**2), peak=PEAK))
 
@@ -101,11 +102,10 @@ def wrong_action_figures(
     Squared error of touch in kPa², mean over all steps, and PSNR at the end of every chunk.
     """
     both = (own, wrong)
-    everywhere = np.ones(real.images_of_chunks.shape[1:3], dtype=bool)
     return {
         "touch_error": [mse(predicted_kpa=o.tactile_kpa, true_kpa=real.tactile_kpa) for o in both],
         "psnr": [
-            [psnr_within(one.images_of_chunks[index], image, everywhere) for one in both]
+            [psnr_within(one.images_of_chunks[index], image) for one in both]
             for index, image in enumerate(real.images_of_chunks)
         ],
     }

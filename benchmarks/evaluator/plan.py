@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from benchmarks.evaluator.kinds import KindsPlan
 from dextouch.errors import InvalidInputError
@@ -76,13 +76,9 @@ class OutsidePolicy:
 
 @dataclass(frozen=True)
 class Trained:
-    """The checkpoints of one training seed.
+    """The checkpoints of one training seed: world model (None: the package's), judge, baselines.
 
-    Args:
-        world: world model; None: the one included in the package.
-        probe: judge of imagined endings.
-        direct: direct judge, the baseline without a world model; None for none.
-        untouched: world model trained without touch; None for none.
+    `direct` is a judge without a world model, `untouched` a world model trained without touch.
     """
 
     world: Path | None
@@ -110,13 +106,11 @@ def trained_seeds(
                 "all or one for each, in the same order"
             )
     count = len(worlds)
-    judges = list(probes) * (count if len(probes) == 1 else 1)
-    rivals = [_one_each(paths, count) for paths in (directs, untouched)]
-    return tuple(map(Trained, worlds, judges, *rivals))
-
-
-def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
-    return [*paths] * (count if len(paths) == 1 else 1) or [None] * count
+    columns: list[Sequence[Any]] = [
+        [*paths] * (count if len(paths) == 1 else 1) or [None] * count
+        for paths in (probes, directs, untouched)
+    ]
+    return tuple(Trained(*row) for row in zip(worlds, *columns, strict=True))
 
 
 @dataclass(frozen=True)

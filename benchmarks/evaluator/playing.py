@@ -74,14 +74,9 @@ def play_in_twin(
     *,
     shows_chunks: bool = True,
 ) -> TrueRollout:
-    """Let a policy act in the twin from its start.
+    """Let a policy, in closed loop or as the commands of all steps, act in the twin from its start.
 
-    Args:
-        twin: the world.
-        started: its start.
-        policy: closed loop, or the commands of all steps.
-        start: what a closed-loop policy is told.
-        shows_chunks: whether images at the ends of chunks are kept.
+    A closed-loop policy is told `start`; `shows_chunks` keeps images at the ends of chunks.
     """
     stage, state = twin.stage(start.task), started.state
     touch, sent = [started.observation.tactile_kpa], []
@@ -131,12 +126,7 @@ def play_in_imagination(
 ) -> ImaginedRollout:
     """Let a policy act in an imagined world; if it uses images, it observes imagined ones.
 
-    Args:
-        world: the imagined one.
-        first: the first observation.
-        policy: closed loop, or the commands of all steps.
-        start: what a closed-loop policy is told.
-        shows_chunks: whether images at the ends of chunks are kept.
+    Policy, start and images as in `play_in_twin`.
     """
     started = world.reset(first)
     state, seen = started.state, started.observation
@@ -196,13 +186,9 @@ def start_amid(
     tactile_kpa: Float32[np.ndarray, "2 320"],
     reached: Float64[np.ndarray, "67"],
 ) -> RolloutStart:
-    """A start from a later step of a rollout, at which the hands have reached an action.
+    """A start from a later step of a rollout, with what is seen and felt at that step.
 
-    Args:
-        first: start of the rollout.
-        image: of the head camera at the step.
-        tactile_kpa: at the step.
-        reached: relative to the start of the rollout.
+    The action that the hands have reached is relative to the start of the rollout, `first`.
     """
     if first.anchor is None:
         raise ValueError("the twin gives an anchor with every start")

@@ -4,13 +4,12 @@ Figures of few starts scatter, those of policies most. The tolerance of a differ
 least its own 95 % half width, the root of the sum of squares of those of both figures.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from benchmarks.evaluator.drawn import Line
 from benchmarks.figures import Requirement, at_most
@@ -22,8 +21,6 @@ TOLERANCES: Final = {"": 0.08, "dB": 1.0}
 
 
 class _EarlierLine(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     task: str
     what: str
     value: float | None
@@ -32,8 +29,6 @@ class _EarlierLine(BaseModel):
 
 
 class _Run(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     lines: tuple[_EarlierLine, ...]
 
 
@@ -50,8 +45,8 @@ def read_lines(path: Path) -> Earlier:
     if not path.is_file():
         raise NotFoundError(f"evaluator: no file {path} to compare with; see --repeats")
     try:
-        run = _Run.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        run = _Run.model_validate_json(path.read_bytes())
+    except ValidationError as error:
         raise CorruptDataError(
             f"evaluator: {path} is not the evaluator.json of an earlier run ({error})"
         ) from error
@@ -60,10 +55,6 @@ def read_lines(path: Path) -> Earlier:
 
 def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
     """Difference of each figure that both runs have, with its tolerance.
-
-    Args:
-        lines: of this run.
-        earlier: from `read_lines`.
 
     Raises:
         InvalidInputError: no line in common.

@@ -8,10 +8,9 @@ from services.evaluation.statistics import Counts, Interval, central_interval
 
 
 def interval_of_draws(figures: np.ndarray) -> Interval | None:
-    """95 % percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
+    """95 % percentile interval of figures [draws] of a bootstrap that are defined, thus not NaN.
 
-    Returns:
-        The interval of the defined draws; None where more than half are undefined.
+    Returns None where more than half are undefined.
 
     Raises:
         ShapeError: not one axis with at least one draw.
@@ -23,19 +22,12 @@ def interval_of_draws(figures: np.ndarray) -> Interval | None:
     return central_interval(defined) if enough else None
 
 
-def _weights(counts: Counts, start_index: np.ndarray) -> Float64[np.ndarray, "draws n"]:
-    return counts[:, np.asarray(start_index)]
-
-
 def rates_of_draws(
     outcomes: np.ndarray, played: np.ndarray, counts: Counts
 ) -> Float64[np.ndarray, "draws policies"]:
     """Mean outcome of every policy in every draw; NaN where a draw lacks all of its starts.
 
-    Args:
-        outcomes: [policies, starts], sums over the rollouts.
-        played: [policies, starts], numbers of rollouts.
-        counts: from `start_counts`.
+    From sums of outcomes and numbers of rollouts, both [policies, starts].
     """
     with np.errstate(invalid="ignore"):
         return np.asarray((counts @ outcomes.T) / (counts @ played.T))
@@ -46,14 +38,10 @@ def area_under_roc_of_draws(
 ) -> Float64[np.ndarray, " draws"]:
     """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
 
-    Args:
-        scores: [n], higher for more certain success.
-        success: [n] outcomes.
-        start_index: [n], start of each rollout.
-        counts: from `start_counts`.
+    Scores [n] are higher for more certain success; each rollout has the index of its start.
     """
-    scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
-    weight = _weights(counts, start_index)
+    positive = np.asarray(success, dtype=bool)
+    weight = counts[:, start_index]
     wins, losses = weight[:, positive], weight[:, ~positive]
     ordered = (np.sign(scores[positive][:, None] - scores[~positive][None, :]) + 1) / 2
     pairs = wins.sum(axis=1) * losses.sum(axis=1)
@@ -65,9 +53,9 @@ def balanced_accuracy_of_draws(
     decisions: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
 ) -> Float64[np.ndarray, " draws"]:
     """Balanced accuracy of every draw; NaN where one outcome is missing."""
-    right = np.asarray(decisions, dtype=bool) == np.asarray(success, dtype=bool)
     positive = np.asarray(success, dtype=bool)
-    weight = _weights(counts, start_index)
+    right = np.asarray(decisions, dtype=bool) == positive
+    weight = counts[:, start_index]
     with np.errstate(invalid="ignore"):
         shares = [
             (weight[:, of] @ right[of]) / weight[:, of].sum(axis=1) for of in (positive, ~positive)
@@ -79,6 +67,6 @@ def mean_of_draws(
     values: np.ndarray, start_index: np.ndarray, counts: Counts
 ) -> Float64[np.ndarray, " draws"]:
     """Mean of values [n] over the rollouts of every draw; NaN for a draw without any."""
-    weight = _weights(counts, start_index)
+    weight = counts[:, start_index]
     with np.errstate(invalid="ignore"):
-        return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
+        return np.asarray((weight @ values) / weight.sum(axis=1))

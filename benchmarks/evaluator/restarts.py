@@ -61,9 +61,7 @@ def chunks_that_move(
 ) -> Bool[np.ndarray, " chunks"]:
     """Whether a wrist, a finger or an object moves within each chunk.
 
-    Args:
-        commands: of steps 1 … 80.
-        object_poses: T_world_object at step 0 and at the chunk ends.
+    Commands are those of steps 1 … 80, poses T_world_object at step 0 and at the chunk ends.
     """
     moves = []
     for index in range(len(object_poses) - 1):

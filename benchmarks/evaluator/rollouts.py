@@ -9,11 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.evaluator.keeping import Row, array_path, read_arrays, write_arrays
-from benchmarks.evaluator.measuring import (
-    chunk_figures,
-    sharpness_of_chunks,
-    wrong_action_figures,
-)
+from benchmarks.evaluator.measuring import chunk_figures, sharpness_of_chunks, wrong_action_figures
 from benchmarks.evaluator.members import Member
 from benchmarks.evaluator.playing import (
     ImaginedRollout,
@@ -56,12 +52,9 @@ DEPENDS_ON: Final[dict[str, tuple[str, ...]]] = {
 class PolicyRollout:
     """One policy from one start, in the twin and in the world of every training seed.
 
-    Args:
-        twin: the real world.
-        keep: folder of results; existing arrays are not computed again.
-        about: the task, the seed and the name of the policy; of a policy with a mistake also the
-            digest of the mistakes, since only the ending of its rollouts is kept.
-        actor: the policy, or its actions.
+    Arrays that exist in the folder `keep` are not computed again. `about` are the task, the seed
+    and the name of the policy; of a policy with a mistake also the digest of the mistakes, since
+    only the ending of its rollouts is kept. `actor` is the policy, or its actions.
     """
 
     def __init__(
@@ -85,12 +78,8 @@ class PolicyRollout:
             "verdict without touch": lambda m: asdict(
                 m.probe.verdict(without_touch(self._imagined_ending(m)))
             ),
-            "verdict of the last image": lambda m: asdict(
-                m.probe.verdict(last_image_alone(self._imagined_ending(m)))
-            ),
-            "sharpness": lambda m: {
-                "sharpness": sharpness_of_chunks(self.real, self.imagined(m))
-            },
+            "verdict of the last image": self._last_image_row,
+            "sharpness": lambda m: {"sharpness": sharpness_of_chunks(self.real, self.imagined(m))},
             "true context": self._context_row,
             "held still": self._still_row,
             "direct verdict": self._direct_row,
@@ -184,6 +173,11 @@ class PolicyRollout:
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
 
+    def _last_image_row(self, member: Member) -> Row:
+        """Verdict on an ending without touch and without object poses."""
+        ending = replace(without_touch(self._imagined_ending(member)), object_poses=None)
+        return asdict(member.probe.verdict(ending))
+
     def _untouched_row(self, member: Member) -> Row:
         """Verdict on the ending of a world model trained without touch, with touch at zero."""
         if member.untouched is None:
@@ -202,8 +196,3 @@ class PolicyRollout:
 def without_touch(ending: Ending) -> Ending:
     """The ending with all taxels at zero."""
     return replace(ending, tactile_kpa=np.zeros_like(ending.tactile_kpa))
-
-
-def last_image_alone(ending: Ending) -> Ending:
-    """The ending without touch and without object poses."""
-    return replace(without_touch(ending), object_poses=None)

@@ -2,37 +2,27 @@
 
 from pathlib import Path
 
-from services.world_model.checkpoints import (
-    StateCheckpoint,
-    read_state_checkpoint,
-    write_state_checkpoint,
-)
+from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.shipped_checkpoints import default_checkpoint
 
 
 def write_single_members(world: Path | None, folder: Path) -> list[Path]:
-    """Write a checkpoint of every member of a state model's ensemble.
-
-    Args:
-        world: checkpoint of a state model; None: the one included in the package.
-        folder: where to write them.
+    """Write a checkpoint of every member of a state model's ensemble (None: the package's own).
 
     Raises:
         CorruptDataError: not a state model.
     """
     whole = read_state_checkpoint(world or default_checkpoint())
     folder.mkdir(parents=True, exist_ok=True)
-    return [_written(whole, member, folder) for member in range(whole.metadata.num_members)]
-
-
-def _written(whole: StateCheckpoint, member: int, folder: Path) -> Path:
-    path = folder / f"{whole.digest[:12]}_member_{member}.safetensors"
-    metadata = whole.metadata.model_copy(
-        update={"num_members": 1, "name": f"{whole.metadata.name}, member {member} alone"}
-    )
-    write_state_checkpoint(path, single_member(whole.dynamics, member), whole.renderer, metadata)
-    return path
+    paths = []
+    for member in range(whole.metadata.num_members):
+        name = f"{whole.metadata.name}, member {member} alone"
+        metadata = whole.metadata.model_copy(update={"num_members": 1, "name": name})
+        paths.append(folder / f"{whole.digest[:12]}_member_{member}.safetensors")
+        alone = single_member(whole.dynamics, member)
+        write_state_checkpoint(paths[-1], alone, whole.renderer, metadata)
+    return paths
 
 
 def single_member(ensemble: DynamicsModel, member: int) -> DynamicsModel:

@@ -6,10 +6,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from benchmarks.evaluator.measuring import psnr_within
-from benchmarks.evaluator.plan import (
-    STILL_CHUNKS,
-    STILL_SHOWN_EVERY,
-)
+from benchmarks.evaluator.plan import STILL_CHUNKS, STILL_SHOWN_EVERY
 from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import State, World
@@ -48,16 +45,12 @@ def still_figures(
 ) -> dict[str, object]:
     """The greatest imagined pressure, and PSNR [imagined, copy of the first image] of each image.
 
-    Args:
-        imagined: by a world.
-        true_images: [shown, h, w, 3] of the same steps.
-        first_image: [h, w, 3] of step 0.
+    True images [shown, h, w, 3] are those of the same steps, the first image is that of step 0.
     """
-    everywhere = np.ones(first_image.shape[:2], dtype=bool)
     return {
         "greatest_kpa": imagined.greatest_kpa,
         "psnr": [
-            [psnr_within(one, true, everywhere) for one in (image, first_image)]
+            [psnr_within(one, true) for one in (image, first_image)]
             for image, true in zip(imagined.images, true_images, strict=True)
         ],
     }

@@ -129,16 +129,14 @@ class Study:
             for name in names:
                 try:
                     rollout = rollout or self._rollout(task, seed, policy)
-                    yield {**keys[name], **self._row(rollout, name, task, seed)}
+                    kind, member = name[0], self.members[name[1]]
+                    if kind == "wrong actions":
+                        row = rollout.wrong_actions(member, self._rollout(task, seed, EXACT))
+                    else:
+                        row = rollout.row(kind, member)
+                    yield {**keys[name], **row}
                 except DexTouchError as error:
                     yield {**keys[name], "error": type(error).__name__, "message": error.message}
-
-    def _row(self, rollout: PolicyRollout, name: RowName, task: str, seed: int) -> Row:
-        kind, number = name
-        member = self.members[number]
-        if kind == "wrong actions":
-            return rollout.wrong_actions(member, self._rollout(task, seed, EXACT))
-        return rollout.row(kind, member)
 
     def _rollout(self, task: str, seed: int, policy: str) -> PolicyRollout:
         about = self._about(task, seed, policy)

@@ -10,16 +10,15 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from benchmarks.figures import Requirement
-from benchmarks.machine import describe_machine
-from benchmarks.report import ResultTable, StageReport, to_markdown, write_json
+from benchmarks.report import ResultTable, StageReport, to_markdown
 from benchmarks.reproduction.experiments import QUICK, TABLES, Experiments, Sizes, Table
 from benchmarks.reproduction.steps import Step, run
 from benchmarks.reproduction.tables import Page, data_table, make_pages
 from benchmarks.stages import Bar
+from dextouch.command_line import write_json_text
 from dextouch.errors import NotFoundError
 from dextouch.schemas import first_problems
 
-PACKAGES = ("numpy", "torch", "mujoco-core")
 _LEGEND = (
     "cells are means over training seeds with 95 % intervals (Student's t); in brackets the "
     "paper's numbers, measured on other data and in other units"
@@ -44,7 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Run the missing steps, and write the tables."""
-    del folder, bar
     keep: Path = options.keep
     tables: Sequence[Table] = options.tables or TABLES
     sizes = options.sizes or (QUICK if options.quick else Sizes())
@@ -69,10 +67,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     shown = [table for page in pages for table in page.tables()]
     report = StageReport(
         stage="reproduction",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={"tables": tables, "seeds": options.seeds, "sizes": sizes.model_dump(mode="json")},
         tables=[_step_table(steps, keep)] if options.list else [*shown, data],
-        panels=[],
         requirements=[Requirement("steps that fail", float(len(failed)), "at most", 0.0)],
         data={
             "tables": [page.to_json() for page in pages],
@@ -83,7 +80,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     )
     if not options.list:
         (keep / "tables.md").write_text(to_markdown(report), encoding="utf-8")
-        write_json(report, keep / "tables.json")
+        write_json_text(keep / "tables.json", report.to_json())
     return report
 
 

@@ -1,13 +1,14 @@
 """Experiments of the paper in miniature: the data, models and studies of each table, as steps."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 from pydantic import Field
 
-from benchmarks.reproduction.steps import Step
+from benchmarks.reproduction.steps import Step, step_with_result
 from dextouch.frozen_model import FrozenModel
 from services.twin.names import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
 
@@ -79,7 +80,9 @@ SCRIPTS: Final = (
     "side_approach 0.4",
 )
 # Whole rollouts from their first step, whose images are those at the ends of chunks.
-_STATE_METRICS: Final = "psnr,tactile_mse,contact_iou,contact_f1,pad_contact_f1,object_error"
+_STATE_METRICS: Final = (
+    "--metrics psnr,tactile_mse,contact_iou,contact_f1,pad_contact_f1,object_error"
+)
 STATE_REFERENCES: Final = ("copy", OTHER_ACTIONS)
 _MODEL: Final = "model.safetensors"
 _JUDGE: Final = "judge.safetensors"
@@ -158,9 +161,9 @@ class Experiments:
         """Steps of some tables, each once and after those that it needs."""
         makers = {
             "tokenizer": self._tokenizers,
-            "options": self._options,
+            "options": lambda: self._joint_models("options", OPTIONS),
             "instruction": self._instructed,
-            "design": self._designs,
+            "design": lambda: self._joint_models("design", DESIGNS),
             "scaling": self._scaling,
             "evaluator": self._evaluator,
             "generation": self._generation,
@@ -203,7 +206,7 @@ class Experiments:
             heldout = f"{amounts[name][1]} --first {_FIRST_HELDOUT_SEED}"
             amounts[f"{name}-heldout"] = (sizes.heldout_per_task, heldout)
         return {
-            name: _step(
+            name: step_with_result(
                 f"data/{name}",
                 f"train data --store data/{name}/store --tasks {words} --count {count} --jobs 1",
                 "store",
@@ -216,7 +219,7 @@ class Experiments:
         for kind in TOKENIZERS.values():
             for seed in self.seeds:
                 name, made = f"tokenizer/{kind}/seed-{seed}", "tokenizer.safetensors"
-                yield _step(
+                yield step_with_result(
                     name,
                     f"train tokenizer --episodes data/robot/store --tokenizer {kind} --seed {seed} "
                     f"--cpu-budget-s {self.sizes.tokenizer_cpu_s} --output {name}/{made}",
@@ -224,34 +227,27 @@ class Experiments:
                     needs=(self._data["robot"],),
                 )
 
-    def _options(self) -> Iterator[Step]:
-        for option, flags in OPTIONS.items():
+    def _joint_models(self, table: Table, columns: Mapping[str, str]) -> Iterator[Step]:
+        for column, flags in columns.items():
             for seed in self.seeds:
-                model = self._world_model(f"options/{folder_of(option)}", seed, flags)
-                yield self._predicted(model, self._references("options", option, seed))
-
-    def _designs(self) -> Iterator[Step]:
-        for design, flags in DESIGNS.items():
-            for seed in self.seeds:
-                model = self._world_model(f"design/{design}", seed, flags)
-                yield self._predicted(model, self._references("design", design, seed))
+                model = self._world_model(f"{table}/{folder_of(column)}", seed, flags)
+                is_base = column == BASES[table] and seed == self.seeds[0]
+                yield self._predicted(model, (*(REFERENCES if is_base else ()), OTHER_ACTIONS))
 
     def _scaling(self) -> Iterator[Step]:
         """State models with more and more human data."""
         for seed in self.seeds:
             yield self._rolled_out(self._state_model("0", seed))
             for multiple in self.sizes.multiples:
-                yield self._rolled_out(self._with_human(multiple, seed))
+                num_human = self._num_human(multiple)
+                yield self._rolled_out(self._state_model(f"{multiple}x", seed, num_human))
         for seed in self.seeds:
             yield self._rolled_out(self._state_model(HALF_TRAINING, seed))
-
-    def _with_human(self, multiple: int, seed: int) -> Step:
-        return self._state_model(f"{multiple}x", seed, num_human=self._num_human(multiple))
 
     def _num_human(self, multiple: int) -> int:
         return multiple * self.sizes.robot_per_task * len(ROBOT_PRETRAINING)
 
-    def _state_model(self, column: str, seed: int, *, num_human: int = 0) -> Step:
+    def _state_model(self, column: str, seed: int, num_human: int = 0) -> Step:
         """One member of a state model, trained for as many steps in every column but one."""
         sizes, share = self.sizes, 2 if column == HALF_TRAINING else 1
         return self._pretrained(
@@ -276,7 +272,7 @@ class Experiments:
         if num_human:
             needs.append(self._data["human"])
             flags += f" --human data/human/store --human-episodes {num_human}"
-        return _step(
+        return step_with_result(
             name,
             f"train world-model --episodes data/{robot}/store --heldout data/robot-heldout/store "
             f"{flags} --seed {seed} --num-members 1 --jobs 1 "
@@ -287,29 +283,12 @@ class Experiments:
             needs=tuple(needs),
         )
 
-    def _rolled_out(self, model: Step, *, data: str = "robot") -> Step:
-        """Errors of a state model over whole rollouts of held-out episodes."""
-        return _step(
-            f"{model.name.removesuffix('model')}prediction",
-            f"evaluate prediction --checkpoint {model.name}/{_MODEL} --horizon rollouts "
-            f"--episodes data/{data}-heldout/store --metrics {_STATE_METRICS} "
-            f"--baselines {','.join(STATE_REFERENCES)}",
-            needs=(self._data[f"{data}-heldout"], model),
-        )
-
-    def _world_model(
-        self,
-        column: str,
-        seed: int,
-        flags: str = "",
-        *,
-        data: str = "robot",
-    ) -> Step:
+    def _world_model(self, column: str, seed: int, flags: str, data: str = "robot") -> Step:
         """A world model of the paper's form; `column` is the folder of a table's column."""
         name = f"{column}/seed-{seed}/model"
         is_option = column.startswith("options/")
         cpu_s = self.sizes.option_cpu_s if is_option else self.sizes.train_cpu_s
-        return _step(
+        return step_with_result(
             name,
             f"train world-model --preset tiny {flags} --episodes data/{data}/store "
             f"--heldout data/{data}-heldout/store --seed {seed} --cpu-budget-s {cpu_s} --resume "
@@ -318,18 +297,23 @@ class Experiments:
             needs=(self._data[data], self._data[f"{data}-heldout"]),
         )
 
-    def _references(self, table: Table, column: str, seed: int) -> Sequence[str]:
-        is_base = column == BASES.get(table) and seed == self.seeds[0]
-        return (*REFERENCES, OTHER_ACTIONS) if is_base else (OTHER_ACTIONS,)
+    def _rolled_out(self, model: Step, data: str = "robot") -> Step:
+        """Errors of a state model over whole rollouts of held-out episodes."""
+        return self._predicted(model, STATE_REFERENCES, data, "rollouts", _STATE_METRICS)
 
     def _predicted(
-        self, model: Step, baselines: Sequence[str] = (OTHER_ACTIONS,), *, data: str = "robot"
+        self,
+        model: Step,
+        baselines: Sequence[str],
+        data: str = "robot",
+        horizon: str = "windows",
+        metrics: str = "",
     ) -> Step:
         """Errors of a model's predictions on held-out episodes, beside those of baselines."""
-        return _step(
+        return step_with_result(
             f"{model.name.removesuffix('model')}prediction",
-            f"evaluate prediction --checkpoint {model.name}/{_MODEL} --horizon windows "
-            f"--episodes data/{data}-heldout/store --baselines {','.join(baselines)}",
+            f"evaluate prediction --checkpoint {model.name}/{_MODEL} --horizon {horizon} "
+            f"--episodes data/{data}-heldout/store {metrics} --baselines {','.join(baselines)}",
             needs=(self._data[f"{data}-heldout"], model),
         )
 
@@ -339,9 +323,9 @@ class Experiments:
             for seed in self.seeds:
                 column = f"instruction/{folder_of(encoder)}"
                 flags = f"--network.instruction-encoder {kind}"
-                model = self._world_model(column, seed, flags, data="cans")
+                model = self._world_model(column, seed, flags, "cans")
                 baselines = ("copy", "no_instruction", "other_instruction")
-                yield self._predicted(model, baselines, data="cans")
+                yield self._predicted(model, baselines, "cans")
 
     def _adapted(self, world: str, seed: int) -> Step:
         """WM-Robot or WM-Mix, from one model of robot episodes with mistakes and all human ones."""
@@ -362,7 +346,7 @@ class Experiments:
             "--human data/downstream-human/store",
         }
         name = f"evaluator/{world}/seed-{seed}/model"
-        return _step(
+        return step_with_result(
             name,
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
             f"--splits B,C {flags[world]} --heldout data/downstream-heldout/store --seed {seed} "
@@ -378,7 +362,7 @@ class Experiments:
         model = self._adapted(world, seed)
         name = f"evaluator/{world}/seed-{seed}/imagined"
         chosen = f"--split {_UNSEEN_SPLIT} --jobs 1"
-        imagined = _step(
+        imagined = step_with_result(
             name,
             f"train imagined --episodes data/downstream/store --store {name}/store {chosen} "
             f"--checkpoint {model.name}/{_MODEL}",
@@ -386,7 +370,7 @@ class Experiments:
             needs=(self._data["downstream"], model),
         )
         name = f"evaluator/{world}/seed-{seed}/judge"
-        return _step(
+        return step_with_result(
             name,
             f"train judge --base package --splits {_UNSEEN_SPLIT} "
             f"--episodes data/downstream/store,{imagined.name}/store --output {name}/{_JUDGE}",
@@ -400,8 +384,8 @@ class Experiments:
         worlds = {f"{world} {seed}": self._adapted(world, seed) for world, seed in named}
         judges = {f"{world} {seed}": self._judge(world, seed) for world, seed in named}
         for model in worlds.values():
-            yield self._rolled_out(model, data="downstream")
-        cloned = _step(
+            yield self._rolled_out(model, "downstream")
+        cloned = step_with_result(
             "evaluator/policy",
             "train policy --episodes data/downstream/store --splits A,B --early-at 0.15 "
             f"--training.num-training-steps {self.sizes.policy_steps} "
@@ -426,16 +410,14 @@ class Experiments:
         for seed in self.seeds:
             for column in GENERATED:
                 is_generated = column.startswith("+")
-                model = self._adapted(
-                    column.removeprefix("+") if is_generated else "WM-Robot", seed
-                )
+                model = self._adapted(column[1:] if is_generated else "WM-Robot", seed)
                 needs = [self._data["demonstrations"], model]
                 flags = f"--splits {'A,B' if column == 'Real' else 'B'}"
                 if is_generated:
-                    needs.append(self._demonstrations(column, seed))
+                    needs.append(self._demonstrations(column, model, seed))
                     flags += f" --imagined {needs[-1].name}/store"
                 name = f"generation/{column}/seed-{seed}/policy"
-                policies[policy_of(column, seed)] = _step(
+                policies[policy_of(column, seed)] = step_with_result(
                     name,
                     f"train policy --episodes data/demonstrations/store {flags} "
                     f"--places {model.name}/{_MODEL} --output {name}/{_POLICY}",
@@ -445,10 +427,9 @@ class Experiments:
         files = {name: f"{step.name}/{_POLICY}" for name, step in policies.items()}
         yield self._study("generation", {}, files, tuple(policies.values()))
 
-    def _demonstrations(self, column: str, seed: int) -> Step:
-        model = self._adapted(column.removeprefix("+"), seed)
+    def _demonstrations(self, column: str, model: Step, seed: int) -> Step:
         name = f"generation/{column}/seed-{seed}/demonstrations"
-        return _step(
+        return step_with_result(
             name,
             f"generate --episodes data/demonstrations/store --split {_UNSEEN_SPLIT} "
             f"--store {name}/store --checkpoint {model.name}/{_MODEL} "
@@ -469,10 +450,9 @@ class Experiments:
 
         `worlds` are the keys of imagined worlds in the study file, by name.
         """
-        tasks = ", ".join(f'"{task}"' for task in DOWNSTREAM)
         lines = [
             f'name = "{table}"',
-            f"tasks = [{tasks}]",
+            f"tasks = {json.dumps(DOWNSTREAM)}",
             f"first_seed = {_FIRST_STUDY_SEED}",
             f"num_starts = {self.sizes.num_starts}",
             "keep_rollouts = false",
@@ -483,7 +463,7 @@ class Experiments:
             lines += [f'[policies."{policy}"]', 'builtin = "behaviour-cloning"']
             lines += [f'checkpoint = "{path}"']
         name = f"{table}/study"
-        return _step(
+        return step_with_result(
             name,
             f"study run {name}/study.toml --folder {name}/results",
             needs=needs,
@@ -499,9 +479,3 @@ def policy_of(column: str, seed: int) -> str:
 def folder_of(column: str) -> str:
     """Name of the folder of a table's column."""
     return column.replace(",", "").replace(" ", "-")
-
-
-def _step(name: str, command: str, *makes: str, **more: Any) -> Step:  # noqa: ANN401 - of `Step`
-    """A step whose command also writes its result as JSON."""
-    words = f"{' '.join(command.split())} --json {name}/result.json"
-    return Step(name, words, ("result.json", *makes), **more)

@@ -86,6 +86,12 @@ class Step:
         return self.receipt(folder) is not None
 
 
+def step_with_result(name: str, command: str, *makes: str, **more: Any) -> Step:  # noqa: ANN401
+    """A step whose command also writes its result as JSON; `more` are other fields of `Step`."""
+    words = f"{' '.join(command.split())} --json {name}/result.json"
+    return Step(name, words, ("result.json", *makes), **more)
+
+
 def run(
     steps: Sequence[Step], folder: Path, num_jobs: int, program: Sequence[str] = DEXTOUCH
 ) -> list[str]:

@@ -179,16 +179,10 @@ class Page:
         found = [ResultTable(self.title, head, rows)]
         if self.base is not None:
             others = [one for one in columns if one != self.base]
-            differences = [
-                (
-                    row.name,
-                    *(
-                        row.cells[one].less(row.cells[self.base]).text(signed=True)
-                        for one in others
-                    ),
-                )
-                for row in shown
-            ]
+            differences = []
+            for row in shown:
+                cells = (row.cells[one].less(row.cells[self.base]) for one in others)
+                differences.append((row.name, *(cell.text(signed=True) for cell in cells)))
             title = f"{self.title}: difference from {self.base}, seed by seed"
             found.append(ResultTable(title, ("", *others), differences))
         return found
@@ -255,11 +249,9 @@ def _figures(results: Iterable[Any], key: str, source: str = MODEL) -> Measured:
     return Measured(tuple(math.nan if one is None else float(one) for one in found))
 
 
-def _of_all_tasks(result: Mapping[str, Any]) -> Mapping[str, Mapping[str, float | None]]:
+def _of_all_tasks(result: Mapping[str, Any]) -> Any:  # noqa: ANN401 - JSON of a command
     """Figures of a prediction by source, of whole rollouts or of windows of one chunk."""
-    horizon = "rollouts" if "rollouts" in result else "windows"
-    found: Mapping[str, Mapping[str, float | None]] = result[horizon]["all"]
-    return found
+    return result["rollouts" if "rollouts" in result else "windows"]["all"]
 
 
 def _tokenizer_pages(folder: Path, experiments: Experiments) -> list[Page]:
@@ -368,9 +360,11 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     success = tuple(_success_rows(report, experiments))
     pages = []
     for of, estimate, truth in (
-        ("judges' probabilities of success", _judged, _succeeded),
-        ("worlds' own estimates of success", _own, _succeeded),
-        ("rubric scores", _rubric, _rubric),
+        ("judges' probabilities of success", "probability", "success"),
+        # In which no judge takes part.
+        ("worlds' own estimates of success", "world_probability", "success"),
+        # Shares of the task's points: by what the twin reports, or as a judge expects them.
+        ("rubric scores", "rubric_score", "rubric_score"),
     ):
         *estimates, pooled = _estimate_rows(folder, estimate, truth)
         pages += [
@@ -391,29 +385,7 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     ]
 
 
-def _judged(score: RolloutScore) -> float | None:
-    return score.probability
-
-
-def _own(score: RolloutScore) -> float | None:
-    """The world's estimate, in which no judge takes part."""
-    return score.world_probability
-
-
-def _rubric(score: RolloutScore) -> float | None:
-    """Share of the task's points: by what the twin reports, or as a judge expects it."""
-    return score.rubric_score
-
-
-def _succeeded(score: RolloutScore) -> float | None:
-    return float(score.success)
-
-
-def _estimate_rows(
-    folder: Path,
-    estimate: Callable[[RolloutScore], float | None],
-    truth: Callable[[RolloutScore], float | None],
-) -> Iterator[Row]:
+def _estimate_rows(folder: Path, estimate: str, truth: str) -> Iterator[Row]:
     """How well estimates in imagined worlds say what the twin gives, by task and seed.
 
     AUC is of single rollouts, where the truth is yes or no; correlation and MMRV are of the means
@@ -421,7 +393,7 @@ def _estimate_rows(
     """
     outcomes = StudyResults.read(folder / "evaluator/study/results").outcomes.values()
     scores = [one for one in outcomes if isinstance(one, RolloutScore)]
-    true = {(o.task, o.policy, o.seed): truth(o) for o in scores if o.world == REAL}
+    true = {(o.task, o.policy, o.seed): getattr(o, truth) for o in scores if o.world == REAL}
     known = {key: value for key, value in true.items() if value is not None}
     found: dict[tuple[str, str], list[EstimateFigures]] = {}
     means: dict[str, list[np.ndarray]] = {world: [] for world in ADAPTED}
@@ -458,22 +430,18 @@ def estimate_figures(
     scores: Sequence[RolloutScore],
     true: Mapping[tuple[str, str, int], bool | float],
     task: str,
-    estimate: Callable[[RolloutScore], float | None] = _own,
+    estimate: str = "world_probability",
 ) -> EstimateFigures:
-    """Figures of one world and task; NaN where it is undefined or there are no estimates.
+    """Figures of one task in an imagined world; NaN where undefined or without estimates.
 
-    Args:
-        scores: of rollouts in one imagined world.
-        true: success (0 or 1) or score in the real world by task, policy and seed; rollouts
-            without one are left out.
-        task: to measure.
-        estimate: of it, of a rollout.
+    `true` is success (0 or 1) or score in the real world by task, policy and seed; rollouts without
+    one are left out.
     """
     used = [
         (one.policy, value, float(true[one.task, one.policy, one.seed]))
         for one in scores
         if one.task == task
-        and (value := estimate(one)) is not None
+        and (value := getattr(one, estimate)) is not None
         and (one.task, one.policy, one.seed) in true
     ]
     outcomes = np.array([value for _, _, value in used])
@@ -554,13 +522,12 @@ def _generation_pages(folder: Path, experiments: Experiments) -> list[Page]:
 
 def _paper_page(title: str, table: Mapping[str, Any]) -> Page:
     """Success rates of the paper's own policies."""
-    tasks = next(iter(next(iter(table.values())).values()))
     rows = [
         Row(
             f"{task}, {policy}",
             {world: Measured((rates[task],)) for world, rates in worlds.items()},
         )
-        for task in tasks
+        for task in next(iter(next(iter(table.values())).values()))
         for policy, worlds in table.items()
     ]
     return Page(f"{title}: the paper's success rates", tuple(rows))

@@ -5,7 +5,6 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.retargeting.compare import (
     Effort,
@@ -14,23 +13,15 @@ from benchmarks.retargeting.compare import (
     compare_speed,
     pinch_set,
     robot_sets,
-    to_data,
 )
 from benchmarks.retargeting.ours import OURS_EXACT, cold_start
 from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
-from benchmarks.retargeting.rivals import (
-    INSTALL,
-    RIVALS,
-    Rival,
-    find_rival,
-    missing_modules,
-)
+from benchmarks.retargeting.rivals import INSTALL, RIVALS, Rival, missing_modules
 from benchmarks.retargeting.robustness import try_faults
 from benchmarks.retargeting.tables import panels, requirements, tables
-from benchmarks.stages import Amounts, Bar
+from benchmarks.stages import Amounts, Bar, named
 from dextouch.errors import InvalidInputError
 
-PACKAGES = ("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs")
 AMOUNTS = Amounts(
     usual={"seeds": 2, "samples": 600, "people": 5, "rounds": 6, "postures": 5000},
     quick={"seeds": 1, "samples": 120, "people": 1, "rounds": 1, "postures": 100},
@@ -52,13 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run every method on robot motions and on pinching people.
-
-    Raises:
-        UnknownNameError: a rival that there is not.
-        InvalidInputError: no round, or motions of fewer than 30 samples.
-    """
-    del folder
+    """Run every method on robot motions and on pinching people."""
     if options.seed < 0:
         raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
     plan = AMOUNTS.of(options, samples=30)
@@ -73,15 +58,18 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     cold = cold_start(effort.num_postures, effort.seed)
     return StageReport(
         stage="retargeting",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs"),
         options={**asdict(effort), "rivals": list(rivals)},
         tables=tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
         panels=panels(speeds, robot, pinches),
         requirements=requirements(speeds, robot, pinches, cold),
         data={
             "speed": [asdict(speed) for speed in speeds],
-            "robot": to_data(robot),
-            "pinches": to_data(pinches),
+            "robot": {
+                name: {method: asdict(score) for method, score in scores.items()}
+                for name, scores in robot.items()
+            },
+            "pinches": {method: asdict(score) for method, score in pinches.items()},
             "cold_start": cold._asdict(),
             "faults": [asdict(outcome) for outcome in outcomes],
         },
@@ -97,8 +85,7 @@ def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
     """
     wanted = list(RIVALS.values())
     if words is not None:
-        names = [name.strip() for name in words.split(",")]
-        wanted = [] if names == [_NONE] else [find_rival(name) for name in names]
+        wanted = [] if words == _NONE else list(named("rival", RIVALS, words).values())
     left_out = [rival for rival in wanted if missing_modules(rival)]
     return [rival for rival in wanted if rival not in left_out], left_out
 

@@ -6,9 +6,8 @@ A library that does not finish has no score or speed; results of the others are 
 import gc
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -17,12 +16,7 @@ from benchmarks.retargeting import ours
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, Timed
 from benchmarks.retargeting.pinches import PinchMotion, pinch_motions
 from benchmarks.retargeting.rival_process import RivalProcess
-from benchmarks.retargeting.scores import (
-    PinchScore,
-    RobotScore,
-    score_pinches,
-    score_robot,
-)
+from benchmarks.retargeting.scores import PinchScore, RobotScore, score_pinches, score_robot
 from benchmarks.rounds import interleaved
 from benchmarks.simulated.hand_motions import Motion, robot_motion, with_noise
 from benchmarks.stages import Bar
@@ -44,13 +38,9 @@ _NOISE_STREAM = 7
 class Effort:
     """Extent of the measurement.
 
-    Args:
-        num_seeds: robot motions of each kind and side.
-        num_samples: of each of them, at 60 Hz; also of a round of the timing.
-        num_people: pinching people per side, smallest first, 1 … 5.
-        num_rounds: of the timing.
-        num_postures: per side, for cold starts.
-        seed: of the first motion.
+    Robot motions are `num_seeds` of each kind and side, of `num_samples` at 60 Hz each, as is a
+    round of the timing; people per side are 1 … 5, smallest first; `seed` is that of the first
+    motion.
     """
 
     num_seeds: int
@@ -65,9 +55,8 @@ class Effort:
 class Speed:
     """One method on one input: processor time a sample of each round, wall time of its calls.
 
-    Attributes:
-        call_us: median and 99th percentile of a call's wall time over all rounds; None where
-            there is one call for all samples.
+    `call_us` are the median and 99th percentile of a call's wall time over all rounds; None where
+    there is one call for all samples.
     """
 
     method: str
@@ -158,14 +147,6 @@ def scale_of(motion: Motion) -> float:
     return float(robot_bone_m(RobotHand(motion.side)).sum() / tracked_m)
 
 
-def to_data(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Scores of each name, for JSON."""
-    return {
-        name: to_data(score) if isinstance(score, Mapping) else asdict(score)
-        for name, score in scores.items()
-    }
-
-
 def _answer(name: str, motion: Motion, rivals: Rivals) -> np.ndarray:
     if name in rivals:
         return rivals[name].run(motion, scale_of(motion)).joints_rad
@@ -194,12 +175,6 @@ def _subjects(
     profiles = [ours.profile_of(motion) for motion in motions]
     scales = [scale_of(motion) for motion in motions]
 
-    def batch(index: int) -> Timed:
-        return ours.time_batch(motions[index], profiles[index])
-
-    def live(index: int) -> Timed:
-        return ours.time_live(motions[index], profiles[index])
-
     given_up = set()
 
     def rival(process: RivalProcess, index: int) -> Timed | None:
@@ -210,14 +185,17 @@ def _subjects(
             given_up.add(name)
         return None
 
-    theirs = {name: partial(rival, process) for name, process in rivals.items()}
-    return {OURS: batch, OURS_LIVE: live, **theirs}
+    return {
+        OURS: lambda index: ours.time_batch(motions[index], profiles[index]),
+        OURS_LIVE: lambda index: ours.time_live(motions[index], profiles[index]),
+        **{name: partial(rival, process) for name, process in rivals.items()},
+    }
 
 
 def _speed(method: str, input_name: str, timed: Sequence[Timed]) -> Speed:
     calls_us = np.concatenate([one.call_s for one in timed]) * 1e6
-    share = (
-        (float(np.median(calls_us)), float(np.percentile(calls_us, 99))) if len(calls_us) else None
-    )
+    call_us = None
+    if len(calls_us):
+        call_us = float(np.median(calls_us)), float(np.percentile(calls_us, 99))
     cpu_us = Figure.of([one.cpu_s * 1e6 / len(one.joints_rad) for one in timed])
-    return Speed(method, input_name, cpu_us, share)
+    return Speed(method, input_name, cpu_us, call_us)

@@ -27,18 +27,10 @@ class Timed(NamedTuple):
     call_s: Float64[np.ndarray, " calls"]
 
 
-def options_of(name: str) -> RetargetOptions:
-    """Options of one of our rows: the default, or without the temporal term."""
-    return RetargetOptions(temporal_weight_m2=0.0) if name == OURS_EXACT else RetargetOptions()
-
-
 def answer(name: str, motion: Motion) -> Float64[np.ndarray, "time 20"]:
-    """Joint angles of a recording of an unknown person."""
-    return (
-        HandRetargeter(motion.side, options=options_of(name))
-        .retarget(motion.keypoints_m)
-        .joints_rad
-    )
+    """Joint angles of a recording of an unknown person; `OURS_EXACT` has no temporal term."""
+    options = RetargetOptions(temporal_weight_m2=0.0) if name == OURS_EXACT else RetargetOptions()
+    return HandRetargeter(motion.side, options=options).retarget(motion.keypoints_m).joints_rad
 
 
 def profile_of(motion: Motion) -> HandProfile:

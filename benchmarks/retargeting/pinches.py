@@ -43,8 +43,7 @@ _GAP_SCALE_M: Final = 1e-3
 class PinchMotion(Motion):
     """A motion with one pinch after the other, index … little.
 
-    Attributes:
-        gaps_m: true distance of the thumb's tip to that of index, middle, ring and little.
+    `gaps_m` are the true distances of the thumb's tip to that of index, middle, ring and little.
     """
 
     gaps_m: Float64[np.ndarray, "time 4"]
@@ -56,13 +55,7 @@ class PinchMotion(Motion):
 
 
 class Person(HumanHand):
-    """A human hand of given size with individual deviations of all bones.
-
-    Args:
-        side: of the hand.
-        size: relative to the average hand, above zero.
-        seed: of the deviations of bones and knuckle positions.
-    """
+    """A human hand of a size relative to the average, with deviations of all bones by seed."""
 
     def __init__(self, side: Side, size: float, seed: int) -> None:
         self.size = size

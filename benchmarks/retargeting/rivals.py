@@ -10,14 +10,13 @@ import importlib
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.retargeting.hand_urdf import WRIST_LINK, hand_urdf, link_name, tip_name
-from dextouch.errors import UnavailableError, UnknownNameError
+from dextouch.errors import UnavailableError
 from dextouch.hands import CHAINS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 
@@ -69,17 +68,6 @@ class Setup(NamedTuple):
     joint_names: list[str]
 
 
-def find_rival(name: str) -> Rival:
-    """The library and objective of this name.
-
-    Raises:
-        UnknownNameError: there is none.
-    """
-    if name not in RIVALS:
-        raise UnknownNameError("rival", name, list(RIVALS))
-    return RIVALS[name]
-
-
 def missing_modules(rival: Rival) -> list[str]:
     """Modules of a rival that are not installed, checked without importing."""
     return [module for module in _MODULES[rival.library] if find_spec(module) is None]
@@ -107,12 +95,8 @@ def set_up(
 ) -> Setup:
     """Create a retargeter for the robot hand of one side, with its references.
 
-    Args:
-        rival: which.
-        keypoints_m: [T, 25, 3], wrist coordinates.
-        side: of the hand.
-        scale: size of the robot's hand relative to the tracked one.
-        folder: for the URDF.
+    Keypoints are [T, 25, 3] in wrist coordinates, `scale` is the size of the robot's hand relative
+    to the tracked one, the folder is for the URDF.
 
     Raises:
         UnavailableError: its library is not installed.
@@ -128,11 +112,11 @@ def set_up(
     config["scaling_factor"] = scale
     wanted = references(rival, keypoints_m, scale)
     if rival.library == DEX:
-        _library("torch").set_num_threads(1)
-        module = _library("dex_retargeting.retargeting_config")
+        importlib.import_module("torch").set_num_threads(1)
+        module = importlib.import_module("dex_retargeting.retargeting_config")
         built = module.RetargetingConfig.from_dict(config).build()
         return Setup(list(wanted), built.retarget, list(built.joint_names))
-    built = _library("dexi_rs").load_config(config).build()
+    built = importlib.import_module("dexi_rs").load_config(config).build()
     flat = wanted.reshape(len(wanted), -1).tolist()
     return Setup(flat, built.retarget, list(built.joint_names))
 
@@ -153,8 +137,3 @@ def _config(objective: str) -> dict[str, Any]:
         }
     tips = [tip_name(chain) for chain in CHAINS]
     return {"type": "dexpilot", "wrist_link_name": WRIST_LINK, "finger_tip_link_names": tips}
-
-
-def _library(name: str) -> ModuleType:
-    """Import by name, since it is an optional dependency."""
-    return importlib.import_module(name)

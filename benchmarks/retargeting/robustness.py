@@ -1,6 +1,5 @@
 """Behaviour of retargeting methods on lost samples and nodes."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,14 +50,6 @@ def try_faults(seed: int, rivals: Rivals, bar: Bar) -> list[Outcome]:
                 step(f"{name}, {fault}")
                 outcomes.append(Outcome(name, fault, _try(name, motion, whole, rivals)))
     return outcomes
-
-
-def table_rows(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
-    """One row per method, one column per fault."""
-    rows: Mapping[str, list[str]] = {one.method: [] for one in outcomes}
-    for one in outcomes:
-        rows[one.method].append(one.text)
-    return [(method, *texts) for method, texts in rows.items()]
 
 
 def _try(name: str, motion: Motion, whole: Motion, rivals: Rivals) -> str:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from benchmarks.retargeting.pinches import PinchMotion
 from benchmarks.simulated.hand_motions import Motion
@@ -20,11 +19,8 @@ LIMIT_TOLERANCE_RAD = 1e-6
 class RobotScore:
     """Errors in recovering known joint angles of the robot's own hand, pooled over motions.
 
-    Tip errors are distances in the wrist frame, not relative to the knuckle.
-
-    Attributes:
-        num_outside: joint angles beyond their limits.
-        max_step_deg: the largest joint change from one sample to the next.
+    Tip errors are distances in the wrist frame, not relative to the knuckle. `num_outside` joint
+    angles are beyond their limits, `max_step_deg` is the largest change of a joint between samples.
     """
 
     tip_mean_mm: float
@@ -40,13 +36,9 @@ class RobotScore:
 class PinchScore:
     """Quality of people's pinches on the robot hand, pooled over motions.
 
-    Attributes:
-        gap_mean_mm: distance of the robot's tips where the human ones are less than 3 mm apart.
-        gap_p95_mm: of the same distances.
-        same_angle_deg: mean difference of robot and human joint angles over all samples.
-        max_step_deg: the largest turn of a joint from one sample to the next.
-        num_outside: joint angles beyond the robot's limits.
-        num_pinched: number of tip distances behind the first two.
+    Gaps are the distances of the robot's tips where the human ones are less than 3 mm apart,
+    `num_pinched` of them; `same_angle_deg` is the mean difference of robot and human joint angles
+    over all samples, `max_step_deg` the largest turn of a joint from one sample to the next.
     """
 
     gap_mean_mm: float
@@ -92,7 +84,9 @@ def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray])
     _check(motions, answers)
     gaps, angles = [], []
     for motion, answer in zip(motions, answers, strict=True):
-        gaps.append(robot_gaps_m(motion.side, answer)[motion.pinched] * 1e3)
+        tips = RobotHand(motion.side).fingertips_m(answer)
+        gaps_m = np.linalg.norm(tips[:, 1:] - tips[:, :1], axis=-1)
+        gaps.append(gaps_m[motion.pinched] * 1e3)
         angles.append(np.rad2deg(np.abs(answer - motion.joints_rad)).ravel())
     gap_mm = np.concatenate(gaps)
     if not gap_mm.size:
@@ -105,12 +99,6 @@ def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray])
         _num_outside(motions, answers),
         gap_mm.size,
     )
-
-
-def robot_gaps_m(side: str, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 4"]:
-    """Distance of the robot's thumb tip to its other four, metres, for joint angles [T, 20]."""
-    tips = RobotHand(side).fingertips_m(joints_rad)
-    return np.asarray(np.linalg.norm(tips[:, 1:] - tips[:, :1], axis=-1))
 
 
 def max_step_deg(answers: Sequence[np.ndarray]) -> float:

@@ -6,7 +6,7 @@ from dataclasses import astuple
 import numpy as np
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Requirement, Sense, at_least, at_most
+from benchmarks.figures import Requirement, at_least, at_most
 from benchmarks.report import ResultTable, cells
 from benchmarks.retargeting.compare import (
     FULL,
@@ -21,7 +21,6 @@ from benchmarks.retargeting.compare import (
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from benchmarks.retargeting.robustness import HAND_LOST, NODE_LOST, NODES_LOST, Outcome
-from benchmarks.retargeting.robustness import table_rows as fault_rows
 from benchmarks.retargeting.scores import PinchScore, RobotScore
 from benchmarks.simulated.hand_motions import RATE_HZ
 from services.alignment.retargeting import RetargetOptions
@@ -41,10 +40,26 @@ def tables(
     rivals: Sequence[str] = (),
 ) -> list[ResultTable]:
     """All tables of the stage; libraries without a result are marked as not finished."""
+    what = "means, joints beyond limits, largest turn a sample"
     return [
         *[_speed_table(speeds, motion, rivals) for motion in (ROBOT_INPUT, PINCH_INPUT)],
-        *[_robot_table(robot, name, rivals) for name in robot],
-        _pinch_table(pinches, rivals),
+        *[
+            ResultTable(
+                f"The robot's own hands, {name}: {what}",
+                ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
+                [(method, *cells(*astuple(score))) for method, score in scores.items()]
+                + _unfinished(rivals, scores, 8),
+            )
+            for name, scores in robot.items()
+        ],
+        ResultTable(
+            "Pinches of people: the robot's gap where the human one is below 3 mm; a joint may "
+            f"turn {velocity_limit_deg():.3g} deg a sample",
+            ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
+            # All but the number of pinches.
+            [(method, *cells(*astuple(score)[:-1])) for method, score in pinches.items()]
+            + _unfinished(rivals, pinches, 6),
+        ),
         ResultTable(
             "Cold start: fingers of random postures solved within 0.1 mm",
             ("fingers", "with one start", "with retries"),
@@ -53,7 +68,10 @@ def tables(
         ResultTable(
             "Behaviour on lost samples and nodes (robot motion, one second)",
             ("method", NODE_LOST, HAND_LOST, NODES_LOST),
-            fault_rows(outcomes),
+            [
+                (method, *(one.text for one in outcomes if one.method == method))
+                for method in dict.fromkeys(one.method for one in outcomes)
+            ],
         ),
     ]
 
@@ -105,29 +123,6 @@ def _speed_table(speeds: Sequence[Speed], motion: str, rivals: Sequence[str]) ->
     return ResultTable(title, ("method", "cpu (µs)", *columns), rows)
 
 
-def _robot_table(robot: RobotScores, name: str, rivals: Sequence[str]) -> ResultTable:
-    return ResultTable(
-        f"The robot's own hands, {name}: means, joints beyond limits, largest turn a sample",
-        ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
-        [(method, *cells(*astuple(score))) for method, score in robot[name].items()]
-        + _unfinished(rivals, robot[name], 8),
-    )
-
-
-def _pinch_table(pinches: Mapping[str, PinchScore], rivals: Sequence[str]) -> ResultTable:
-    return ResultTable(
-        "Pinches of people: the robot's gap where the human one is below 3 mm; a joint may turn "
-        f"{velocity_limit_deg():.3g} deg a sample",
-        ("method", "gap (mm)", "p95", "off human angles (deg)", "turn (deg)", "outside"),
-        [
-            # All but the number of pinches.
-            (method, *cells(*astuple(score)[:-1]))
-            for method, score in pinches.items()
-        ]
-        + _unfinished(rivals, pinches, 6),
-    )
-
-
 def requirements(
     speeds: Sequence[Speed],
     robot: RobotScores,
@@ -135,13 +130,35 @@ def requirements(
     cold: ColdStart,
 ) -> list[Requirement]:
     """Build the table of requirements; some may be unmeasured in this run."""
+    exact = [robot[name][OURS_EXACT] for name in (NATURAL, FULL)]
+    tip_mm, joint_deg = max(s.tip_max_mm for s in exact), max(s.joint_max_deg for s in exact)
+    noisy = [robot[name][OURS] for name in (NATURAL_NOISE, FULL_NOISE)]
+    noisy_mm, noisy_deg = max(s.tip_mean_mm for s in noisy), max(s.joint_mean_deg for s in noisy)
+    pinched = pinches[OURS]
+    every: list[RobotScore | PinchScore] = [*(found[OURS] for found in robot.values()), pinched]
+    step_deg, bound_deg = max(s.max_step_deg for s in every), velocity_limit_deg() + _ROUNDING_DEG
+    once, retried = cold.num_found_once / cold.num_fingers, cold.num_found / cold.num_fingers
+    rivals = [(Rival(library, VECTOR).name, bound) for library, bound in PROMISED_SPEED]
+    motion, noise = f"robot motion, {OURS_EXACT}", "robot motion, 1 mm noise"
     return [
-        *_speed(speeds),
-        *_exactness([robot[name][OURS_EXACT] for name in (NATURAL, FULL)]),
-        *_noise([robot[name][OURS] for name in (NATURAL_NOISE, FULL_NOISE)]),
-        *_pinches(pinches[OURS]),
-        *_limits(robot, pinches[OURS]),
-        *_cold(cold),
+        *(
+            at_least(f"{OURS}: times as fast as {name}", worst_ratio(speeds, OURS, name), bound)
+            for name, bound in rivals
+        ),
+        at_most(f"{motion}: tip error, max", tip_mm, 1e-3, "mm"),
+        at_most(f"{motion}: joint error, max", joint_deg, 0.01, "deg"),
+        at_most(f"{motion}: joints beyond limits", float(sum(s.num_outside for s in exact)), 0.0),
+        at_most(f"{noise}: tip error, mean", noisy_mm, 1.3, "mm"),
+        at_most(f"{noise}: joint error, mean", noisy_deg, 1.7, "deg"),
+        at_most(
+            "pinches: gap where the human's is below 3 mm, mean", pinched.gap_mean_mm, 1.5, "mm"
+        ),
+        at_most("pinches: gap where the human's is below 3 mm, p95", pinched.gap_p95_mm, 2.5, "mm"),
+        at_most("pinches: off the human joint angles, mean", pinched.same_angle_deg, 5.0, "deg"),
+        at_most("all motions: turn of a joint a sample", step_deg, bound_deg, "deg"),
+        at_most("all motions: joints beyond limits", float(sum(s.num_outside for s in every)), 0.0),
+        at_least("cold start: fingers within 0.1 mm, one start", once, 0.999),
+        at_least("cold start: fingers within 0.1 mm, retries", retried, 1.0),
     ]
 
 
@@ -156,60 +173,3 @@ def worst_ratio(speeds: Sequence[Speed], ours: str, rival: str) -> float | None:
 def velocity_limit_deg() -> float:
     """Maximum joint change between samples under our default velocity limit."""
     return float(np.rad2deg(RetargetOptions().velocity_limit_rad_s / RATE_HZ))
-
-
-def _speed(speeds: Sequence[Speed]) -> list[Requirement]:
-    return [
-        at_least(
-            f"{OURS}: times as fast as {Rival(library, VECTOR).name}",
-            worst_ratio(speeds, OURS, Rival(library, VECTOR).name),
-            bound,
-        )
-        for library, bound in PROMISED_SPEED
-    ]
-
-
-def _exactness(scores: Sequence[RobotScore]) -> list[Requirement]:
-    rows: list[tuple[str, float, Sense, float, str]] = [
-        ("tip error, max", max(one.tip_max_mm for one in scores), "at most", 1e-3, "mm"),
-        ("joint error, max", max(one.joint_max_deg for one in scores), "at most", 0.01, "deg"),
-        ("joints beyond limits", float(sum(one.num_outside for one in scores)), "at most", 0.0, ""),
-    ]
-    return [Requirement(f"robot motion, {OURS_EXACT}: {row[0]}", *row[1:]) for row in rows]
-
-
-def _noise(scores: Sequence[RobotScore]) -> list[Requirement]:
-    tip_mm = max(one.tip_mean_mm for one in scores)
-    joint_deg = max(one.joint_mean_deg for one in scores)
-    return [
-        at_most("robot motion, 1 mm noise: tip error, mean", tip_mm, 1.3, "mm"),
-        at_most("robot motion, 1 mm noise: joint error, mean", joint_deg, 1.7, "deg"),
-    ]
-
-
-def _pinches(score: PinchScore) -> list[Requirement]:
-    rows = (
-        ("gap where the human's is below 3 mm, mean", score.gap_mean_mm, 1.5, "mm"),
-        ("gap where the human's is below 3 mm, p95", score.gap_p95_mm, 2.5, "mm"),
-        ("off the human joint angles, mean", score.same_angle_deg, 5.0, "deg"),
-    )
-    return [at_most(f"pinches: {row[0]}", row[1], *row[2:]) for row in rows]
-
-
-def _limits(robot: RobotScores, pinches: PinchScore) -> list[Requirement]:
-    scores = [found[OURS] for found in robot.values()]
-    step_deg = max([score.max_step_deg for score in scores] + [pinches.max_step_deg])
-    outside = sum(score.num_outside for score in scores) + pinches.num_outside
-    bound_deg = velocity_limit_deg() + _ROUNDING_DEG
-    return [
-        at_most("all motions: turn of a joint a sample", step_deg, bound_deg, "deg"),
-        at_most("all motions: joints beyond limits", float(outside), 0.0),
-    ]
-
-
-def _cold(cold: ColdStart) -> list[Requirement]:
-    once, retried = cold.num_found_once / cold.num_fingers, cold.num_found / cold.num_fingers
-    return [
-        at_least("cold start: fingers within 0.1 mm, one start", once, 0.999),
-        at_least("cold start: fingers within 0.1 mm, retries", retried, 1.0),
-    ]

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
 from benchmarks.rollouts.watcher import listing_s, watched
@@ -65,12 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time chunks of a world that computes nothing, alternating with echoes of the same bytes.
-
-    Raises:
-        InvalidInputError: no round, or more chunks than a rollout may have.
-    """
-    del folder
+    """Time chunks of a world that computes nothing, alternating with echoes of the same bytes."""
     plan = AMOUNTS.of(options, watched_rollouts=0)
     if max(plan["chunks"], plan["crowd_chunks"]) > MAX_CHUNKS:
         raise InvalidInputError(
@@ -83,21 +77,48 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         ways = [*WAYS, *OTHERS, WATCHED, *([DURABLE] if DURABLE.server in urls else [])]
         times_s, sizes = timed(urls, ways, plan, bar)
         with bar("32 rollouts", len(DEVICES)) as step:
-            crowds = {world: _crowd(urls, world, plan, step) for world in DEVICES}
-        listings_s = _listings_s(urls, plan["watched_rollouts"])
+            crowds = {}
+            for world in DEVICES:
+                step(world)
+                crowds[world] = crowd(urls["ours"], world, NUM_ROLLOUTS, plan["crowd_chunks"])
+        # By where rollouts are kept.
+        kept = {"in memory": "ours", "in Redis": DURABLE.server}
+        listings_s = {
+            where: listing_s(
+                urls[server], num_rollouts=plan["watched_rollouts"], num_listings=NUM_LISTINGS
+            )
+            for where, server in kept.items()
+            if server in urls
+        }
     finally:
         child.close()
     bare_s = {selector: bare_step_s(selector) for selector in (LAST, JPEG, ALL)}
     over = {way: _overhead(times_s, way, bare_s[way.selector]) for way in ways}
+    rates = {
+        world: (one.chunks_per_s, 1e3 * one.p50_s, 1e3 * one.p99_s) for world, one in crowds.items()
+    }
+    listing = f"GET /v1/watch?limit=1, {plan['watched_rollouts']} rollouts"
+    listings_ms = {where: 1e3 * statistics.median(found) for where, found in listings_s.items()}
     return StageReport(
         stage="rollouts",
-        machine=describe_machine(("numpy", "fastapi", "uvicorn", "websockets", "msgpack")),
+        packages=("numpy", "fastapi", "uvicorn", "websockets", "msgpack"),
         options=plan,
-        tables=[_table(times_s, over, sizes), _crowd_table(crowds)],
-        panels=[],
+        tables=[
+            _table(times_s, over, sizes),
+            ResultTable(
+                f"{NUM_ROLLOUTS} rollouts on a device of 5 ms",
+                ("world", "chunks/s", "p50 ms", "p99 ms"),
+                [(name, *(f"{value:.0f}" for value in each)) for name, each in rates.items()],
+            ),
+        ],
         requirements=[
             *_requirements(times_s, over, crowds),
-            *_listing_requirements(listings_s, plan["watched_rollouts"]),
+            *(
+                at_most(
+                    f"{listing} {where}, with a new connection, p50", p50_ms, MAX_LISTING_MS, "ms"
+                )
+                for where, p50_ms in listings_ms.items()
+            ),
         ],
         data={
             "seconds": {name: list(figure.values) for name, figure in times_s.items()},
@@ -140,30 +161,6 @@ def timed(
     return {name: Figure.of(values) for name, values in found.items()}, sizes
 
 
-def _listings_s(urls: Mapping[str, str], num_rollouts: int) -> dict[str, list[float]]:
-    """Times of listing one open rollout, by where rollouts are kept."""
-    kept = {"in memory": "ours", "in Redis": DURABLE.server}
-    return {
-        where: listing_s(urls[server], num_rollouts=num_rollouts, num_listings=NUM_LISTINGS)
-        for where, server in kept.items()
-        if server in urls
-    }
-
-
-def _listing_requirements(
-    listings_s: Mapping[str, list[float]], num_rollouts: int
-) -> list[Requirement]:
-    return [
-        at_most(
-            f"GET /v1/watch?limit=1, {num_rollouts} rollouts {where}, with a new connection, p50",
-            1e3 * statistics.median(times_s),
-            MAX_LISTING_MS,
-            "ms",
-        )
-        for where, times_s in listings_s.items()
-    ]
-
-
 def bare_step_s(selector: ReturnSelector) -> float:
     """Seconds of the world's own step, in this process."""
     world, actions = StillWorld(), resting_actions(MAX_STEPS)
@@ -183,12 +180,6 @@ def _median_s(chunk: Chunk, count: int) -> float:
         chunk()
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds)
-
-
-def _crowd(urls: Mapping[str, str], world: str, plan: Mapping[str, int], step: Any) -> Crowd:  # noqa: ANN401 - of the bar
-    step(world)
-    num_chunks = plan["crowd_chunks"]
-    return crowd(urls["ours"], world, num_rollouts=NUM_ROLLOUTS, num_chunks=num_chunks)
 
 
 def _name(way: Way) -> str:
@@ -254,15 +245,3 @@ def _table(
     ]
     columns = ("chunk of 16 steps", "kB", "ours ms", "beside ms", "ratio")
     return ResultTable("Time of a chunk", columns, rows)
-
-
-def _crowd_table(crowds: Mapping[str, Crowd]) -> ResultTable:
-    rows = [
-        (world, f"{one.chunks_per_s:.0f}", f"{one.p50_s * 1e3:.0f}", f"{one.p99_s * 1e3:.0f}")
-        for world, one in crowds.items()
-    ]
-    return ResultTable(
-        f"{NUM_ROLLOUTS} rollouts on a device of 5 ms",
-        ("world", "chunks/s", "p50 ms", "p99 ms"),
-        rows,
-    )

@@ -25,7 +25,7 @@ class Crowd(NamedTuple):
     p99_s: float
 
 
-def crowd(url: str, world: str, *, num_rollouts: int, num_chunks: int) -> Crowd:
+def crowd(url: str, world: str, num_rollouts: int, num_chunks: int) -> Crowd:
     """Advance rollouts of a world at the same time; the first chunk of each is not counted.
 
     Raises:

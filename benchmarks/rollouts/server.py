@@ -128,8 +128,8 @@ def main() -> None:
     worlds = {
         "still": StillWorld(),
         "still in a thread": StillWorld(is_quick=False),
-        "device": Device(),
-        "batch device": BatchDevice(),
+        "device": Device(is_quick=False),
+        "batch device": BatchDevice(is_quick=False),
     }
     with bare_servers() as bare, redis_url() as url:
         # Each round begins new ones, and listing is measured among ten thousand.

@@ -3,11 +3,12 @@
 import http.client
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import Final, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.rollouts.worlds import MAX_STEPS, resting_actions
 from dextouch.errors import InvalidInputError
@@ -50,13 +51,7 @@ def opened(urls: Mapping[str, str], way: Way) -> Iterator[Chunk]:
             wanted = way.selector.model_dump(mode="json")
             socket.send(pack_openpi({"start": start, "return": wanted}))
             unpack_openpi(_bytes(socket.recv()), max_bytes=MAX_BYTES)
-            message = pack_openpi({"actions": actions})
-
-            def send() -> int:
-                socket.send(message)
-                return len(_bytes(socket.recv()))
-
-            yield send
+            yield partial(_exchanged, socket, pack_openpi({"actions": actions}))
         return
     with connection(urls[way.server]) as post:
         begun = post("/v1/rollouts", json.dumps(start).encode(), "application/json")
@@ -77,12 +72,7 @@ def compared(urls: Mapping[str, str], way: Way, num_bytes: int) -> Iterator[Chun
     if way.protocol == "WebSocket":
         with connect(urls["messages"], compression=None, proxy=None, max_size=MAX_BYTES) as socket:
             message = pack_openpi({"actions": actions, "steps": way.selector.steps})
-
-            def send() -> int:
-                socket.send(message)
-                return len(_bytes(socket.recv()))
-
-            yield send
+            yield partial(_exchanged, socket, message)
         return
     with connection(urls["echo"]) as post:
         yield lambda: len(post(f"/{num_bytes}", actions.tobytes(), KIND))
@@ -91,9 +81,7 @@ def compared(urls: Mapping[str, str], way: Way, num_bytes: int) -> Iterator[Chun
 @contextmanager
 def connection(url: str) -> Iterator[Callable[[str, bytes, str], bytes]]:
     """POST requests over one connection, by the standard library's client."""
-    with ExitStack() as stack:
-        opened = http.client.HTTPConnection(urlsplit(url).netloc)
-        stack.callback(opened.close)
+    with closing(http.client.HTTPConnection(urlsplit(url).netloc)) as opened:
 
         def post(path: str, body: bytes, kind: str) -> bytes:
             opened.request("POST", path, body, {"content-type": kind})
@@ -104,6 +92,12 @@ def connection(url: str) -> Iterator[Callable[[str, bytes, str], bytes]]:
             return content
 
         yield post
+
+
+def _exchanged(socket: ClientConnection, message: bytes) -> int:
+    """Send a message; the size of the response."""
+    socket.send(message)
+    return len(_bytes(socket.recv()))
 
 
 def _bytes(message: str | bytes) -> bytes:

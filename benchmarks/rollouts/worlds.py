@@ -7,13 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
-from dextouch.schemas import (
-    EVERYTHING,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    WorldDescription,
-)
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, SteppedRollout
 
@@ -35,8 +29,7 @@ def resting_actions(num_steps: int) -> Float64[np.ndarray, "steps 67"]:
 class StillWorld:
     """Returns the same prepared observation for every chunk.
 
-    Args:
-        is_quick: whether the service may call it in its event loop.
+    `is_quick`: whether the service may call it in its event loop.
     """
 
     def __init__(self, *, is_quick: bool = True) -> None:
@@ -64,7 +57,6 @@ class StillWorld:
 
     def reset(self, start: RolloutStart) -> StartedRollout[int]:
         """See World."""
-        del start
         anchor = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
         return StartedRollout(0, self._seen(0, resting_actions(1)), anchor, np.eye(3))
 
@@ -77,7 +69,6 @@ class StillWorld:
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[int]:
         """See World."""
-        del seed
         seen = self._seen(state + 1, check_actions(actions)).selected(selector)
         return SteppedRollout(state + len(actions), seen)
 
@@ -102,9 +93,6 @@ class StillWorld:
 
 class Device(StillWorld):
     """Simulated device that computes one rollout at a time."""
-
-    def __init__(self) -> None:
-        super().__init__(is_quick=False)
 
     def step(
         self,

@@ -51,14 +51,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Scene:
-    """Simulated measurements with ground truth.
+    """Simulated measurements with ground truth: the true mount, and the true pose of the board.
 
-    Attributes:
-        Ts_world_tracker: [n, 4, 4] with the tracker's noise.
-        views: noisy corners.
-        Ts_camera_board: [n, 4, 4] poses that fit the noisy corners best.
-        T_tracker_camera: the true mount.
-        T_world_board: the true board.
+    The tracker's poses and the corners are noisy; `Ts_camera_board` fit the noisy corners best.
     """
 
     Ts_world_tracker: Float64[np.ndarray, "n 4 4"]

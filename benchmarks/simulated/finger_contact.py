@@ -21,13 +21,9 @@ _PALM_SAMPLES: Final = np.linspace(0.0, 1.0, 6)
 
 
 def touching(hand: TwinHand, joints_rad: np.ndarray) -> Bool[np.ndarray, "time 5"]:
-    """Fingers, thumb … little, that touch another finger or the palm.
+    """Fingers, thumb … little, that touch another finger or the palm, for joint angles [T, 20].
 
     The first link of a finger rotates inside the palm and is not checked against it.
-
-    Args:
-        hand: kinematics and shape.
-        joints_rad: [T, 20], firmware order.
     """
     starts, ends, radii = _capsules(hand, joints_rad)
     found = np.zeros((len(starts), NUM_FINGERS), dtype=bool)

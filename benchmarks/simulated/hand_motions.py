@@ -38,11 +38,8 @@ _MAX_TRIES: Final = 12
 class Motion:
     """A hand motion with known joint angles at 60 Hz, and its tracked keypoints.
 
-    Attributes:
-        side: of the hand.
-        joints_rad: true joint angles, firmware order.
-        keypoints_m: wrist coordinates, order of `dextouch.hands.NODES`; NaN: not tracked.
-        tips_m: true fingertips, thumb … little, wrist coordinates.
+    Joint angles are in firmware order; keypoints (NaN: not tracked), in the order of
+    `dextouch.hands.NODES`, and true fingertips, thumb … little, in wrist coordinates.
     """
 
     side: Side
@@ -57,11 +54,8 @@ class Motion:
 def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> Motion:
     """Robot hand motion: a sum of sines of 0.15 to 1.6 Hz per joint, collision-free.
 
-    Args:
-        side: of the hand.
-        num_samples: at 60 Hz, at least 2.
-        seed: of rates and phases.
-        natural: within the usual range of hands; otherwise the joints' whole range.
+    At least 2 samples at 60 Hz; natural: within the usual range of hands, otherwise the joints'
+    whole range.
 
     Raises:
         LimitExceededError: no motion of this seed is slow enough and collision-free.

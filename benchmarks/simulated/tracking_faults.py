@@ -15,18 +15,17 @@ DROPOUT_SAMPLES = 60
 MAX_FAULT_SAMPLES = 8
 CLEAN_SAMPLES = 10
 OUTLIER_M = 0.05
+Fault = Callable[[np.ndarray, Generator], None]
 _BODY = np.array([node for chain in CHAINS for node in chain_indices(chain)])
 
 
 @dataclass(frozen=True)
 class FuzzedMotion:
-    """Keypoints with faults, and ground truth about these.
+    """Keypoints (wrist coordinates) with faults, and ground truth about these.
 
-    Attributes:
-        keypoints_m: wrist coordinates.
-        kind: index in `FAULTS` of each sample's fault; -1 none.
-        hit: fingers with a corrupted point.
-        since_fault: clean samples since the last fault; large before the first.
+    `kind` is the index in `FAULTS` of each sample's fault, -1 for none; `hit` are fingers with a
+    corrupted point; `since_fault` counts clean samples since the last fault, large before the
+    first.
     """
 
     keypoints_m: Float64[np.ndarray, "time 25 3"]
@@ -39,20 +38,15 @@ def _some_nodes(rng: Generator) -> np.ndarray:
     return rng.choice(_BODY, rng.integers(1, 6), replace=False)
 
 
-def _nan(samples: np.ndarray, rng: Generator) -> None:
-    samples[:, _some_nodes(rng)] = np.nan
+def _filled(value: float) -> Fault:
+    def fill(samples: np.ndarray, rng: Generator) -> None:
+        samples[:, _some_nodes(rng)] = value
+
+    return fill
 
 
 def _infinite(samples: np.ndarray, rng: Generator) -> None:
     samples[:, _some_nodes(rng)] = rng.choice([np.inf, -np.inf])
-
-
-def _zeros(samples: np.ndarray, rng: Generator) -> None:
-    samples[:, _some_nodes(rng)] = 0.0
-
-
-def _denormal(samples: np.ndarray, rng: Generator) -> None:
-    samples[:, _some_nodes(rng)] = 5e-324
 
 
 def _outliers(samples: np.ndarray, rng: Generator) -> None:
@@ -67,31 +61,23 @@ def _swapped_fingers(samples: np.ndarray, rng: Generator) -> None:
     samples[:, [*a, *b]] = samples[:, [*b, *a]]
 
 
-def _dropout(samples: np.ndarray, rng: Generator) -> None:
-    del rng
-    samples[:] = np.nan
+def _scaled(factor: float) -> Fault:
+    def scale(samples: np.ndarray, _: Generator) -> None:
+        samples *= factor
+
+    return scale
 
 
-def _twice_as_large(samples: np.ndarray, rng: Generator) -> None:
-    del rng
-    samples *= 2.0
-
-
-def _millimetres(samples: np.ndarray, rng: Generator) -> None:
-    del rng
-    samples *= 1e3
-
-
-FAULTS: Mapping[str, Callable[[np.ndarray, Generator], None]] = {
-    "NaN": _nan,
+FAULTS: Mapping[str, Fault] = {
+    "NaN": _filled(np.nan),
     "infinite": _infinite,
-    "zeros": _zeros,
-    "denormal": _denormal,
+    "zeros": _filled(0.0),
+    "denormal": _filled(5e-324),
     "50 mm outliers": _outliers,
     "swapped fingers": _swapped_fingers,
-    "1 s dropout": _dropout,
-    "twice as large": _twice_as_large,
-    "millimetres": _millimetres,
+    "1 s dropout": lambda samples, _: samples.fill(np.nan),
+    "twice as large": _scaled(2.0),
+    "millimetres": _scaled(1e3),
 }
 
 

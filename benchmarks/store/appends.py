@@ -39,16 +39,10 @@ class AppendResult:
 def measure_appends(
     workload: Workload, folder: Path, num_rounds: int, bar: Bar, *, share: float = 1.0
 ) -> list[AppendResult]:
-    """Append glove samples one by one to the spool, with and without sync.
+    """Append samples of the left glove one by one to the spool, with and without sync.
 
-    Compared with plain file writes, and with a zarr array.
-
-    Args:
-        workload: source of the left glove's samples, appended repeatedly.
-        folder: for the spools.
-        num_rounds: at least 1.
-        bar: opens a progress bar.
-        share: of the usual number of appends.
+    Compared with plain file writes, and with a zarr array; `share` is that of the usual number of
+    appends.
     """
     ways: dict[str, Callable[[Workload, Path, int], np.ndarray]] = {
         SPOOL: partial(_spool, sync=False),
@@ -87,14 +81,13 @@ def _spool(workload: Workload, folder: Path, count: int, *, sync: bool) -> np.nd
     )
     values = workload.numbers[STREAM].values
     batches = [_batch(values, index) for index in range(count)]
-    taken_ms = np.empty(count)
     with SpoolWriter(folder, attributes, sync=sync) as spool:
-        for index, batch in enumerate(batches):
-            begun_s = time.perf_counter()
-            spool.append(STREAM, batch)
+
+        def append(index: int) -> None:
+            spool.append(STREAM, batches[index])
             spool.flush()
-            taken_ms[index] = (time.perf_counter() - begun_s) * 1e3
-    return taken_ms
+
+        return _taken_ms(append, count)
 
 
 def _batch(values: np.ndarray, index: int) -> SampleBatch:
@@ -108,19 +101,17 @@ def _batch(values: np.ndarray, index: int) -> SampleBatch:
 
 
 def _bare(workload: Workload, folder: Path, count: int) -> np.ndarray:
-    values = workload.numbers[STREAM].values
-    taken_ms = np.empty(count)
+    rows = [row.tobytes() for row in workload.numbers[STREAM].values]
     descriptor = os.open(folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+
+    def append(index: int) -> None:
+        os.write(descriptor, rows[index % len(rows)])
+        os.fdatasync(descriptor)
+
     try:
-        for index in range(count):
-            data = values[index % len(values)].tobytes()
-            begun_s = time.perf_counter()
-            os.write(descriptor, data)
-            os.fdatasync(descriptor)
-            taken_ms[index] = (time.perf_counter() - begun_s) * 1e3
+        return _taken_ms(append, count)
     finally:
         os.close(descriptor)
-    return taken_ms
 
 
 def _zarr(workload: Workload, folder: Path, count: int) -> np.ndarray:
@@ -131,10 +122,13 @@ def _zarr(workload: Workload, folder: Path, count: int) -> np.ndarray:
     array = zarr.create_array(
         str(folder), shape=(0, *values.shape[1:]), chunks=(60, *values.shape[1:]), dtype="uint16"
     )
+    return _taken_ms(lambda index: array.append(values[index % len(values)][None]), count)
+
+
+def _taken_ms(append: Callable[[int], object], count: int) -> np.ndarray:
     taken_ms = np.empty(count)
     for index in range(count):
-        row = index % len(values)
         begun_s = time.perf_counter()
-        array.append(values[row : row + 1])
+        append(index)
         taken_ms[index] = (time.perf_counter() - begun_s) * 1e3
     return taken_ms

@@ -1,24 +1,21 @@
 """Entry point of the benchmark stage `store`."""
 
 import argparse
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
-from benchmarks.stages import Amounts, Bar
+from benchmarks.stages import Amounts, Bar, named
 from benchmarks.store.appends import measure_appends
-from benchmarks.store.compare import DesignResult, Effort, compare
+from benchmarks.store.compare import Effort, compare
 from benchmarks.store.designs import Design
-from benchmarks.store.live import LiveResult, write_live
+from benchmarks.store.live import write_live
 from benchmarks.store.mcap_design import McapDesign
 from benchmarks.store.our_design import OurDesign
 from benchmarks.store.tables import OURS, panels, requirements, tables
 from benchmarks.store.take import make_take
-from benchmarks.store.workload import CAMERAS, Workload
+from benchmarks.store.workload import CAMERAS
 from benchmarks.store.zarr_design import ZarrDesign
-from dextouch.errors import UnknownNameError
 
 DESIGNS: tuple[Design, ...] = (
     OurDesign("h264"),
@@ -28,7 +25,6 @@ DESIGNS: tuple[Design, ...] = (
     ZarrDesign("raw"),
     McapDesign(),
 )
-PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap")
 AMOUNTS = Amounts(
     usual={"seconds": 10.0, "rounds": 5, "windows": 40},
     quick={"seconds": 2.0, "rounds": 1, "windows": 4},
@@ -50,26 +46,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Write and read one take with every design, then appends and the live run.
-
-    Raises:
-        UnknownNameError: an unknown design.
-        InvalidInputError: a take too short for a window, or no round or window.
-    """
+    """Write and read one take with every design, then appends and the live run."""
     plan = AMOUNTS.of(options, seconds=_MIN_SECONDS)
-    chosen = choose(options.designs)
-    notes = [f"{d.name} is skipped: needs {d.missing()}" for d in chosen if d.missing()]
-    designs = [design for design in chosen if design.missing() is None]
+    known = {design.name: design for design in DESIGNS}
+    chosen = known if options.designs is None else named("design", known, options.designs)
+    notes = [f"{d.name} is skipped: needs {d.missing()}" for d in chosen.values() if d.missing()]
+    designs = [design for design in chosen.values() if design.missing() is None]
     with bar("generating the scene", len(CAMERAS)) as step:
         workload = make_take(plan["seconds"], options.seed, on_camera=step)
     effort = Effort(plan["rounds"], plan["windows"], 1 if options.quick else 3, options.seed)
     results = compare(designs, workload, folder, effort, bar)
     share = 0.1 if options.quick else 1.0
     appends = measure_appends(workload, folder, plan["rounds"], bar, share=share)
-    live = _live(results, workload, folder / "live", plan["rounds"], bar)
+    live = []
+    with bar("live", plan["rounds"]) as step:
+        for index in range(plan["rounds"]) if OURS in results else ():
+            step(f"run {index + 1}")
+            live.append(write_live(workload, folder / "live"))
     return StageReport(
         stage="store",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap"),
         options={**plan, "seed": options.seed, "designs": [design.name for design in designs]},
         tables=tables(results, appends, live),
         panels=panels(results),
@@ -81,34 +77,3 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         },
         notes=notes,
     )
-
-
-def choose(names: str | None) -> list[Design]:
-    """Designs of `--designs`; default: all.
-
-    Raises:
-        UnknownNameError: an unknown design.
-    """
-    known = {design.name: design for design in DESIGNS}
-    wanted = list(known) if names is None else [name.strip() for name in names.split(",")]
-    for name in wanted:
-        if name not in known:
-            raise UnknownNameError("design", name, list(known))
-    return [known[name] for name in wanted]
-
-
-def _live(
-    results: Mapping[str, DesignResult],
-    workload: Workload,
-    folder: Path,
-    num_rounds: int,
-    bar: Bar,
-) -> Sequence[LiveResult]:
-    if OURS not in results:
-        return []
-    runs = []
-    with bar("live", num_rounds) as step:
-        for index in range(num_rounds):
-            step(f"run {index + 1}")
-            runs.append(write_live(workload, folder, "h264"))
-    return runs

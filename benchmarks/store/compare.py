@@ -78,12 +78,7 @@ def compare(
 ) -> dict[str, DesignResult]:
     """Write and read one take with every design in each round.
 
-    Args:
-        designs: available ones; one that reads another's files requires that other.
-        workload: the take.
-        folder: for the files, with a subfolder per design.
-        effort: extent of the measurement.
-        bar: opens a progress bar.
+    A design that reads another's files requires that other; each has a subfolder.
 
     Raises:
         CorruptDataError: a design returned other values than were written.

@@ -86,12 +86,7 @@ class Design(Protocol):
         """Missing dependency (package or codec); None if the design is available."""
 
     def write(self, workload: Workload, folder: Path) -> None:
-        """Write the take as a station would: image by image, in the order of time.
-
-        Args:
-            workload: the take.
-            folder: new folder for all files.
-        """
+        """Write the take into a new folder as a station would, image by image in order of time."""
 
     def open(self, folder: Path) -> OpenStore:
         """Open the files of `write`."""

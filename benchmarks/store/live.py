@@ -33,20 +33,11 @@ class LiveResult:
     worst_lag_ms: float
     finish_s: float
 
-    @property
-    def num_untimely(self) -> int:
-        """Number of late or dropped rows."""
-        return self.num_late + self.num_dropped
 
+def write_live(workload: Workload, folder: Path) -> LiveResult:
+    """Write a recording of the whole station with H.264 at a multiple of real time.
 
-def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SPEED) -> LiveResult:
-    """Write a recording of the whole station at a multiple of real time.
-
-    Args:
-        workload: the take; its timestamps are the due times.
-        folder: folder of a store, emptied first.
-        unit: unit of the cameras.
-        speed: multiple of real time.
+    The timestamps of the take are the due times; the folder of the store is emptied first.
     """
     shutil.rmtree(folder, ignore_errors=True)
     attributes = RecordingAttributes(
@@ -55,7 +46,7 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
         instruction="keep up",
         domain="robot",
         station="bench",
-        streams=descriptors(workload, unit),
+        streams=descriptors(workload, "h264"),
     )
     store = EpisodeStore(folder)
     num_rows, num_late, worst_lag_s = 0, 0, 0.0
@@ -64,7 +55,7 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
         for name, values, stamps in arrivals(workload):
             if not len(stamps):
                 continue
-            due_s = begun_s + int(stamps[-1]) / 1e9 / speed
+            due_s = begun_s + int(stamps[-1]) / 1e9 / SPEED
             time.sleep(max(0.0, due_s - time.perf_counter()))
             writer.append(
                 name,
@@ -81,4 +72,4 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
     finish_s = time.perf_counter() - ended_s
     kept = store.recording(_RECORDING_ID)
     num_kept = sum(kept.num_samples(name) for name in kept.streams)
-    return LiveResult(speed, num_rows, num_late, num_rows - num_kept, worst_lag_s * 1e3, finish_s)
+    return LiveResult(SPEED, num_rows, num_late, num_rows - num_kept, worst_lag_s * 1e3, finish_s)

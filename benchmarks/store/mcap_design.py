@@ -11,12 +11,7 @@ import numpy as np
 import simplejpeg
 
 from benchmarks.store.designs import OpenStore, StreamStore
-from benchmarks.store.workload import (
-    JPEG_QUALITY,
-    WINDOW_IMAGES,
-    TimedStream,
-    Workload,
-)
+from benchmarks.store.workload import JPEG_QUALITY, WINDOW_IMAGES, Workload
 
 _FILE = "take.mcap"
 
@@ -102,9 +97,6 @@ def _messages(workload: Workload) -> Iterator[tuple[str, bytes, int]]:
             payload = simplejpeg.encode_jpeg(image, quality=JPEG_QUALITY, colorsubsampling="420")
             yield name, payload, int(stream.t_ref_ns[index])
         for name, stream in workload.numbers.items():
-            yield from _numbers(name, stream, workload.arrived_with(name, index))
-
-
-def _numbers(name: str, stream: TimedStream, rows: slice) -> Iterator[tuple[str, bytes, int]]:
-    for row in range(rows.start, rows.stop):
-        yield name, stream.values[row].tobytes(), int(stream.t_ref_ns[row])
+            rows = workload.arrived_with(name, index)
+            for row in range(rows.start, rows.stop):
+                yield name, stream.values[row].tobytes(), int(stream.t_ref_ns[row])

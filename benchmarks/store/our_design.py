@@ -9,11 +9,7 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.store.designs import OpenStore, StreamStore
-from benchmarks.store.workload import (
-    WINDOW_IMAGES,
-    TimedStream,
-    Workload,
-)
+from benchmarks.store.workload import WINDOW_IMAGES, TimedStream, Workload
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
@@ -44,10 +40,8 @@ class OurDesign:
 
     def missing(self) -> str | None:
         """The package for H.264, if it is not installed."""
-        needs = ("dextouch.episodes.image_codecs", "av") if self.unit == "h264" else ()
-        for module in needs:
-            if importlib.util.find_spec(module) is None:
-                return f"module {module} (pip install 'dextouch-wm[store]')"
+        if self.unit == "h264" and importlib.util.find_spec("av") is None:
+            return "module av (pip install 'dextouch-wm[store]')"
         return None
 
     def write(self, workload: Workload, folder: Path) -> None:

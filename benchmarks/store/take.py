@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import UInt16
 
 from benchmarks.store.scene import make_scene, render
 from benchmarks.store.workload import (
@@ -24,12 +24,9 @@ _SHAPES = {"keypoints": (25, 3), "wrist": (7,), "head": (7,), "action": (67,)}
 def make_take(
     seconds: float, seed: int, *, on_camera: Callable[[str], None] = lambda _: None
 ) -> Workload:
-    """Generate the streams of one take, deterministic by seed and length.
+    """Generate the streams of one take of whole images, deterministic by seed and length.
 
-    Args:
-        seconds: length, a whole number of images.
-        seed: random seed.
-        on_camera: called with a camera's name before it is rendered, from its thread.
+    `on_camera` is called with a camera's name before it is rendered, from its thread.
     """
     rng = np.random.default_rng(seed)
     camera_rngs = rng.spawn(len(CAMERAS))
@@ -68,11 +65,8 @@ def _numbers(name: str, count: int, rng: np.random.Generator) -> np.ndarray:
     kind = name.removesuffix("_left").removesuffix("_right")
     if kind == "tactile":
         return _tactile(count, phase=float(name.endswith("right")), rng=rng)
-    return _walk((count, *_SHAPES[kind]), rng)
-
-
-def _walk(shape: tuple[int, ...], rng: np.random.Generator) -> Float32[np.ndarray, "..."]:
-    """Slow motion with the noise of a tracker."""
+    # Slow motion with the noise of a tracker.
+    shape = (count, *_SHAPES[kind])
     motion = np.cumsum(rng.normal(0, 1e-3, shape), axis=0)
     return np.asarray(motion + rng.normal(0, 1e-4, shape), dtype=np.float32)
 

@@ -8,11 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.store.designs import OpenStore, StreamStore
-from benchmarks.store.workload import (
-    IMAGE_SHAPE,
-    WINDOW_IMAGES,
-    Workload,
-)
+from benchmarks.store.workload import IMAGE_SHAPE, WINDOW_IMAGES, Workload
 
 STAMPS = "_t_ref_ns"
 _ZSTD_LEVEL = 1

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Requirement, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from benchmarks.stress.cells import (
@@ -62,21 +61,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run the matrix, or the given stages and hazards of it.
-
-    Raises:
-        UnknownNameError: no such stage or hazard.
-    """
-    for name in options.hazard or ():
-        if name not in HAZARDS:
-            raise UnknownNameError("hazard", name, list(HAZARDS))
-    chosen = sorted(set(options.stage or STAGES), key=_place)
-    cells = [
-        cell
-        for name in chosen
-        for cell in load_cells(name).row()
-        if cell.hazard in (options.hazard or HAZARDS)
-    ]
+    """Run the matrix, or the given stages and hazards of it."""
+    stages, hazards = options.stage or STAGES, options.hazard or HAZARDS
+    for kind, names, known in (("stage", stages, STAGES), ("hazard", hazards, HAZARDS)):
+        for name in names:
+            if name not in known:
+                raise UnknownNameError(kind, name, list(known))
+    chosen = [name for name in STAGES if name in stages]
+    cells = [cell for name in chosen for cell in load_cells(name).row() if cell.hazard in hazards]
     if options.list:
         return _report([_listing(cells)], [], {})
     findings = []
@@ -92,32 +84,27 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     requirements = [
         at_most(f"{name}: cells that fail", float(failed[name]), 0.0) for name in chosen
     ]
-    data = {"counts": counts, "cells": [_row_of_json(one) for one in findings]}
+    rows = []
+    for one in findings:
+        figures = {
+            name: value if math.isfinite(value) else None for name, value in one.figures.items()
+        }
+        rows.append({**asdict(one), "figures": figures})
+    data = {"counts": counts, "cells": rows}
     return _report([_matrix(findings), _results(findings)], requirements, data)
 
 
 def load_cells(stage: str) -> StageCells:
-    """The row of a stage.
-
-    Raises:
-        UnknownNameError: no such stage.
-    """
-    _place(stage)
+    """The row of a known stage."""
     cells: StageCells = importlib.import_module(f"benchmarks.stress.{STAGES[stage]}").STAGE
     return cells
-
-
-def _place(stage: str) -> int:
-    if stage not in STAGES:
-        raise UnknownNameError("stage", stage, list(STAGES))
-    return list(STAGES).index(stage)
 
 
 def _report(
     tables: Sequence[ResultTable], requirements: Sequence[Requirement], data: dict[str, Any]
 ) -> StageReport:
-    machine = describe_machine(["numpy", "scipy", "torch", "mujoco-core"])
-    return StageReport("stress", machine, {}, tables, [], requirements, data)
+    packages = ("numpy", "scipy", "torch", "mujoco-core")
+    return StageReport("stress", packages, {}, tables, requirements, data)
 
 
 def _matrix(findings: Sequence[Finding]) -> ResultTable:
@@ -161,9 +148,3 @@ def _listing(cells: Sequence[Cell | Exemption]) -> ResultTable:
     ]
     columns = ("stage", "hazard", "input, or why it does not apply", "takes")
     return ResultTable(f"{len(cells)} cells", columns, rows, num_text_columns=4)
-
-
-def _row_of_json(finding: Finding) -> dict[str, Any]:
-    """A finding; figures that are not finite are null."""
-    figures = {n: value if math.isfinite(value) else None for n, value in finding.figures.items()}
-    return {**asdict(finding), "figures": figures}

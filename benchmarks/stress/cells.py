@@ -99,13 +99,12 @@ class Check:
         """A call with these arguments that must raise a DexTouch error of this kind."""
         try:
             call(*arguments, **options)
+        except kind as error:
+            self._refusals.setdefault(type(error).__name__, []).append(what)
         except DexTouchError as error:
-            if isinstance(error, kind):
-                self._refusals.setdefault(type(error).__name__, []).append(what)
-            else:
-                self._broken.append(
-                    f"{what}: {type(error).__name__}, expected {kind.__name__} ({error.message})"
-                )
+            self._broken.append(
+                f"{what}: {type(error).__name__}, expected {kind.__name__} ({error.message})"
+            )
         else:
             self._broken.append(f"{what}: accepted, expected {kind.__name__}")
 

@@ -29,12 +29,7 @@ def _clock(check: Check) -> None:
             worst["tick counter"] = max(worst["tick counter"], _off(np.array(ticked), device_ns))
             straight = unwrap_counter(counts, modulus=2**bits, hint=host_ns // tick_ns) * tick_ns
             worst["stamps offline"] = max(worst["stamps offline"], _off(straight, device_ns))
-            online = OnlineClock(_descriptor(bits, tick_ns))
-            dated = [
-                online.update(t_host_ns=int(t), t_device_ns=int(c * tick_ns))
-                for c, t in zip(counts, host_ns, strict=True)
-            ]
-            late = np.array(dated) - device_ns
+            late = _live(counts * tick_ns, host_ns, _descriptor(bits, tick_ns)) - device_ns
             worst["stamps online"] = max(worst["stamps online"], _off(late, late * 0 + 5_000_000))
     for what, bound in (("tick counter", 0), ("stamps offline", 0), ("stamps online", 700_000)):
         check.at_most(f"{what} off after a pause", worst[what], bound, "ns")
@@ -77,12 +72,8 @@ def _ends(check: Check) -> None:
     device, host = _take(10, 0.0)
     model = fit_clock(device, host)
     outside = np.array([device[0] - 10**9, device[-1] + 10**9])
-    check.at_most(
-        "dates a second outside off",
-        np.abs(model.to_host_ns(outside) - outside - 1_000_000).max(),
-        700_000,
-        "ns",
-    )
+    off_ns = np.abs(model.to_host_ns(outside) - outside - 1_000_000).max()
+    check.at_most("dates a second outside off", off_ns, 700_000, "ns")
     check.refused("9 samples", fit_clock, device[:9], host[:9], kind=ClockFitError)
     check.refused("no sample", fit_clock, device[:0], host[:0], kind=ClockFitError)
 
@@ -94,16 +85,9 @@ def _precision(check: Check) -> None:
     near, far = fit_clock(device, host), fit_clock(device + shift, host + shift)
     apart = far.to_host_ns(device + shift) - shift - near.to_host_ns(device)
     check.at_most("dates change by", np.abs(apart).max(), 0, "ns")
-    online = [OnlineClock(None), OnlineClock(None)]
-    dated = [
-        [
-            one.update(t_host_ns=int(h) + off, t_device_ns=int(d) + off)
-            for d, h in zip(device[:500], host[:500], strict=True)
-        ]
-        for one, off in zip(online, (0, shift), strict=True)
-    ]
-    moved = [b - a - shift for a, b in zip(*dated, strict=True)]
-    check.at_most("live dates change by", max(map(abs, moved)), 0, "ns")
+    live = _live(device[:500], host[:500])
+    moved = _live(device[:500] + shift, host[:500] + shift) - shift - live
+    check.at_most("live dates change by", np.abs(moved).max(), 0, "ns")
 
 
 @STAGE.cell("long_run", "60 000 samples (1000 s), 30 ppm fast, live and offline")
@@ -112,12 +96,8 @@ def _long_run(check: Check) -> None:
     true_ns = _truth(device, 30.0)
     off_ns = np.abs(fit_clock(device, host).to_host_ns(device) - true_ns)
     check.at_most("offline off", off_ns.max(), 50_000, "ns")
-    clock = OnlineClock(None)
-    live = [
-        clock.update(t_host_ns=int(h), t_device_ns=int(d))
-        for d, h in zip(device[::6], host[::6], strict=True)
-    ]
-    late = np.abs(np.array(live) - true_ns[::6])[600:]
+    live = _live(device[::6], host[::6])
+    late = np.abs(live - true_ns[::6])[600:]
     check.at_most("live off after a minute", late.max(), 200_000, "ns")
     check.true("live dates rise", (np.diff(live) > 0).all())
 
@@ -150,6 +130,15 @@ def _take(num_samples: int, skew_ppm: float) -> tuple[np.ndarray, np.ndarray]:
 def _truth(device: np.ndarray, skew_ppm: float) -> np.ndarray:
     """Arrival times without any delay."""
     return np.rint(device * (1 + skew_ppm * 1e-6)).astype(np.int64) + 1_000_000
+
+
+def _live(
+    device_ns: np.ndarray, host_ns: np.ndarray, descriptor: StreamDescriptor | None = None
+) -> np.ndarray:
+    """Dates by the online clock, sample by sample."""
+    clock = OnlineClock(descriptor)
+    pairs = zip(device_ns.tolist(), host_ns.tolist(), strict=True)
+    return np.array([clock.update(t_host_ns=h, t_device_ns=d) for d, h in pairs])
 
 
 def _descriptor(bits: int, tick_ns: int) -> StreamDescriptor:

@@ -62,21 +62,13 @@ def _non_finite(check: Check) -> None:
         ending = _ending(0.0)
         touch = ending.tactile_kpa.copy()
         touch[1, 1, 300] = bad
-        check.refused(
-            f"probe, touch {bad}",
-            _probe().verdict,
-            replace(ending, tactile_kpa=touch),
-            kind=NonFiniteError,
-        )
+        broken_ending = replace(ending, tactile_kpa=touch)
+        check.refused(f"probe, touch {bad}", _probe().verdict, broken_ending, kind=NonFiniteError)
         for column in (0, JOINTS_LEFT.start):
             reached = _seen().action_reached.copy()
             reached[-1, column] = bad
-            check.refused(
-                f"policy, reached {bad}",
-                _act,
-                replace(_seen(), action_reached=reached),
-                kind=DexTouchError,
-            )
+            broken = replace(_seen(), action_reached=reached)
+            check.refused(f"policy, reached {bad}", _act, broken, kind=DexTouchError)
         poses = np.zeros((3, 2, 7), dtype=np.float32)
         poses[..., 3], poses[1, 0, 2] = 1.0, bad
         check.true("an object somewhere unknown is absent", not known_objects(poses)[0])
@@ -91,17 +83,13 @@ def _touch(check: Check) -> None:
         check.true("probabilities in 0 … 1", 0 <= probability <= 1)
         touch = np.full_like(_seen().tactile_kpa, pressure_kpa)
         _command_is_bounded(check, _act(replace(_seen(), tactile_kpa=touch)))
-    check.at_most(
-        "a saturated hand in an empty scene: probability of success",
-        _probe().probability(_ending(99_999.0)),
-        0.5,
-    )
+    what = "a saturated hand in an empty scene: probability of success"
+    check.at_most(what, _probe().probability(_ending(99_999.0)), 0.5)
 
 
 @STAGE.cell("ends", "an ending of 2 steps; the policy at step 0 and long after its horizon")
 def _ends(check: Check) -> None:
-    short = replace(_seen(2), tactile_kpa=_seen(2).tactile_kpa)
-    check.refused("2 steps", Ending.of, short, "stand_bottle", imagined=False)
+    check.refused("2 steps", Ending.of, _seen(2), "stand_bottle", imagined=False)
     check.refused("no ending", _probe().probabilities, [])
     for step in (0, 79, 80, 10**6):
         _command_is_bounded(check, _act(replace(_seen(), first_step=step)))
@@ -153,12 +141,9 @@ def _batch(check: Check) -> None:
     together = _probe().probabilities(endings)
     alone = [_probe().probability(ending) for ending in endings]
     check.at_most("probabilities differ", np.abs(together - alone).max(), 1e-5)
-    many = _probe().probabilities(endings[:2] * 150)
-    check.at_most(
-        "probabilities in parts of 256 differ",
-        np.abs(many.reshape(-1, 2) - together[:2]).max(),
-        1e-5,
-    )
+    many = _probe().probabilities(endings[:2] * 150).reshape(-1, 2)
+    off = np.abs(many - together[:2]).max()
+    check.at_most("probabilities in parts of 256 differ", off, 1e-5)
 
 
 STAGE.does_not_apply(

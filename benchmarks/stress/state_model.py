@@ -4,6 +4,7 @@ A small model with random weights stands in for a trained one: the checks must h
 """
 
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import TASK, Subject
 from dextouch.errors import EndedError, InvalidInputError
 from services.world_model.checkpoints import (
-    StateCheckpoint,
     StateMetadata,
     read_state_checkpoint,
     write_state_checkpoint,
@@ -43,10 +43,9 @@ def _ends(check: Check) -> None:
 def _precision(check: Check) -> None:
     subject = _subject()
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
-        found = _checkpoint()
-        checkpoint = StateCheckpoint(
-            found.dynamics.to(dtype), found.renderer, found.metadata, found.digest
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            found = read_state_checkpoint(_written(Path(folder)))
+        checkpoint = replace(found, dynamics=found.dynamics.to(dtype))
         check.refused(
             f"weights {dtype}",
             lambda c=checkpoint: Subject(StateWorld(c), subject.begun).step(subject.still()),
@@ -57,14 +56,11 @@ def _precision(check: Check) -> None:
 @STAGE.cell("long_run", "hands that stand still for 63 chunks; hands that move until it refuses")
 def _long_run(check: Check) -> None:
     subject = _subject()
-    first = subject.world.reset(subject.touching(0.0))
-    peaks = worlds.still_peaks_kpa(subject)
-    check.at_most("peak of still hands, of random weights", max(peaks), _TRAINED_KPA, "kPa")
-    state, poses = first.state, first.observation.object_poses
-    for chunk in range(worlds.NUM_CHUNKS):
-        stepped = subject.world.step(state, subject.still(), seed=chunk, selector=worlds.TOUCH_ONLY)
-        state = stepped.state
-    last = stepped.observation.object_poses
+    poses = subject.world.reset(subject.touching(0.0)).observation.object_poses
+    seen = worlds.stand_still(subject)
+    peak_kpa = worlds.peak_kpa(seen)
+    check.at_most("peak of still hands, of random weights", peak_kpa, _TRAINED_KPA, "kPa")
+    last = seen[-1].object_poses
     check.true("it gives object poses", poses is not None and last is not None)
     if poses is not None and last is not None:
         moved_m = np.abs(last[-1, :, :3] - poses[-1, :, :3]).max()
@@ -81,23 +77,16 @@ STAGE.does_not_apply(
 
 def _play(check: Check, subject: Subject) -> None:
     state = subject.world.reset(subject.begun.start).state
-    for index, chunk in enumerate(worlds.there_and_back(subject.actions)):
-        stepped = subject.world.step(state, chunk, seed=index, selector=worlds.TOUCH_ONLY)
-        state = stepped.state
+    for stepped in worlds.play(subject.world, state, worlds.there_and_back(subject.actions)):
         check.finite("touch of moving hands", stepped.observation.tactile_kpa)
-        uncertainty = stepped.observation.uncertainty
-        check.true("every answer says how far it is trusted", uncertainty is not None)
+        trusted = stepped.observation.uncertainty is not None
+        check.true("every answer says how far it is trusted", trusted)
 
 
 @cache
 def _subject() -> Subject:
     with tempfile.TemporaryDirectory() as folder:
         return Subject(open_world(_written(Path(folder))), worlds.demonstration(_PX))
-
-
-def _checkpoint() -> StateCheckpoint:
-    with tempfile.TemporaryDirectory() as folder:
-        return read_state_checkpoint(_written(Path(folder)))
 
 
 def _written(folder: Path) -> Path:

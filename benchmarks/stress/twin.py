@@ -11,6 +11,8 @@ from benchmarks.stress.worlds import (
     TASK,
     TOUCH_ONLY,
     demonstration,
+    peak_kpa,
+    play,
     there_and_back,
 )
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
@@ -57,7 +59,10 @@ def _non_finite(check: Check) -> None:
     for what, column, value in (("3 m", 0, 3.0), ("50 rad", JOINTS_LEFT.start, 50.0)):
         wild = _still(16)
         wild[4:, column] = value
-        _bounded_or_refused(check, what, wild)
+        try:
+            _answers(check, _step(wild))
+        except InvalidInputError as error:
+            check.true(f"{what}: {type(error).__name__}", holds=True)
     check.true("the state stands as it was", world.snapshot(begun.state) == before)
     check.equal("and plays as before", _step(_still(16)).tactile_kpa, _step(_still(16)).tactile_kpa)
 
@@ -66,32 +71,27 @@ def _non_finite(check: Check) -> None:
 def _touch(check: Check) -> None:
     check.at_most("touch of hands in the air", _step(_still(16)).tactile_kpa.max(), 0.0, "kPa")
     world, begun = _begun()
-    state, peak_kpa = begun.state, 0.0
     down = _still(16)
     # Commands are relative to the wrist: down in the world is the anchor's third row.
     direction = begun.anchor.T_world_wrist_right[2, :3]
     down[:, WRIST_RIGHT.start : WRIST_RIGHT.start + 3] -= (
         np.linspace(0.025, 0.4, 16)[:, None] * direction
     )
-    for actions in (down, np.repeat(down[-1:], 16, axis=0)):
-        stepped = world.step(state, actions, seed=0, selector=TOUCH_ONLY)
-        state, kpa = stepped.state, stepped.observation.tactile_kpa
-        _answers(check, stepped.observation)
-        peak_kpa = max(peak_kpa, float(kpa.max()))
-    check.true("the hand feels the table", peak_kpa > 0)
-    check.at_most("peak pressure", peak_kpa, _MAX_KPA, "kPa")
+    chunks = (down, np.repeat(down[-1:], 16, axis=0))
+    seen = [stepped.observation for stepped in play(world, begun.state, chunks)]
+    for observation in seen:
+        _answers(check, observation)
+    check.true("the hand feels the table", peak_kpa(seen) > 0)
+    check.at_most("peak pressure", peak_kpa(seen), _MAX_KPA, "kPa")
 
 
 @STAGE.cell("ends", "one step; a rollout cut into chunks of 16 and of 4 steps")
 def _ends(check: Check) -> None:
     world, begun = _begun()
-    actions = demonstration(16).actions
-    whole = world.step(begun.state, actions[:16], seed=0, selector=TOUCH_ONLY)
-    state = begun.state
-    for k in range(0, 16, 4):
-        stepped = world.step(state, actions[k : k + 4], seed=0, selector=TOUCH_ONLY)
-        state = stepped.state
-    check.equal("physics", state.physics, whole.state.physics)
+    actions = demonstration(16).actions[:16]
+    (whole,) = play(world, begun.state, [actions])
+    *_, last = play(world, begun.state, np.split(actions, 4))
+    check.equal("physics", last.state.physics, whole.state.physics)
     check.true("one step gives one", len(_step(_still(1))) == 1)
     check.refused("no step", lambda: _step(_still(1)[:0]))
 
@@ -112,22 +112,12 @@ def _precision(check: Check) -> None:
 )
 def _long_run(check: Check) -> None:
     world, begun = _begun()
-    actions = demonstration(16).actions
-    state = begun.state
-    for chunk in there_and_back(actions):
-        stepped = world.step(state, chunk, seed=0, selector=TOUCH_ONLY)
-        state = stepped.state
+    chunks = there_and_back(demonstration(16).actions)
+    for stepped in play(world, begun.state, chunks):
         _answers(check, stepped.observation)
-    check.at_most(
-        "wrist off its last command",
-        np.abs(stepped.observation.action_reached[-1] - chunk[-1])[:3].max(),
-        0.05,
-        "m",
-    )
-    state = begun.state
-    for _ in range(NUM_CHUNKS):
-        stepped = world.step(state, _still(16), seed=0, selector=TOUCH_ONLY)
-        state = stepped.state
+    off_m = np.abs(stepped.observation.action_reached[-1] - chunks[-1][-1])[:3].max()
+    check.at_most("wrist off its last command", off_m, 0.05, "m")
+    *_, stepped = play(world, begun.state, [_still(16)] * NUM_CHUNKS)
     drift_m = np.abs(stepped.observation.action_reached[-1] - _still(1)[0])[:3].max()
     check.at_most("still wrist drifts", drift_m, 1e-5, "m")
     check.at_most("still hands feel", stepped.observation.tactile_kpa.max(), 0.0, "kPa")
@@ -136,18 +126,16 @@ def _long_run(check: Check) -> None:
 @STAGE.cell("batch", "two rollouts in turns in one world, and alone in worlds of their own")
 def _batch(check: Check) -> None:
     world = TwinWorld(_SETTINGS)
-    actions = demonstration(16).actions
-    states = [world.reset(RolloutStart(TASK, seed, "")).state for seed in (SEED, SEED + 1)]
-    for k in (0, 16):
-        states = [
-            world.step(s, actions[k : k + 16], seed=0, selector=TOUCH_ONLY).state for s in states
-        ]
-    for seed, state in zip((SEED, SEED + 1), states, strict=True):
-        alone = TwinWorld(_SETTINGS)
-        own = alone.reset(RolloutStart(TASK, seed, "")).state
-        for k in (0, 16):
-            own = alone.step(own, actions[k : k + 16], seed=0, selector=TOUCH_ONLY).state
-        check.equal("physics", state.physics, own.physics)
+    chunks = np.split(demonstration(16).actions[:32], 2)
+    starts = [RolloutStart(TASK, seed, "") for seed in (SEED, SEED + 1)]
+    in_turns = zip(
+        *(play(world, world.reset(start).state, chunks) for start in starts), strict=True
+    )
+    *_, together = in_turns
+    for start, stepped in zip(starts, together, strict=True):
+        own = TwinWorld(_SETTINGS)
+        *_, alone = play(own, own.reset(start).state, chunks)
+        check.equal("physics", stepped.state.physics, alone.state.physics)
 
 
 STAGE.does_not_apply(
@@ -175,22 +163,11 @@ def _step(actions: np.ndarray) -> Observation:
 
 def _reached(actions: np.ndarray) -> np.ndarray:
     world, begun = _begun()
-    state, reached = begun.state, []
-    for k in range(0, len(actions), 16):
-        stepped = world.step(state, actions[k : k + 16], seed=0, selector=TOUCH_ONLY)
-        state = stepped.state
-        reached.append(stepped.observation.action_reached)
-    return np.concatenate(reached)
+    played = play(world, begun.state, np.split(actions, len(actions) // 16))
+    return np.concatenate([stepped.observation.action_reached for stepped in played])
 
 
 def _answers(check: Check, observation: Observation) -> None:
     check.finite("touch", observation.tactile_kpa)
     check.finite("reached poses", observation.action_reached)
     check.at_most("pressure below zero", -float(observation.tactile_kpa.min()), 0.0, "kPa")
-
-
-def _bounded_or_refused(check: Check, what: str, actions: np.ndarray) -> None:
-    try:
-        _answers(check, _step(actions))
-    except InvalidInputError as error:
-        check.true(f"{what}: {type(error).__name__}", holds=True)

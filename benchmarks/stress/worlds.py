@@ -1,6 +1,6 @@
 """Stress checks shared by all kinds of world models, and their rollout start."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from dextouch.errors import DegenerateRotationError, NonFiniteError, ShapeError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
-from dextouch.worlds import BatchWorld
+from dextouch.worlds import BatchWorld, State, SteppedRollout, World
 from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
@@ -81,10 +81,7 @@ def add_shared_cells(
 ) -> None:
     """Add the checks of rotations, numbers, touch and batches, the same for every world model.
 
-    Args:
-        stage: to add them to.
-        subject: opens what is tried.
-        trained_kpa: the largest pressure that the model was trained on.
+    `subject` opens what is tried, `trained_kpa` tells the largest pressure of its training.
     """
     stage.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")(
         lambda check: check_rotations(check, subject())
@@ -174,15 +171,26 @@ def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
     check.refused("no rollout", subject.world.step_batch, [], chunks[:0], seeds=[])
 
 
-def still_peaks_kpa(subject: Subject) -> list[float]:
-    """Peak pressure of each of 63 chunks in which untouched hands stand still."""
-    state = subject.world.reset(subject.touching(0.0)).state
-    peaks = []
-    for chunk in range(NUM_CHUNKS):
-        stepped = subject.world.step(state, subject.still(), seed=chunk, selector=TOUCH_ONLY)
+def play(
+    world: World[State], state: State, chunks: Iterable[np.ndarray]
+) -> Iterator[SteppedRollout[State]]:
+    """Chunk after chunk from a state, with touch but without images."""
+    for index, chunk in enumerate(chunks):
+        stepped = world.step(state, chunk, seed=index, selector=TOUCH_ONLY)
         state = stepped.state
-        peaks.append(float(stepped.observation.tactile_kpa.max()))
-    return peaks
+        yield stepped
+
+
+def stand_still(subject: Subject) -> list[Observation]:
+    """Observations of 63 chunks in which untouched hands stand still."""
+    state = subject.world.reset(subject.touching(0.0)).state
+    chunks = [subject.still()] * NUM_CHUNKS
+    return [stepped.observation for stepped in play(subject.world, state, chunks)]
+
+
+def peak_kpa(observations: Iterable[Observation]) -> float:
+    """The greatest pressure; NaN where any is."""
+    return float(np.max([one.tactile_kpa.max() for one in observations]))
 
 
 def there_and_back(actions: np.ndarray) -> Sequence[np.ndarray]:

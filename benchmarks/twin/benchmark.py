@@ -10,21 +10,13 @@ import numpy as np
 
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most
-from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
-from benchmarks.twin.physics import (
-    AS_SERVED,
-    SOLVERS,
-    ContactChunks,
-    ContactError,
-    contact_error,
-)
+from benchmarks.twin.physics import AS_SERVED, SOLVERS, ContactChunks, ContactError, contact_error
 from services.twin.tasks import TASK_NAMES
 
-PACKAGES: Final = ("numpy", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
 # 16 steps at 15 a second.
@@ -42,12 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time a chunk alternately with every selector, then chunks with contact with every solver.
-
-    Raises:
-        InvalidInputError: no round.
-    """
-    del folder
+    """Time a chunk alternately with every selector, then chunks with contact with every solver."""
     plan = AMOUNTS.of(options)
     chunk = TimedChunk(options.task, FIRST_SEED)
     subjects = chunk.subjects()
@@ -55,12 +42,27 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         found = interleaved(subjects, plan["rounds"], on_step=step)
     times_ms = {name: Figure.of(values) for name, values in found.items()}
     solver_ms, errors, num_chunks = _solvers(options.task, plan, bar)
+    points = [
+        Point.of(name, solver_ms[name], error.force_n, is_ours=name == AS_SERVED)
+        for name, error in errors.items()
+    ]
+    label = "RMS error of pad forces after one chunk (N)"
     return StageReport(
         stage="twin",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "mujoco-core"),
         options={**plan, "task": options.task, "chunks_with_contact": num_chunks},
-        tables=[selector_table(times_ms), solver_table(solver_ms, errors, num_chunks)],
-        panels=[panel(solver_ms, errors)],
+        tables=[
+            ResultTable(
+                "A chunk of 16 steps by requested observation",
+                ("requested", "ms", "times real time"),
+                [
+                    (name, figure.text(), figure.inverse(CHUNK_MS).text())
+                    for name, figure in times_ms.items()
+                ],
+            ),
+            solver_table(solver_ms, errors, num_chunks),
+        ],
+        panels=[Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)],
         requirements=requirements(times_ms, states_are_equal=chunk.states_are_equal()),
         data={
             "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
@@ -71,18 +73,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             },
         },
         notes=["times are processor time of the whole process, with one thread"],
-    )
-
-
-def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
-    """Milliseconds of a chunk, and its speed relative to real time."""
-    return ResultTable(
-        "A chunk of 16 steps by requested observation",
-        ("requested", "ms", "times real time"),
-        [
-            (name, figure.text(), figure.inverse(CHUNK_MS).text())
-            for name, figure in times_ms.items()
-        ],
     )
 
 
@@ -106,28 +96,14 @@ def solver_table(
     )
 
 
-def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) -> Panel:
-    """Time of a chunk against its contact error, relative to the default solver."""
-    points = [
-        Point.of(name, times_ms[name], error.force_n, is_ours=name == AS_SERVED)
-        for name, error in errors.items()
-    ]
-    label = "RMS error of pad forces after one chunk (N)"
-    return Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)
-
-
 def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> list[Requirement]:
     """Requirements on selectors of the twin."""
     saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
-    share = times_ms[HEAD].median / CHUNK_MS
+    share, equal = times_ms[HEAD].median / CHUNK_MS, float(states_are_equal)
     return [
         at_most(f"{HEAD_LAST}, share of the time of {HEAD}", saved, 0.9),
         at_most(f"{HEAD}, share of real time", share, 0.5),
-        at_least(
-            "selectors that leave the state after a chunk as it is, share",
-            float(states_are_equal),
-            1.0,
-        ),
+        at_least("selectors that leave the state after a chunk as it is, share", equal, 1.0),
     ]
 
 

@@ -26,12 +26,7 @@ SELECTORS: Final = {
 
 
 class TimedChunk:
-    """One chunk of a demonstration with contact, stepped repeatedly from the same state.
-
-    Args:
-        task: of the twin.
-        seed: of the demonstration.
-    """
+    """One chunk of a demonstration with contact, stepped repeatedly from the same state."""
 
     def __init__(self, task: str, seed: int) -> None:
         self._world = TwinWorld(TwinSettings())

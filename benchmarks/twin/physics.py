@@ -1,7 +1,7 @@
 """Contact errors of the twin under coarser MuJoCo solvers, relative to the default solver."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,25 +15,16 @@ from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Simulati
 from services.twin.stage import Plan, Stage, command_row
 
 AS_SERVED: Final = "as served"
-_MM_PER_M: Final = 1e3
 
 
-@dataclass(frozen=True)
-class Solver:
-    """Options of MuJoCo's constraint solver; None: as in the twin."""
-
-    iterations: int | None = None
-    kind: int | None = None
-    cone: int | None = None
-
-
-SOLVERS: Final = {
-    AS_SERVED: Solver(),
-    "3 Newton steps": Solver(iterations=3),
-    "2 Newton steps": Solver(iterations=2),
-    "1 Newton step": Solver(iterations=1),
-    "pyramidal cones": Solver(cone=int(mujoco.mjtCone.mjCONE_PYRAMIDAL)),
-    "CG": Solver(kind=int(mujoco.mjtSolver.mjSOL_CG)),
+# Options of MuJoCo that differ from the twin's.
+SOLVERS: Final[Mapping[str, Mapping[str, int]]] = {
+    AS_SERVED: {},
+    "3 Newton steps": {"iterations": 3},
+    "2 Newton steps": {"iterations": 2},
+    "1 Newton step": {"iterations": 1},
+    "pyramidal cones": {"cone": int(mujoco.mjtCone.mjCONE_PYRAMIDAL)},
+    "CG": {"solver": int(mujoco.mjtSolver.mjSOL_CG)},
 }
 
 
@@ -50,10 +41,8 @@ class Played:
 class ContactError:
     """Errors of chunks relative to the default solver, from the same initial states.
 
-    Attributes:
-        force_n: root mean square error over pads and samples with contact.
-        force_rms_n: root mean square of the true forces that are not zero.
-        object_mm: median error of final object positions over chunks and objects.
+    Forces are root mean squares: the error over pads and samples with contact, and the true forces
+    that are not zero. `object_mm` is the median error of final positions over chunks and objects.
     """
 
     force_n: float
@@ -65,10 +54,6 @@ class ContactChunks:
     """Chunks of demonstrations, started from the states that the default solver reaches.
 
     Errors are therefore those of one chunk and do not accumulate.
-
-    Args:
-        task: of the twin.
-        seeds: of the demonstrations.
     """
 
     def __init__(self, task: str, seeds: Sequence[int]) -> None:
@@ -86,20 +71,18 @@ class ContactChunks:
     def __len__(self) -> int:
         return len(self._begins)
 
-    def play(self, solver: Solver) -> list[Played]:
-        """Play every chunk with one solver; the default options are restored afterwards."""
+    def play(self, solver: Mapping[str, int]) -> list[Played]:
+        """Play every chunk with other options; the default ones are restored afterwards."""
         played, simulation = [], self._simulation
         option = simulation.scene.model.opt
-        kept = option.iterations, option.solver, option.cone
+        kept = {name: getattr(option, name) for name in solver}
         for plan, first, state in self._begins:
             simulation.set_state(state, step_index=(first - 1) * STEPS_PER_GRID)
-            option.iterations = kept[0] if solver.iterations is None else solver.iterations
-            option.solver = kept[1] if solver.kind is None else solver.kind
-            option.cone = kept[2] if solver.cone is None else solver.cone
-            try:
-                played.append(_play(simulation, plan, first))
-            finally:
-                option.iterations, option.solver, option.cone = kept
+            for name, value in solver.items():
+                setattr(option, name, value)
+            played.append(_play(simulation, plan, first))
+            for name, value in kept.items():
+                setattr(option, name, value)
         return played
 
 
@@ -114,7 +97,7 @@ def contact_error(played: Sequence[Played], truth: Sequence[Played]) -> ContactE
     return ContactError(
         force_n=float(np.sqrt(np.mean(off_n[felt] ** 2))) if felt.any() else 0.0,
         force_rms_n=float(np.sqrt(np.mean(true_n[true_n > 0] ** 2))),
-        object_mm=_MM_PER_M * float(np.median(np.linalg.norm(off_m, axis=1))),
+        object_mm=1e3 * float(np.median(np.linalg.norm(off_m, axis=1))),
     )
 
 

@@ -1,30 +1,23 @@
 """Entry point of the benchmark stage `world-model`."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.figures import Figure
-from benchmarks.machine import describe_machine
-from benchmarks.report import StageReport
+from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from benchmarks.world_model.held_out import HeldOut, held_out
-from benchmarks.world_model.rollouts import (
-    RolloutError,
-    imagine,
-    imagine_together,
-    rollout_error,
-)
+from benchmarks.world_model.rollouts import Imagined, imagine, imagine_together, rollout_error
 from benchmarks.world_model.tables import (
     COPY_FIRST,
     STATE_BATCHES,
     Variant,
     asked_name,
-    cost_table,
     error_table,
     panels,
     requirements,
@@ -37,15 +30,10 @@ from dextouch.worlds import BatchWorld, CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
 from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
 from services.world_model.network.model import Sampling
-from services.world_model.shipped_checkpoints import (
-    PRETRAINED,
-    STATE_MODEL,
-    paper_form_checkpoint,
-)
+from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL, paper_form_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 
-PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
 AMOUNTS: Final = Amounts(usual={"rounds": 7, "seeds": 6}, quick={"rounds": 1, "seeds": 1})
@@ -75,12 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Predict held-out demonstrations with different settings, alternately.
-
-    Raises:
-        InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
-    """
-    del folder
+    """Predict held-out demonstrations with different settings, alternately."""
     plan = AMOUNTS.of(options)
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
@@ -104,30 +87,36 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         step("making")
         seeds = range(FIRST_SEED, FIRST_SEED + plan["seeds"])
         episodes = held_out(tasks, seeds, world.description.image_height_px)
-    worlds: dict[str, World[Any]] = {
-        COPY_FIRST: CopyFirstWorld.beside(world.description),
-        **variants,
-    }
+    copied = CopyFirstWorld.beside(world.description)
+    worlds: dict[str, World[Any]] = {COPY_FIRST: copied, **variants}
     errors = {name: rollout_error(imagine(one, episodes), episodes) for name, one in worlds.items()}
-    times_ms = _times(worlds, episodes, plan["rounds"], bar)
-    costs_ms = _costs(world, episodes[:1], TOGETHER, plan["rounds"], bar)
-    state_world = _state_world(options.state_model)
-    state_ms = _state_costs(state_world, plan["rounds"], bar)
+    imagining = {name: partial(imagine, one, episodes) for name, one in worlds.items()}
+    times_ms = _times_ms(imagining, "steps and precision", plan["rounds"], bar)
+    costs_ms = _costs_ms(world, episodes[:1], TOGETHER, plan["rounds"], bar)
+    state_model = options.state_model or PRETRAINED / STATE_MODEL
+    state_world = StateWorld(read_state_checkpoint(state_model))
+    state_ms = _state_costs_ms(state_world, plan["rounds"], bar)
     return StageReport(
         stage="world-model",
-        machine=describe_machine(PACKAGES),
+        packages=("numpy", "torch", "mujoco-core"),
         options={**plan, "tasks": tasks, "checkpoint": world.description.name, "served": served},
         tables=[
             error_table(times_ms, errors, served, len(episodes)),
-            cost_table(costs_ms, served),
+            ResultTable(
+                f"{served}: a chunk of one rollout, by requested images and batch size",
+                ("requested", "ms"),
+                [(name, figure.text()) for name, figure in costs_ms.items()],
+            ),
             state_model_table(state_ms, state_world.description.name),
         ],
         panels=panels(times_ms, errors, served),
-        requirements=[
-            *requirements(times_ms, errors, served),
-            *state_model_requirements(state_ms),
-        ],
-        data=_data(times_ms, errors, costs_ms, state_ms),
+        requirements=requirements(times_ms, errors, served) + state_model_requirements(state_ms),
+        data={
+            "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
+            "errors": {name: asdict(error) for name, error in errors.items()},
+            "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
+            "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
+        },
         notes=[
             "times are processor time of the whole process; OMP_NUM_THREADS=1 gives one thread",
             "every chunk starts from the predicted end of the previous one",
@@ -135,32 +124,26 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     )
 
 
-def _times(
-    worlds: Mapping[str, World[Any]], episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
+def _times_ms(
+    imagining: Mapping[str, Callable[[], Imagined]], what: str, num_rounds: int, bar: Bar
 ) -> dict[str, Figure]:
-    subjects = {
-        name: every_round(partial(imagine, world, episodes)) for name, world in worlds.items()
-    }
-    with bar("steps and precision", num_rounds * len(subjects)) as step:
+    subjects = {name: every_round(measured) for name, measured in imagining.items()}
+    with bar(what, num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
 
 
-def _state_world(path: Path | None) -> StateWorld:
-    return StateWorld(read_state_checkpoint(path or PRETRAINED / STATE_MODEL))
-
-
-def _state_costs(world: StateWorld, num_rounds: int, bar: Bar) -> dict[str, Figure]:
+def _state_costs_ms(world: StateWorld, num_rounds: int, bar: Bar) -> dict[str, Figure]:
     """Milliseconds per chunk of the state model, with one demonstration of each of its tasks."""
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     episodes = held_out(tasks, [FIRST_SEED], world.description.image_height_px)
     # Choice of precision, memory of the first images, and traces.
     for selector in SELECTORS.values():
         imagine_together(world, episodes, 1, selector)
-    return _costs(world, episodes, STATE_BATCHES, num_rounds, bar)
+    return _costs_ms(world, episodes, STATE_BATCHES, num_rounds, bar)
 
 
-def _costs(
+def _costs_ms(
     world: BatchWorld[Any],
     episodes: Sequence[HeldOut],
     batches: Sequence[int],
@@ -168,27 +151,9 @@ def _costs(
     bar: Bar,
 ) -> dict[str, Figure]:
     """Milliseconds per chunk of one rollout, by requested images and batch size."""
-    subjects = {
-        asked_name(asked, count): every_round(
-            partial(imagine_together, world, episodes, count, selector)
-        )
+    imagining = {
+        asked_name(asked, count): partial(imagine_together, world, episodes, count, selector)
         for count in batches
         for asked, selector in SELECTORS.items()
     }
-    with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
-        found = interleaved(subjects, num_rounds, on_step=step)
-    return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
-
-
-def _data(
-    times_ms: Mapping[str, Figure],
-    errors: Mapping[str, RolloutError],
-    costs_ms: Mapping[str, Figure],
-    state_ms: Mapping[str, Figure],
-) -> dict[str, Any]:
-    return {
-        "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
-        "errors": {name: asdict(error) for name, error in errors.items()},
-        "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
-        "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
-    }
+    return _times_ms(imagining, "requested images and batch sizes", num_rounds, bar)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from benchmarks.evaluator.playing import start_in_twin
-from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
@@ -34,13 +34,7 @@ class HeldOut:
 
 
 def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[HeldOut]:
-    """The twin's demonstrations of these tasks and seeds, seen by the head camera.
-
-    Args:
-        tasks: of the twin.
-        seeds: held-out seeds.
-        image_px: width and height of the images.
-    """
+    """The twin's demonstrations of tasks and seeds, seen by the head camera in square images."""
     settings = TwinSettings(
         cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
     )
@@ -54,17 +48,8 @@ def _played(world: TwinWorld, task: str, seed: int) -> HeldOut:
     actions = scripted_actions(stage, seed, script_name(0.0))
     state, seen = begun.state, []
     for first in range(0, len(actions), CHUNK_STEPS):
-        stepped = world.step(
-            state,
-            actions[first : first + CHUNK_STEPS],
-            seed=0,
-            selector=ReturnSelector(cameras=(HEAD_CAMERA,)),
-        )
+        stepped = world.step(state, actions[first : first + CHUNK_STEPS], seed=0)
         state = stepped.state
         seen.append(stepped.observation)
-    return HeldOut(
-        start=start,
-        actions=actions,
-        images=np.concatenate([one.images[HEAD_CAMERA] for one in seen]),
-        tactile_kpa=np.concatenate([one.tactile_kpa for one in seen]),
-    )
+    images = np.concatenate([one.images[HEAD_CAMERA] for one in seen])
+    return HeldOut(start, actions, images, np.concatenate([one.tactile_kpa for one in seen]))

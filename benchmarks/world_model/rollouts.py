@@ -72,13 +72,13 @@ def imagine_together(
 def rollout_error(imagined: Imagined, episodes: Sequence[HeldOut]) -> RolloutError:
     """Errors of rollouts with all images relative to the twin."""
     all_seen = [one for seen in imagined.seen for one in seen]
-    pairs = list(zip(imagined.seen, episodes, strict=True))
-    true_images = [episode.images[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
-    true_touches = [episode.tactile_kpa[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
+    pairs = zip(imagined.seen, episodes, strict=True)
+    lengths = [(episode, CHUNK_STEPS * len(seen)) for seen, episode in pairs]
     images = np.concatenate([one.images[HEAD_CAMERA] for one in all_seen])
-    off_levels = images.astype(np.float64) - np.concatenate(true_images)
+    true_images = np.concatenate([episode.images[:length] for episode, length in lengths])
+    off_levels = images.astype(np.float64) - true_images
     touch = np.concatenate([one.tactile_kpa for one in all_seen])
-    true_touch = np.concatenate(true_touches)
+    true_touch = np.concatenate([episode.tactile_kpa[:length] for episode, length in lengths])
     off_kpa = touch.astype(np.float64) - true_touch
     return RolloutError(
         image_levels=float(np.sqrt(np.mean(off_levels**2))),

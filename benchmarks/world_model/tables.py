@@ -60,15 +60,6 @@ def error_table(
     )
 
 
-def cost_table(costs_ms: Mapping[str, Figure], served: str) -> ResultTable:
-    """Time of one rollout's chunk by requested images and batch size."""
-    return ResultTable(
-        f"{served}: a chunk of one rollout, by requested images and batch size",
-        ("requested", "ms"),
-        [(name, figure.text()) for name, figure in costs_ms.items()],
-    )
-
-
 def asked_name(asked: str, batch: int) -> str:
     """Name of the figure for requested images and a batch size."""
     return f"{asked}, batch of {batch}"

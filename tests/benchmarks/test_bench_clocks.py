@@ -19,11 +19,11 @@ from benchmarks.clocks.scenes import (
     STAMPLESS_SCENES,
     STOP_SCENES,
     Scene,
-    find_scene,
     simulate,
 )
 from benchmarks.clocks.scores import score
 from benchmarks.command import stage_parser
+from benchmarks.stages import named
 from dextouch.errors import InvalidInputError, UnknownNameError
 
 
@@ -104,5 +104,5 @@ def test_options_that_mean_nothing_are_refused(words, tmp_path):
 
 
 def test_every_scene_can_be_named_in_a_list():
-    for name in SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES:
-        assert [find_scene(part) for part in name.split(",")] == [find_scene(name)]
+    scenes = SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES
+    assert named("scene", scenes, ",".join(scenes)) == scenes

@@ -193,10 +193,9 @@ def fake_stage(monkeypatch):
         figure = options.figure
         return StageReport(
             stage="fake",
-            machine={"cores": "2"},
+            packages=["numpy"],
             options={},
             tables=[ResultTable("Results", ("design", "time"), [("ours", "1 [s]")])],
-            panels=[],
             requirements=[Requirement("speed", figure, "at least", 2.0, "m/s")],
             data={"designs": {"ours": [figure]}},
             notes=["rival is left out"],

@@ -121,21 +121,20 @@ def fake_rival(solve, joint_names=None):
     return set_up
 
 
-def test_a_rivals_joints_are_put_in_order_by_name(monkeypatch, tmp_path):
+def test_a_rivals_joints_are_put_in_order_by_name(monkeypatch):
     names = list(RobotHand("left").joint_names)
     monkeypatch.setattr(
         rival_process, "set_up", fake_rival(lambda _: np.arange(20.0), sorted(names))
     )
-    path = tmp_path / "requests"
-    with path.open("wb") as requests:
-        head = {"side": "left", "scale": 1.0, "num_samples": 3}
-        rival_process._send(requests, head, np.zeros((3, 25, 3)))
-    with path.open("rb") as requests, (tmp_path / "answers").open("w+b") as answers:
-        rival_process.serve("dex vector15", requests, answers)
-        answers.seek(0)
-        assert len(json.loads(answers.readline())["call_s"]) == 3
-        joints = rival_process._receive(answers, (3, 20))
-    assert [sorted(names)[int(value)] for value in joints[2]] == names
+    asked = {"side": "left", "scale": 1.0, "keypoints_m": np.zeros((3, 25, 3)).tolist()}
+    answers = []
+    monkeypatch.setattr(
+        rival_process, "serve_parent", lambda niceness: (iter([asked]), answers.append)
+    )
+    rival_process.serve("dex vector15")
+    (answer,) = answers
+    assert len(answer["call_s"]) == 3
+    assert [sorted(names)[int(value)] for value in answer["joints_rad"][2]] == names
 
 
 def test_the_alarm_counts_processor_time_and_is_not_left_behind():
@@ -175,18 +174,25 @@ def set_up(rival, keypoints_m, side, *, scale, folder):
     return rivals.Setup(list(keypoints_m), solve, list(names))
 rival_process.set_up = set_up
 rival_process.CALL_LIMIT_S = 1.0
-rival_process._main()
+rival_process.serve(sys.argv[1])
 """
 
 
+@pytest.fixture
+def run_as_rival(monkeypatch, tmp_path):
+    """Lets the module of this text be the process of every rival."""
+
+    def run(text):
+        (tmp_path / "a_rival.py").write_text(text)
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.setattr(rival_process, "MODULE", "a_rival")
+
+    return run
+
+
 @pytest.mark.slow
-def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(monkeypatch):
-    begin = subprocess.Popen
-
-    def child(command, **pipes):
-        return begin([sys.executable, "-c", CHILD, command[-1]], stderr=subprocess.DEVNULL, **pipes)
-
-    monkeypatch.setattr(rival_process.subprocess, "Popen", child)
+def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(run_as_rival):
+    run_as_rival(CHILD)
     motion = robot_motion("right", 30, 0, natural=True)
     faulty = {}
     for kind in (1.0, 2.0, 3.0):
@@ -206,17 +212,10 @@ def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_rival_that_does_not_finish_is_a_row(monkeypatch):
-    begin = subprocess.Popen
+def test_a_rival_that_does_not_finish_is_a_row(monkeypatch, run_as_rival):
     # It takes its time at the first sample of all.
-    child_text = CHILD.replace("while reference[0, 0] == 2.0:", "while True:").replace(
-        "1.0\n", "0.2\n"
-    )
-
-    def child(command, **pipes):
-        return begin([sys.executable, "-c", child_text, command[-1]], **pipes)
-
-    monkeypatch.setattr(rival_process.subprocess, "Popen", child)
+    endless = CHILD.replace("while reference[0, 0] == 2.0:", "while True:")
+    run_as_rival(endless.replace("1.0\n", "0.2\n"))
     motion = robot_motion("right", 30, 0, natural=True)
     sets = {"natural range": [motion]}
     monkeypatch.setattr(compare, "_timed_motions", lambda name, effort: [motion])

@@ -9,7 +9,6 @@ from environment import enter
 from lerobot_designs import DIRECT, STREAMING, lerobot_designs
 
 from benchmarks.figures import Requirement
-from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
 from benchmarks.stages import Bar
 from benchmarks.store.compare import DesignResult, Effort, compare
@@ -21,7 +20,6 @@ from benchmarks.store.workload import CAMERAS
 from dextouch.errors import UnknownNameError
 
 OURS = "ours-h264"
-PACKAGES = ("lerobot", "torch", "torchcodec", "datasets", "pyarrow", "av", "numpy")
 NOTES = (
     "LeRobot has one rate: its files hold no native time stamps and nine of ten 100 Hz poses.",
     "LeRobot's item decodes one image of each other camera too, in threads of its own.",
@@ -61,7 +59,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     results = compare(designs, workload, folder, effort, bar)
     return StageReport(
         stage="lerobot",
-        machine=describe_machine(PACKAGES),
+        packages=("lerobot", "torch", "torchcodec", "datasets", "pyarrow", "av", "numpy"),
         options={"seconds": seconds, **asdict(effort), "designs": list(results)},
         tables=[write_table(results), read_table(results)],
         panels=panels(results),
