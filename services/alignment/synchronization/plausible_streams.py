@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
+from dextouch.geometry.rotations import rotation_angle
 from dextouch.hands import CHAINS, chain_indices
 from dextouch.schemas import Domain
 from dextouch.streams import (
@@ -27,6 +28,9 @@ from services.alignment.synchronization.resampling import RefusedReason, runs_of
 RIGHT_SHARE: Final = 0.9
 WRONG_SHARE: Final = 0.3
 MAX_VIEW_RAD: Final = np.radians(75.0)
+# By so much a robot's wrist is behind its command.
+MAX_LAG_RAD: Final = np.radians(30.0)
+COMMANDED: Final = "_commanded"
 MIN_ORDER_SAMPLES: Final = 60
 LEAST_DISTANCE_M: Final = 1e-6
 
@@ -68,7 +72,7 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
                 stream=name,
             )
     stream, parts_ns = _left_out(stream, found)
-    if kind == "pose" and not name.endswith("_commanded"):
+    if kind == "pose" and not name.endswith(COMMANDED):
         return _cut_at_lasting_jumps(CheckedStream(stream, parts_ns), max_gap_ns)
     if kind == "keypoints" and not found:
         stream = _without_frozen_fingers(stream, raw)
@@ -76,10 +80,11 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
 
 
 def check_quaternion_order(streams: Mapping[str, DatedStream], domain: Domain) -> None:
-    """Refuse a head, or a person's wrist, whose quaternions are x, y, z, w.
+    """Refuse a head or a wrist whose quaternions are x, y, z, w.
 
-    Heads are upright and look at the hands, and a person's fingers point away from the head: where
-    that does not hold, but does once the columns are read in the other order, they are in it.
+    Heads are upright and look at the hands, a person's fingers point away from the head, and a
+    robot's wrists turn as commanded: where that does not hold, but does once the columns are read
+    in the other order, they are in it.
 
     Raises:
         InvalidInputError: names the stream.
@@ -92,20 +97,34 @@ def check_quaternion_order(streams: Mapping[str, DatedStream], domain: Domain) -
         {name: _poses_at(streams[name], t_ns, order=order) for name in names}
         for order in ((3, 4, 5, 6), (6, 3, 4, 5))
     )
+    for name in names[1:]:
+        if name + COMMANDED in streams:
+            commanded = _poses_at(streams[name + COMMANDED], t_ns, order=(3, 4, 5, 6))
+            _compare_orders(
+                name,
+                "turned as commanded",
+                *(_share_as_commanded(of[name], commanded) for of in (poses, others)),
+            )
     # Cameras may stand opposite a robot.
     for name in names if domain == "human" else names[:1]:
-        as_read, otherwise = (
-            _share_as_usual(name, {**poses, name: of[name]}) for of in (poses, others)
+        usual = "upright and sees the hands" if name == "head" else "pointing forward"
+        _compare_orders(
+            name,
+            usual,
+            *(_share_as_usual(name, {**poses, name: of[name]}) for of in (poses, others)),
         )
-        if as_read <= WRONG_SHARE and otherwise >= RIGHT_SHARE:
-            usual = "is upright and sees the hands" if name == "head" else "points forward"
-            raise InvalidInputError(
-                f"stream {name!r}: {usual} in {as_read:.0%} of the samples, but in {otherwise:.0%} "
-                "of them if its quaternions are x, y, z, w; expected w, x, y, z: correct the order "
-                "where they are sent, and record again",
-                fault="quaternion_order",
-                stream=name,
-            )
+
+
+def _compare_orders(name: str, usual: str, as_read: float, otherwise: float) -> None:
+    """Refuse a stream that is as usual only in the other order of its quaternions."""
+    if as_read <= WRONG_SHARE and otherwise >= RIGHT_SHARE:
+        raise InvalidInputError(
+            f"stream {name!r}: {usual} in {as_read:.0%} of the samples, but in {otherwise:.0%} of "
+            "them if its quaternions are x, y, z, w; expected w, x, y, z: correct the order where "
+            "they are sent, and record again",
+            fault="quaternion_order",
+            stream=name,
+        )
 
 
 def _left_out(
@@ -203,6 +222,14 @@ def _share_as_usual(name: str, Ts: Mapping[str, np.ndarray]) -> float:
     # Rows of images go down, and z of the world goes up.
     is_upright = head[:, 2, 1] < -np.cos(MAX_VIEW_RAD)
     return float((sees & is_upright).mean())
+
+
+def _share_as_commanded(Ts: np.ndarray, commanded: np.ndarray) -> float:
+    """Share of the samples in which a wrist is turned about as it was commanded."""
+    if min(len(Ts), len(commanded)) < MIN_ORDER_SAMPLES:
+        return 0.0
+    apart_rad = rotation_angle(np.swapaxes(Ts[:, :3, :3], -1, -2) @ commanded[:, :3, :3])
+    return float((apart_rad < MAX_LAG_RAD).mean())
 
 
 def _cosines(some: np.ndarray, others: np.ndarray) -> np.ndarray:
