@@ -45,8 +45,15 @@ class AlignmentOptions(FrozenModel):
         description="longest gap between samples that is interpolated; of slow streams it is 2.5 "
         "nominal periods",
     )
+    max_bridged_ms: float = Field(
+        default=250.0,
+        ge=0,
+        le=10_000,
+        description="longest gap that remains in the episode: its steps are interpolated, marked, "
+        "and not trained on; 0 ends the episode at every gap",
+    )
     min_num_steps: int = Field(
-        default=17, ge=2, description="shortest gap-free interval that becomes an episode"
+        default=17, ge=2, description="fewest measured steps that become an episode"
     )
     wrist: WristChoice = Field(
         default="tracked",
@@ -65,6 +72,17 @@ class AlignmentOptions(FrozenModel):
         if self.objects is None:
             return self
         return self.model_copy(update={"objects": self.objects.of_task(task)})
+
+    @property
+    def max_bridged_steps(self) -> int:
+        """Steps in a row that may be interpolated across a gap and marked."""
+        return int(self.max_bridged_ms * 1e-3 * self.model_rate_hz)
+
+    @property
+    def longest_bridge_ns(self) -> int:
+        """Two samples that are further apart are never connected."""
+        step_ns = 1e9 / self.model_rate_hz
+        return max(self.max_gap_ns, round((self.max_bridged_steps + 2) * step_ns))
 
     @property
     def max_gap_ns(self) -> int:

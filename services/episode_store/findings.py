@@ -79,7 +79,8 @@ def figures_of(
     if "coverage" in quality:
         found["coverage"] = quality["coverage"]
     elif num_steps and "num_steps_refused" in quality:
-        found["coverage"] = num_steps / (num_steps + quality["num_steps_refused"])
+        num_measured = num_steps - quality.get("num_steps_interpolated", 0.0)
+        found["coverage"] = num_measured / (num_steps + quality["num_steps_refused"])
     if isinstance(attributes, EpisodeAttributes):
         found |= _clock_figures(attributes.clocks)
     return found

@@ -196,10 +196,17 @@ def read_rollout(reader: EpisodeReader) -> Scene:
 
 
 def read_windows(reader: EpisodeReader) -> list[Scene]:
-    """An episode as consecutive scenes of one chunk, each from the true step before it."""
+    """An episode as consecutive scenes of one chunk, each from the true step before it.
+
+    Chunks with interpolated actions are left out.
+    """
     grid = EpisodeGrid(reader)
     starts = range(0, len(grid) - CHUNK_STEPS, CHUNK_STEPS)
-    return [_read(grid, start, CHUNK_STEPS, image_every=1) for start in starts]
+    return [
+        _read(grid, start, CHUNK_STEPS, image_every=1)
+        for start in starts
+        if grid.is_measured(start, start + CHUNK_STEPS + 1)
+    ]
 
 
 def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: int) -> Scene:

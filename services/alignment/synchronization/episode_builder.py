@@ -39,8 +39,9 @@ from services.alignment.synchronization.recorded_streams import (
 from services.alignment.synchronization.resampling import (
     EDGE_PERIODS,
     MAX_GAP_PERIODS,
+    bridged_run,
     grid_times_ns,
-    longest_run,
+    interpolated_matrices,
     refused_edges,
     refused_matrices,
     refused_stretches,
@@ -64,12 +65,16 @@ class BuiltEpisode:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """The part of a recording that becomes the episode; matrices say why the rest does not."""
+    """The part of a recording that becomes the episode.
+
+    `matrices` say why the rest does not, and which steps are interpolated across gaps.
+    """
 
     gridded: GriddedStreams
     origin_ns: int
     num_refused: int
-    refused: dict[str, Matrix]
+    num_interpolated: int
+    matrices: dict[str, Matrix]
 
 
 def build_episode(
@@ -79,7 +84,7 @@ def build_episode(
     options: AlignmentOptions,
     on_progress: OnProgress = lambda _: None,
 ) -> BuiltEpisode:
-    """Fit all clocks, find the longest stretch without a gap, and make actions on its grid.
+    """Fit all clocks, find the longest stretch without a long gap, and make actions on its grid.
 
     Streams that the recording lacks are omitted. Time 0 of the episode is the first moment at which
     all streams that make up the action are there. Values of other streams are read only while the
@@ -98,7 +103,7 @@ def build_episode(
         streams[name] = date_stream(recording, name)
     streams = with_tracked_objects(streams, objects)
     checked = {
-        name: checked_stream(stream, max_gap_ns=options.max_gap_ns)
+        name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
         for name, stream in streams.items()
     }
     streams = {name: one.stream for name, one in checked.items()}
@@ -125,6 +130,7 @@ def build_episode(
     ]
     quality = {
         "num_steps_refused": float(stretch.num_refused),
+        "num_steps_interpolated": float(stretch.num_interpolated),
         "origin_after_start_ns": float(stretch.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
@@ -133,7 +139,7 @@ def build_episode(
     listed = () if objects is None else objects.tasks[source.task]
     more = {
         "model_rate_hz": options.model_rate_hz,
-        "calibration": attributes.calibration | stretch.refused,
+        "calibration": attributes.calibration | stretch.matrices,
         "object_names": tuple(one.name for one in listed),
         "object_boxes_m": tuple(one.box_m for one in listed),
     }
@@ -176,8 +182,8 @@ def _find_stretch(
     grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
     gridded = place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
     valid = {name: gridded.at[name].valid for name in needed}
-    first, stop = longest_run(gridded.valid)
-    if stop - first < options.min_num_steps:
+    first, stop = bridged_run(gridded.valid, max_steps=options.max_bridged_steps)
+    if np.count_nonzero(gridded.valid[first:stop]) < options.min_num_steps:
         bad = {name: int((~mine).sum()) for name, mine in valid.items()}
         worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
         raise InvalidInputError(
@@ -190,12 +196,15 @@ def _find_stretch(
         start_ns = min(first_ns.values())
     refused = refused_edges(first_ns, last_ns, start_ns)
     refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
+    inside = {name: mine[first:stop] for name, mine in valid.items()}
     causes_ns = {name: one.parts_ns for name, one in checked.items()}
     return _Stretch(
-        place_streams(moved, grid_ns[first:stop], max_gap_ns=options.max_gap_ns),
+        place_streams(moved, grid_ns[first:stop], max_gap_ns=options.longest_bridge_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),
-        refused_matrices(with_causes(refused, causes_ns, start_ns)),
+        int((~gridded.valid[first:stop]).sum()),
+        refused_matrices(with_causes(refused, causes_ns, start_ns))
+        | interpolated_matrices(grid_ns[first:stop] - grid_ns[first], inside),
     )
 
 

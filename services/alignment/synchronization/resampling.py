@@ -26,6 +26,8 @@ MAX_GAP_PERIODS = 2.5
 # gap: a stream has no samples there; jump, frozen, limits: it has, but they cannot be true;
 # shorter: nothing is wrong but that a longer stretch exists.
 RefusedReason = Literal["late_start", "early_end", "gap", "jump", "frozen", "limits", "shorter"]
+# Of the steps of an episode at least as many are measured, the others interpolated across gaps.
+MIN_MEASURED_SHARE = 0.8
 _KEY = re.compile(rf"refused_({'|'.join(get_args(RefusedReason))})(?:_(\w+))?_s")
 NS_PER_S = 1e9
 
@@ -98,6 +100,27 @@ def longest_run(valid: np.ndarray) -> tuple[int, int]:
     return max(runs_of(valid), key=lambda run: run[1] - run[0], default=(0, 0))
 
 
+def bridged_run(valid: np.ndarray, *, max_steps: int) -> tuple[int, int]:
+    """The run with the most valid steps whose gaps have at most `max_steps`; (0, 0) if none is.
+
+    Its first and its last step are valid, and four of five are at least; else it is `longest_run`.
+    """
+    longest = longest_run(valid)
+    joined: list[tuple[int, int]] = []
+    for start, stop in runs_of(valid):
+        if joined and start - joined[-1][1] <= max_steps:
+            joined[-1] = (joined[-1][0], stop)
+        else:
+            joined.append((start, stop))
+
+    def num_valid(run: tuple[int, int]) -> int:
+        return int(np.count_nonzero(valid[run[0] : run[1]]))
+
+    fit = [run for run in joined if num_valid(run) >= MIN_MEASURED_SHARE * (run[1] - run[0])]
+    best = max(fit, key=num_valid, default=longest)
+    return best if num_valid(best) > num_valid(longest) else longest
+
+
 class RefusedPart(FrozenModel):
     """A stretch of the recording that is not in the episode.
 
@@ -140,9 +163,31 @@ def refused_stretches(
         stop_ns = int(t_ns[run[1] - 1]) + step_ns
         return _part(int(t_ns[run[0]]), stop_ns, start_ns, reason, stream)
 
-    gaps = [part(run, "gap", name) for name, mine in valid.items() for run in runs_of(~mine)]
+    outside = np.ones(len(t_ns), dtype=bool)
+    outside[slice(*taken)] = False
+    gaps = [
+        part(run, "gap", name) for name, mine in valid.items() for run in runs_of(~mine & outside)
+    ]
     good = np.logical_and.reduce(list(valid.values()))
-    return gaps + [part(run, "shorter", None) for run in runs_of(good) if run != taken]
+    return gaps + [part(run, "shorter", None) for run in runs_of(good & outside)]
+
+
+def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> dict[str, Matrix]:
+    """When each stream was missing at steps of the episode, as it carries that.
+
+    `t_ns` are times of the steps on the episode's clock; rows are start and stop in seconds.
+    """
+    step_ns = int(t_ns[1] - t_ns[0]) if len(t_ns) > 1 else 0
+    rows = {
+        name: [
+            (t_ns[start] / NS_PER_S, (t_ns[stop - 1] + step_ns) / NS_PER_S)
+            for start, stop in runs_of(~mine)
+        ]
+        for name, mine in valid.items()
+    }
+    return {
+        f"interpolated_{name}_s": matrix_rows(np.array(runs)) for name, runs in rows.items() if runs
+    }
 
 
 def with_causes(

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from dextouch.episodes import (
     TRUE_ORIGINS,
@@ -87,11 +87,19 @@ class CloningEpisode:
     commanded: Float64[np.ndarray, "steps 67"]
     start_digest: str
     content_sha256: str
+    interpolated: Bool[np.ndarray, " steps"] | None = None
 
     @property
     def num_steps(self) -> int:
         """Steps of the model grid, including the first one."""
         return len(self.measured)
+
+    def decisions(self) -> list[int]:
+        """Decision steps that are followed by a whole chunk of which no step is interpolated."""
+        steps = range(0, self.num_steps - CHUNK_STEPS, DECISION_STRIDE)
+        if self.interpolated is None:
+            return list(steps)
+        return [s for s in steps if not self.interpolated[s : s + CHUNK_STEPS + 1].any()]
 
 
 def read_cloning_episode(
@@ -123,6 +131,7 @@ def read_cloning_episode(
         grid.sent,
         start_digest(EpisodeGrid(reader).images([0])[0], touch_kpa[0]),
         grid.content_sha256,
+        grid.interpolated,
     )
 
 
@@ -199,7 +208,7 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     Raises:
         InvalidInputError: no successful episode is long enough, or image sizes differ.
     """
-    wanted = [item for item in episodes if item.success and item.num_steps > CHUNK_STEPS]
+    wanted = [item for item in episodes if item.success and item.decisions()]
     if not wanted:
         raise InvalidInputError("behaviour cloning: no successful demonstration to imitate")
     sizes = sorted({item.moments[0].image.shape for item in wanted})
@@ -214,7 +223,7 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     begins = [0]
     for item in wanted:
         commanded = in_world(item.commanded, item.anchor)
-        for step in range(0, item.num_steps - CHUNK_STEPS, DECISION_STRIDE):
+        for step in item.decisions():
             moment = item.moments[step]
             newest.append(half_size(moment.image))
             for measured in (True, False) if step else (True,):

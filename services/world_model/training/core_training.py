@@ -241,11 +241,13 @@ def core_loss(
     )
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
+    counted = table.measured_within(rows, batch.start_step)
     latents = table.latent_steps(batch.start_step)
     true = mapped(table.objects, lambda values: values[rows][:, latents])
     true = replace(_held_still(true, batch.is_held), present=true.present)
     known = start.objects.present[:, None] * table.labelled[rows, None, None]
     known = known * table.objects_known[rows][:, latents]
+    known[:, 1:] *= counted[..., None]
     steps = table.steps_after(batch.start_step)
     moves = ~batch.is_held
     touch = data.touch[rows][:, steps].float()
@@ -264,16 +266,16 @@ def core_loss(
     return (
         success
         + weights.objects * _object_error(future.objects, true, known)
-        + weights.touch * _mean_within((future.touch[:, 1:] - touch).square().sum(-1), within)
-        + weights.contact * _mean_within(contact_error, within)
-        + weights.taxels * _mean_within(taxel_error, within[few])
+        + weights.touch * _mean_within((future.touch[:, 1:] - touch).square().sum(-1), counted)
+        + weights.contact * _mean_within(contact_error, counted)
+        + weights.taxels * _mean_within(taxel_error, counted[few])
     )
 
 
 def _mean_within(
     each: Float32[Tensor, "batch latents ..."], within: Bool[Tensor, "batch latents"]
 ) -> Float32[Tensor, ""]:
-    """Mean over the latent steps that lie within their episodes."""
+    """Mean over the latent steps that count."""
     by_latent = each.flatten(2).mean(-1)
     return (by_latent * within).sum() / within.sum().clamp_min(1)
 

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -70,6 +70,7 @@ class EpisodeArrays:
     domain: Domain = "robot"
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
+    interpolated: Bool[np.ndarray, " steps"] | None = None
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -187,6 +188,7 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         domain=about.domain,
         object_poses=poses,
         boxes_m=boxes_m,
+        interpolated=grid.interpolated if grid.interpolated.any() else None,
     )
 
 
@@ -210,6 +212,7 @@ class StoredEpisode:
     domain: Domain
     model_rate_hz: float
     image_px: int | None = None
+    interpolated: Bool[np.ndarray, " steps"] | None = None
 
     def __len__(self) -> int:
         return self.num_steps
@@ -261,13 +264,22 @@ TrainingEpisode: TypeAlias = EpisodeArrays | StoredEpisode
 E = TypeVar("E", bound=TrainingEpisode)
 
 
+def window_starts(episode: TrainingEpisode, num_steps: int) -> Int64[np.ndarray, " starts"]:
+    """First steps of an episode's windows of so many steps, none of which is interpolated."""
+    starts = np.arange(len(episode) - num_steps + 1)
+    if episode.interpolated is None:
+        return starts
+    before = np.concatenate([[0], np.cumsum(episode.interpolated)])
+    return starts[before[starts + num_steps] == before[starts]]
+
+
 class WindowSampler:
     """Samples windows uniformly over starts, and over the episodes of each domain.
 
-    Episodes are at least `max_steps` long. Of windows from episodes with commanded actions, the
-    `commanded_fraction` has them, and of these the `chained_fraction` is anchored like a later
-    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
-    None: every episode is equally likely.
+    Windows have no interpolated step. Episodes have one of `max_steps` at least. Of windows from
+    episodes with commanded actions, the `commanded_fraction` has them, and of these the
+    `chained_fraction` is anchored like a later chunk. `human_share` is that of windows from human
+    episodes, if there are human and robot ones; None: every episode is equally likely.
     """
 
     def __init__(
@@ -280,11 +292,12 @@ class WindowSampler:
         chained_fraction: float = 0.3,
         human_share: float | None = None,
     ) -> None:
-        short = [e.episode_id for e in episodes if len(e) < max_steps]
+        short = [e.episode_id for e in episodes if not len(window_starts(e, max_steps))]
         if not episodes or short:
             raise InvalidInputError(
-                f"training episodes: got {len(episodes)}, of which {len(short)} are shorter than "
-                f"{max_steps} steps {short[:3]}; expected at least one and none too short"
+                f"training episodes: got {len(episodes)}, of which {len(short)} have no "
+                f"{max_steps} measured steps in a row {short[:3]}; expected at least one episode "
+                "and none too short"
             )
         self._episodes = list(episodes)
         self._rng = rng
@@ -318,7 +331,8 @@ class WindowSampler:
     def _place(self, num_steps: int) -> WindowPosition:
         index = self._episode_index()
         episode = self._episodes[index]
-        start = int(self._rng.integers(len(episode) - num_steps + 1))
+        starts = window_starts(episode, num_steps)
+        start = int(starts[self._rng.integers(len(starts))])
         is_commanded = self._rng.random() < self._commanded_fraction
         is_chained = bool(self._rng.random() < self._chained_fraction)
         if not is_commanded or "commanded" not in episode.action_kinds:
@@ -373,6 +387,7 @@ def index_episodes(
                 domain=arrays.domain,
                 model_rate_hz=arrays.model_rate_hz,
                 image_px=image_px,
+                interpolated=arrays.interpolated,
             )
         )
     return indexed

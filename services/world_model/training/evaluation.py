@@ -23,6 +23,7 @@ from services.world_model.training.dataset import (
     Window,
     WindowPosition,
     stack_windows,
+    window_starts,
 )
 
 BATCH = 24
@@ -69,7 +70,8 @@ def evaluate_prediction(
     places = [
         (episode, start)
         for episode in episodes
-        for start in range(0, len(episode) - model.config.max_steps + 1, stride)
+        for start in window_starts(episode, model.config.max_steps).tolist()
+        if start % stride == 0
     ]
     if not places:
         raise InvalidInputError(

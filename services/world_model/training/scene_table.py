@@ -57,7 +57,8 @@ class HandTable:
 class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
-    `length` is the number of an episode's own steps; `objects_known` are the steps at which the
+    `length` is the number of an episode's own steps, of which `interpolated` ones have actions that
+    nothing measured; `objects_known` are the steps at which the
     pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
     measurement, `touched` those of tasks of which some have poses from touch, and `placed_sd_m` is
     the standard deviation of positions from clicks or touch, 0 of others. `images` are those of the
@@ -88,6 +89,7 @@ class SceneTable:
     human_share: Float32[Tensor, ""]
     labelled: Bool[Tensor, " episodes"]
     length: Int64[Tensor, " episodes"]
+    interpolated: Bool[Tensor, "episodes steps"]
     objects_known: Bool[Tensor, "episodes steps objects"]
     measured_objects: Bool[Tensor, " episodes"]
     touched: Bool[Tensor, " episodes"]
@@ -160,12 +162,18 @@ class SceneTable:
     def starts_at(self, step: int) -> Int64[Tensor, " rows"]:
         """Episodes with an image of `step` and a latent step after it."""
         shown = self.shown[:, self.image_steps.index(step)]
-        return torch.nonzero(shown & (self.length > step + STEPS_PER_LATENT))[:, 0]
+        fits = (self.length > step + STEPS_PER_LATENT) & ~self.interpolated[:, step]
+        return torch.nonzero(shown & fits)[:, 0]
 
     def within(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents"]:
         """Latent steps after `start` that lie within an episode."""
         ends = torch.arange(start + STEPS_PER_LATENT, self.num_steps, STEPS_PER_LATENT)
         return ends < self.length[rows, None]
+
+    def measured_within(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents"]:
+        """Those `within` without an interpolated step, which losses count."""
+        given = self.interpolated[rows][:, self.steps_after(start)].any(-1)
+        return self.within(rows, start) & ~given
 
     def latent_steps(self, start: int) -> Int64[Tensor, " latents"]:
         """The start and every latent step after it."""
@@ -291,6 +299,9 @@ def scene_table(
         human_share=torch.tensor(torch.nan if human_share is None else human_share),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
         length=torch.tensor(lengths),
+        interpolated=torch.from_numpy(
+            np.stack([_filled(e.interpolated, e, num_steps) for e in episodes])
+        ),
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
         touched=torch.tensor([episode.task in touched_tasks for episode in episodes]),

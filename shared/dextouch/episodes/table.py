@@ -5,8 +5,9 @@ select episodes here and read them through `EpisodeGrid`, so that they agree on 
 """
 
 import hashlib
+import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Final
 
@@ -24,9 +25,10 @@ from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
-from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
+from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Matrix, Observation, Origin
 from dextouch.streams import HEAD_CAMERA
 
+INTERPOLATED: Final = re.compile(r"interpolated_\w+_s")
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 
 logger = structlog.get_logger(__name__)
@@ -165,6 +167,21 @@ class _Chosen:
         self._first = first
 
 
+def interpolated_steps(
+    calibration: Mapping[str, Matrix], t_ref_ns: Int64[np.ndarray, " steps"]
+) -> Bool[np.ndarray, " steps"]:
+    """Steps whose actions were interpolated, as the matrices `interpolated_STREAM_s` say.
+
+    Their rows are from when on and until when (s, on the episode's clock) a stream was missing.
+    """
+    found = np.zeros(len(t_ref_ns), dtype=np.bool_)
+    for name, rows in calibration.items():
+        if INTERPOLATED.fullmatch(name):
+            for start_s, stop_s in rows:
+                found |= (t_ref_ns >= start_s * 1e9 - 1) & (t_ref_ns < stop_s * 1e9 - 1)
+    return found
+
+
 def data_hash(contents: Iterable[str], **options: object) -> str:
     """SHA-256 of a set of episodes, in any order, as every checkpoint notes what it learned from.
 
@@ -249,6 +266,17 @@ class EpisodeGrid:
     def anchor(self) -> AnchorPoses:
         """Measured poses of wrists and head camera at step 0, in the world."""
         return self.reader.anchor(0)
+
+    @cached_property
+    def interpolated(self) -> Bool[np.ndarray, " steps"]:
+        """Steps whose actions alignment interpolated across a gap of a stream."""
+        if not any(map(INTERPOLATED.fullmatch, self.about.calibration)):
+            return np.zeros(len(self), dtype=np.bool_)
+        return interpolated_steps(self.about.calibration, self.t_ref_ns)
+
+    def is_measured(self, first: int, stop: int) -> bool:
+        """Whether no action of the steps first … stop − 1 is interpolated."""
+        return not self.interpolated[first:stop].any()
 
     @cached_property
     def measured(self) -> Float64[np.ndarray, "steps 67"]:

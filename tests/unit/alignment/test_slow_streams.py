@@ -15,7 +15,7 @@ SECONDS = 4
 ALL_STEPS = range(58, 62)
 
 
-def steps_of(folder, rate_hz, lost=()):
+def steps_of(folder, rate_hz, lost=(), **options):
     """Steps of the episode of a robot whose head is tracked at a rate, some samples lost."""
     store = EpisodeStore(folder)
     attributes = RecordingAttributes(
@@ -45,7 +45,9 @@ def steps_of(folder, rate_hz, lost=()):
             writer.append(
                 name, values=values, t_host_ns=t_ns + 10**12, t_device_ns=t_ns, sequence=number
             )
-    built = build_episode(store.recording("take"), episode_id="e", options=AlignmentOptions())
+    built = build_episode(
+        store.recording("take"), episode_id="e", options=AlignmentOptions(**options)
+    )
     (action,) = (stream for stream in built.streams if stream.descriptor.name == "action")
     return sum(len(block.t_ns) for block in action.blocks), built.attributes.quality
 
@@ -61,6 +63,7 @@ def test_a_slow_stream_may_lose_a_sample(tmp_path, rate_hz, lost):
 
 @pytest.mark.parametrize(("rate_hz", "lost"), [(30, [60, 61]), (100, range(200, 205))])
 def test_longer_gaps_still_part_the_take(tmp_path, rate_hz, lost):
-    num_steps, quality = steps_of(tmp_path, rate_hz, lost)
+    num_steps, quality = steps_of(tmp_path, rate_hz, lost, max_bridged_ms=0)
     assert num_steps <= 31
     assert quality["head_num_gaps"] == 1
+    assert quality["num_steps_interpolated"] == 0

@@ -348,6 +348,41 @@ def test_a_core_learns_nothing_from_behind_an_episodes_end(config):
     assert _loss_of(core_data(dynamics, inside), config, settings) != losses[0]
 
 
+def test_a_core_learns_nothing_at_interpolated_steps(config):
+    table = scene_table([episode(0), episode(1)], config)
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
+    # One step of a latent spoils all four, of which the last is where poses count.
+    given = dataclasses.replace(
+        table, interpolated=_changed(table.interpolated, slice(6, 7), value=True)
+    )
+    latent = slice(5, 9)
+    other = dataclasses.replace(
+        given,
+        tactile_kpa=_changed(table.tactile_kpa, latent, value=9.0),
+        in_contact=_changed(table.in_contact, latent, value=True),
+        objects=dataclasses.replace(
+            table.objects, position_m=_changed(table.objects.position_m, latent, value=0.4)
+        ),
+    )
+    settings = CoreSettings(batch=8, first_fraction=1.0)
+
+    def loss(one):
+        # What moves in a task is told by all steps.
+        return _loss_of(core_data(dynamics, one), config, settings, described=table)
+
+    losses = [loss(one) for one in (given, other)]
+    assert losses[0] == losses[1]
+    measured = dataclasses.replace(other, interpolated=table.interpolated)
+    assert loss(measured) != losses[0]
+    step = table.image_steps[1]
+    late = dataclasses.replace(
+        table, interpolated=_changed(table.interpolated, slice(step, step + 1), value=True)
+    )
+    assert table.starts_at(step).tolist() == [0, 1]
+    assert late.starts_at(step).tolist() == [0]
+
+
 def _changed(values, steps, *, value):
     changed = values.clone()
     changed[1, steps] = value
@@ -358,10 +393,10 @@ def core_data(dynamics, table):
     return CoreData(table, touch_latents(dynamics.codec, table), {})
 
 
-def _loss_of(data, config, settings):
+def _loss_of(data, config, settings, described=None):
     torch.manual_seed(0)
     core = RecurrentCore(config)
-    describe(core, data.table)
+    describe(core, described or data.table)
     batch = _draw(data, settings, torch.Generator().manual_seed(1), np.random.default_rng(1))
     return float(core_loss(core, data, batch, settings).detach())
 
