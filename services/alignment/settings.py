@@ -33,8 +33,7 @@ nothing, so an interrupted run can simply be started again."""
 class AlignmentOptions(FrozenModel):
     """Options of one alignment; they are part of the episode's identity.
 
-    A `wrist` as tracked is not written, and nor are `objects` if there are none, so that ids of
-    episodes of earlier versions remain.
+    A `wrist` as tracked is not written, and nor are `objects` if there are none.
     """
 
     model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="rate of the model grid")

@@ -150,6 +150,9 @@ class ImageChecker:
         self._found.num_images += 1
         checksum = zlib.crc32(data)
         is_equal = checksum == self._checksum
+        if not is_equal and self._num_equal > MAX_EQUAL_IMAGES:
+            # What was frozen is no camera that repeats its images.
+            self._equal_share = 0.0
         self._num_equal = self._num_equal + 1 if is_equal else 1
         self._checksum = checksum
         self._equal_share += (is_equal - self._equal_share) / EQUAL_SHARE_IMAGES

@@ -105,7 +105,7 @@ CODES: Final[Mapping[str, Rule]] = {
         "Cover mirrors and other light sources, and fix the base stations in place."),
     "frozen": Rule(0.0, 1.0, "s", "5 s", "time in which a device repeats the values it had",
         "Restart the device and its driver; check battery and line of sight."),
-    "implausible": Rule(0.0, 0.0, "", "5 s", "values that cannot be true: unit, speed, limits",
+    "implausible": Rule(0.0, 0.05, "%", "5 s", "samples beyond limits; ERROR: another unit",
         "Correct unit and order of what the device or its bridge sends, as the message says."),
     "pose_jitter": Rule(1e-3, 5e-3, "mm", "1 s", "RMS of the position of a body at rest",
         "Fix tracker and base stations in place so that nothing vibrates."),

@@ -381,7 +381,8 @@ def _value_judges(
     if descriptor.kind == "keypoints":
         return [FiniteCheck("tracking", "nodes are not seen"), PlausibilityCheck(descriptor)]
     if descriptor.kind == "pose":
-        return [PoseCheck(descriptor), PlausibilityCheck(descriptor)]
+        of_robot = any(other.kind == "robot_state" for other in driver.descriptors)
+        return [PoseCheck(descriptor), PlausibilityCheck(descriptor, of_robot=of_robot)]
     if descriptor.kind == "robot_state":
         return [PlausibilityCheck(descriptor)]
     return [CameraCheck(driver)] if descriptor.kind == "image" else []

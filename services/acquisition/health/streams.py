@@ -226,10 +226,17 @@ class PoseCheck:
 
 
 class PlausibilityCheck:
-    """Judges whether the values of the last 5 s can be true, by the rules that alignment has."""
+    """Judges whether the values of the last 5 s can be true, by the rules that alignment has.
 
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        self._descriptor = descriptor
+    Args:
+        descriptor: of the stream.
+        of_robot: whether a robot sends it, which may stand still exactly.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, *, of_robot: bool = False) -> None:
+        self._descriptor, self._of_robot = descriptor, of_robot
+        # The value at which it was found frozen, and since when.
+        self._frozen: tuple[np.ndarray, int] | None = None
         self._blocks: deque[tuple[np.ndarray, np.ndarray]] = deque()
 
     def __call__(self, evaluation: Evaluation) -> None:
@@ -242,11 +249,21 @@ class PlausibilityCheck:
         if not blocks:
             return
         t_ns, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        period_ns = self._descriptor.period_ns()
-        for one in implausible_values(self._descriptor, t_ns, values):
-            if one.cause in {"frozen", "repeated"}:
-                lasted_s = float(one.samples.sum()) * period_ns * 1e-9
+        if self._frozen is not None and (values[-1] == self._frozen[0]).all():
+            # By now the window may hold nothing else.
+            lasted_s = (t_ns[-1] - self._frozen[1]) * 1e-9
+            evaluation.judge("frozen", lasted_s, f"values are frozen for {lasted_s:.0f} s")
+            return
+        self._frozen = None
+        found = implausible_values(self._descriptor, t_ns, values, of_robot=self._of_robot)
+        for one in found:
+            if one.cause == "repeated" or one.harmless:
+                evaluation.findings.append(Finding("frozen", "WARN", one.message))
+            elif one.cause == "frozen":
+                lasted_s = float(one.samples.sum()) * self._descriptor.period_ns() * 1e-9
                 evaluation.judge("frozen", lasted_s, one.message)
+                if one.samples[-1]:
+                    self._frozen = values[-1], int(t_ns[np.flatnonzero(~one.samples)[-1]])
             elif one.cause != "jump":
                 # Single jumps have a code of their own.
                 level: Literal["WARN", "ERROR"] = "ERROR" if one.whole else "WARN"

@@ -67,14 +67,20 @@ NO_CELL = -1
 # Readings that scatter by more, and are no nearer to the ones before than to any other.
 MIN_RANDOM_KPA = 5.0
 MIN_RANDOM_RATIO = 0.5
+MAX_RESTING_SHARE = 0.2
+# How many times more than independent taxels those of a glove may move together.
+MAX_COMMON_RATIO = 10.0
 # More taxels than this that are random, or below their tare: the glove or its tare is wrong.
 MAX_WRONG_TAXELS = 0.5
-# So many samples at rest show how often two readings in a row are equal.
+MARGIN_COUNTS = 1.5
+# So many samples at rest show a taxel's noise, and so many equal ones in a row that it has none any
+# more: several times as many as ever before.
 MIN_REST_SAMPLES = 100
-# That a reading remains equal for so long by chance has a probability below exp(-25).
-LEAST_LOG_CHANCE = 25.0
-# Full scale of a glove, as its gain has it: fingertips press with up to some 1000 kPa.
-FULL_SCALE_KPA = (50.0, 20_000.0)
+MIN_ENDED_SAMPLES = 300
+ENDED_RATIO = 5.0
+# Fingertips press with up to some 1000 kPa. A glove of 16 bits has a full scale above 50 kPa.
+MAX_PRESSURE_KPA = 5000.0
+MIN_FULL_SCALE_KPA = 50.0
 
 Record = Mapping[str, Sequence[Sequence[float]]]
 
@@ -333,7 +339,7 @@ class TactileCalibration:
         state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        if num_cells == NUM_RAW_TAXELS and (state == OK).any():
+        if num_cells == NUM_RAW_TAXELS and (state == OK).any() and (gain[cells] > 0).all():
             _check_full_scale(gain[cells[state == OK]], f"{glove}_gain_counts_per_kpa")
         gain = np.where(state == OK, gain[cells], 1.0)
         return cls(side, num_cells, cells, tare[cells], gain, state)
@@ -385,7 +391,8 @@ def unusable_taxels(
         pieces: consecutive raw readings [T, cells] of the take.
 
     Raises:
-        InvalidInputError: more than half of the taxels are random or below their tare.
+        InvalidInputError: more than half of the taxels are random or below their tare, or some
+            read more than any finger presses.
         ShapeError: not [T, cells].
     """
     reasons, take = calibration.state.copy(), _TaxelTake(calibration)
@@ -393,6 +400,7 @@ def unusable_taxels(
         take.add(calibration.taxels(counts).astype(np.float64))
     if take.num_samples < MIN_SAMPLES_TO_JUDGE:
         return reasons
+    take.check_pressures()
     for reason, taxels in take.faults().items():
         reasons[(reasons == OK) & taxels] = reason
     for reason, what, advice in (
@@ -413,82 +421,107 @@ class _TaxelTake:
 
     def __init__(self, calibration: TactileCalibration) -> None:
         self._glove = calibration
+        # Gloves of few bits round their tare and their readings to whole counts.
+        self._margin = np.maximum(DEAD_OFFSET_KPA * calibration.gain_counts_per_kpa, MARGIN_COUNTS)
         self.num_samples = 0
         self._last = np.full(NUM_TAXELS, np.nan)
         self._low = np.full(NUM_TAXELS, np.inf)
         self._high = -self._low
-        zeros = [np.zeros(NUM_TAXELS) for _ in range(7)]
-        self._finite, self._below, self._rest, self._equal, self._kept, *sums = zeros
-        self._steps2, self._sum = sums
-        self._sum2 = np.zeros(NUM_TAXELS)
+        self._common_steps2 = 0.0
+        zeros = np.zeros((8, NUM_TAXELS))
+        self._finite, self._below, self._rest, self._kept = zeros[:4]
+        self._longest, self._steps2, self._sum, self._sum2 = zeros[4:]
 
     def add(self, counts: Float64[np.ndarray, "time 320"]) -> None:
         """The next readings."""
         if not len(counts):
             return
-        before = np.concatenate([self._last[None], counts[:-1]])
-        offsets_kpa = (counts - self._glove.tare_counts) / self._glove.gain_counts_per_kpa
-        equal, at_rest = counts == before, np.abs(offsets_kpa) < DEAD_OFFSET_KPA
+        offsets = counts - self._glove.tare_counts
+        steps = np.diff(counts, axis=0, prepend=self._last[None])
         self._low = np.fmin(self._low, counts.min(axis=0))
         self._high = np.fmax(self._high, counts.max(axis=0))
         self._finite += np.isfinite(counts).sum(axis=0)
-        self._below += (offsets_kpa < -DEAD_OFFSET_KPA).sum(axis=0)
-        self._rest += at_rest.sum(axis=0)
-        self._equal += (equal & at_rest).sum(axis=0)
-        changed = ~equal[::-1]
-        since = np.where(changed.any(axis=0), changed.argmax(axis=0), len(counts) + self._kept)
-        self._kept = since.astype(np.float64)
-        self._steps2 += np.nansum((counts - before) ** 2, axis=0)
-        self._sum += np.nansum(counts - self._glove.tare_counts, axis=0)
-        self._sum2 += np.nansum((counts - self._glove.tare_counts) ** 2, axis=0)
+        self._below += (offsets < -self._margin).sum(axis=0)
+        self._rest += (np.abs(offsets) < self._margin).sum(axis=0)
+        self._note_equal(steps == 0)
+        self._steps2 += np.nansum(steps**2, axis=0)
+        self._common_steps2 += float(np.nansum(np.nan_to_num(steps).mean(axis=1) ** 2))
+        self._sum += np.nansum(offsets, axis=0)
+        self._sum2 += np.nansum(offsets**2, axis=0)
         self._last = counts[-1]
         self.num_samples += len(counts)
 
+    def _note_equal(self, equal: Bool[np.ndarray, "time 320"]) -> None:
+        """Count equal readings in a row: the longest row that ended, and the one that has not."""
+        at = np.arange(len(equal))[:, None]
+        # Of each reading the last one before or at it that was new; before this block if negative.
+        new = np.maximum.accumulate(np.where(equal, -1.0 - self._kept, at), axis=0)
+        runs = at - new
+        ended = np.concatenate([self._kept[None], runs[:-1]])[~equal]
+        columns = np.broadcast_to(np.arange(equal.shape[1]), equal.shape)[~equal]
+        np.maximum.at(self._longest, columns, ended)
+        self._kept = runs[-1]
+
+    def check_pressures(self) -> None:
+        """Refuse readings that no finger gives, as a gain per Pa makes them."""
+        glove = self._glove
+        offsets_kpa = (self._high - glove.tare_counts) / glove.gain_counts_per_kpa
+        highest_kpa = float(np.sort(offsets_kpa[glove.state == OK])[-3:].min())
+        if highest_kpa > MAX_PRESSURE_KPA:
+            raise InvalidInputError(
+                f"{glove.side} glove: three taxels read {highest_kpa:.3g} kPa or more, expected at "
+                f"most {MAX_PRESSURE_KPA:g} kPa; its gain looks like counts/Pa: calibrate it again",
+                fault="unit",
+            )
+
     def faults(self) -> dict[int, Bool[np.ndarray, "320"]]:
         """Taxels by reason; of several reasons the first one counts."""
-        gain, n = self._glove.gain_counts_per_kpa, self.num_samples
-        offset_kpa = (self._last - self._glove.tare_counts) / gain
-        variance = self._sum2 / n - (self._sum / n) ** 2
-        # Of independent readings the mean square of a step is twice the variance.
-        is_random = self._steps2 > MIN_RANDOM_RATIO * 2 * n * variance
-        is_random &= variance > (MIN_RANDOM_KPA * gain) ** 2
-        silent = (self._low == self._high) & (np.abs(offset_kpa) > DEAD_OFFSET_KPA)
-        # A taxel that ends before the take does: it keeps a reading that no pressure gives, or it
-        # has lost the noise that it had at rest.
-        rest = np.where(np.abs(offset_kpa) < DEAD_OFFSET_KPA, self._rest - self._kept, self._rest)
-        same = np.where(rest < self._rest, self._equal - self._kept, self._equal)
-        share = np.clip((same + 1) / (rest + 1), 1e-6, 1.0)
-        is_unlikely = -np.log(share) * self._kept > LEAST_LOG_CHANCE
-        ended = (rest >= MIN_REST_SAMPLES) & is_unlikely & (self._kept >= MIN_SAMPLES_TO_JUDGE)
-        ended |= (self._kept >= MIN_SAMPLES_TO_JUDGE) & (offset_kpa < -DEAD_OFFSET_KPA)
+        n, offset = self.num_samples, self._last - self._glove.tare_counts
+        silent = (self._low == self._high) & (np.abs(offset) > self._margin)
         is_below = self._below > n / 2
-        silent |= ended & ~(is_below & (self._last != 0))
+        silent |= self._ended() & ~(is_below & (self._last != 0))
         return {
             ABSENT: 1.0 - self._finite / n > MAX_MISSING,
-            RANDOM: is_random,
+            RANDOM: self._random(),
             DEAD: silent & (self._last == 0),
             BELOW_TARE: is_below,
             STUCK: silent,
         }
 
+    def _random(self) -> Bool[np.ndarray, "320"]:
+        """Taxels whose readings have nothing to do with those before, nor with other taxels'."""
+        n, gain = self.num_samples, self._glove.gain_counts_per_kpa
+        variance = self._sum2 / n - (self._sum / n) ** 2
+        # Of independent readings the mean square of a step is twice the variance.
+        found = self._steps2 > MIN_RANDOM_RATIO * 2 * n * variance
+        found &= variance > (MIN_RANDOM_KPA * gain) ** 2
+        # What taps returns to rest, and what vibrates moves its neighbours alike.
+        found &= self._rest < MAX_RESTING_SHARE * n
+        alone = self._steps2.sum() / NUM_TAXELS**2
+        return found & (self._common_steps2 < MAX_COMMON_RATIO * alone)
+
+    def _ended(self) -> Bool[np.ndarray, "320"]:
+        """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.
+
+        A stream that is frozen as a whole, and readings at full scale, are none of these.
+        """
+        offset = self._last - self._glove.tare_counts
+        below = (self._kept >= MIN_SAMPLES_TO_JUDGE) & (offset < -self._margin)
+        least = np.maximum(MIN_ENDED_SAMPLES, ENDED_RATIO * self._longest)
+        quiet = (self._kept >= least) & (self._rest >= MIN_REST_SAMPLES + self._kept)
+        ended = (below | quiet) & (self._last < np.nanmax(self._high))
+        return ended & (ended.mean() <= MAX_WRONG_TAXELS)
+
 
 def _check_full_scale(gain_counts_per_kpa: np.ndarray, name: str) -> None:
-    """Refuse gains of our gloves that are per another unit."""
-    if (gain_counts_per_kpa <= 0).any():
-        # Refused by name where the calibration is made.
-        return
+    """Refuse gains of our gloves that are per MPa; those per Pa show in what is measured."""
     full_scale_kpa = FULL_SCALE_COUNTS / float(np.median(gain_counts_per_kpa))
-    low_kpa, high_kpa = FULL_SCALE_KPA
-    if low_kpa <= full_scale_kpa <= high_kpa:
-        return
-    units = {"counts/Pa": 1e-3, "counts/MPa": 1e3, "counts/psi": 6.894757}
-    alike = [u for u, f in units.items() if low_kpa <= full_scale_kpa * f <= high_kpa]
-    told = f"; these look like {alike[0]}" if alike else ""
-    raise InvalidInputError(
-        f"calibration {name!r}: makes {full_scale_kpa:.3g} kPa of full scale, expected "
-        f"{low_kpa:g} … {high_kpa:g} kPa{told}; calibrate the glove again",
-        fault="unit",
-    )
+    if 0 < full_scale_kpa < MIN_FULL_SCALE_KPA:
+        raise InvalidInputError(
+            f"calibration {name!r}: makes {full_scale_kpa:.3g} kPa of full scale, expected at "
+            f"least {MIN_FULL_SCALE_KPA:g} kPa; these look like counts/MPa: calibrate it again",
+            fault="unit",
+        )
 
 
 def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.hands import CHAINS, chain_indices
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, chain_indices
 from dextouch.schemas import Domain
 from dextouch.streams import (
     Implausible,
@@ -27,6 +27,7 @@ from services.alignment.synchronization.resampling import RefusedReason, runs_of
 # Steps in which hands are where heads look and arms reach, if quaternions are read rightly.
 RIGHT_SHARE: Final = 0.9
 WRONG_SHARE: Final = 0.3
+ALWAYS_SHARE: Final = 0.98
 MAX_VIEW_RAD: Final = np.radians(75.0)
 # By so much a robot's wrist is behind its command.
 MAX_LAG_RAD: Final = np.radians(30.0)
@@ -74,8 +75,8 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
     stream, parts_ns = _left_out(stream, found)
     if kind == "pose" and not name.endswith(COMMANDED):
         return _cut_at_lasting_jumps(CheckedStream(stream, parts_ns), max_gap_ns)
-    if kind == "keypoints" and not found:
-        stream = _without_frozen_fingers(stream, raw)
+    if kind == "keypoints" and raw.shape[1] == NUM_KEYPOINTS:
+        stream = _without_frozen_fingers(stream)
     return CheckedStream(stream, parts_ns)
 
 
@@ -105,14 +106,18 @@ def check_quaternion_order(streams: Mapping[str, DatedStream], domain: Domain) -
                 "turned as commanded",
                 *(_share_as_commanded(of[name], commanded) for of in (poses, others)),
             )
-    # Cameras may stand opposite a robot.
-    for name in names if domain == "human" else names[:1]:
-        usual = "upright and sees the hands" if name == "head" else "pointing forward"
-        _compare_orders(
-            name,
-            usual,
-            *(_share_as_usual(name, {**poses, name: of[name]}) for of in (poses, others)),
-        )
+    shares = {
+        name: tuple(_share_as_usual(name, {**poses, name: of[name]}) for of in (poses, others))
+        for name in names
+    }
+    _compare_orders("head", "upright and sees the hands", *shares["head"])
+    # Cameras may stand opposite a robot. A person's hand may turn to the face, but hardly all the
+    # time; and trackers of one kind are read alike.
+    wrists = [shares[name] for name in names[1:]]
+    if domain == "human" and min(otherwise for _, otherwise in wrists) >= ALWAYS_SHARE:
+        for name in names[1:]:
+            if shares[name][0] <= 1 - ALWAYS_SHARE:
+                _compare_orders(name, "pointing forward", *shares[name])
 
 
 def _compare_orders(name: str, usual: str, as_read: float, otherwise: float) -> None:
@@ -135,8 +140,11 @@ def _left_out(
     left_out = np.zeros(len(stream.t_ns), dtype=bool)
     quality = dict(stream.quality)
     for one in found:
+        name = f"{stream.name}_num_{one.cause}_samples"
+        quality[name] = quality.get(name, 0.0) + float(one.samples.sum())
+        if one.harmless:
+            continue
         left_out |= one.samples
-        quality[f"{stream.name}_num_{one.cause}_samples"] = float(one.samples.sum())
         if one.factor > 1:
             # It is a slower stream than it says.
             rate_hz = stream.descriptor.nominal_rate_hz / one.factor
@@ -175,24 +183,31 @@ def _cut_at_lasting_jumps(checked: CheckedStream, max_gap_ns: int) -> CheckedStr
         return checked
     reach_ns = stream_gap_ns(max_gap_ns, period_ns) // 2 + period_ns
     at_ns = (t_ns[jumps] + t_ns[jumps - 1]) // 2
-    near = (np.abs(stream.t_ns[:, None] - at_ns) <= reach_ns).any(axis=1)
+    # Of the jumps around each sample the nearer one.
+    after = np.searchsorted(at_ns, stream.t_ns).clip(max=len(at_ns) - 1)
+    nearest = np.minimum(
+        np.abs(stream.t_ns - at_ns[after]), np.abs(stream.t_ns - at_ns[np.maximum(after - 1, 0)])
+    )
+    near = nearest <= reach_ns
     quality = stream.quality | {f"{stream.name}_num_lasting_jumps": float(len(jumps))}
     parts_ns = (*checked.parts_ns, *_parts_ns(stream.t_ns, near, "jump"))
     return CheckedStream(replace(_only(stream, ~near), quality=quality), parts_ns)
 
 
-def _without_frozen_fingers(stream: DatedStream, raw: np.ndarray) -> DatedStream:
+def _without_frozen_fingers(stream: DatedStream) -> DatedStream:
     """The stream whose fingers are not seen while only they are frozen."""
-    unseen = np.zeros(raw.shape[:2], dtype=bool)
+    raw = replace(stream, convert=np.asarray).load().values
+    frozen, unseen = np.zeros((2, *raw.shape[:2]), dtype=bool)
     for chain in CHAINS:
         nodes = np.array(chain_indices(chain))
-        for one in implausible_repeats(raw[:, nodes], what=chain):
+        for one in implausible_repeats(raw[:, nodes], what=chain, may_lock=True):
             if one.cause == "frozen":
-                unseen[np.ix_(one.samples, nodes)] = True
-    if not unseen.any():
+                frozen[np.ix_(one.samples, nodes)] = True
+                unseen[np.ix_(one.samples, nodes)] = not one.harmless
+    if not frozen.any():
         return stream
-    quality = stream.quality | {f"{stream.name}_num_frozen_nodes": float(unseen.sum())}
-    return replace(stream, unseen=unseen, quality=quality)
+    quality = stream.quality | {f"{stream.name}_num_frozen_nodes": float(frozen.sum())}
+    return replace(stream, unseen=unseen if unseen.any() else None, quality=quality)
 
 
 def _poses_at(

@@ -28,7 +28,14 @@ MIN_LATENESS_NS = 5e6
 
 # Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.
 MIN_UNIT_RATIO = 20.0
-UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
+MIN_OFF_SHARE = 0.9
+UNITS = {
+    1e3: "microseconds taken for nanoseconds",
+    1e6: "milliseconds taken for nanoseconds",
+    1e9: "seconds taken for nanoseconds",
+    1e-3: "nanoseconds taken for microseconds",
+    1e-6: "nanoseconds taken for milliseconds",
+}
 # Stamps of consecutive samples that are cut to a step take several multiples of it, each as often.
 MIN_CUT_SHARE = 0.05
 
@@ -121,57 +128,68 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     has_sequence = not (batch.sequence == NO_SEQUENCE).any()
     period_ns = descriptor.period_ns()
     bits, tick_ns = capabilities.device_time_bits, capabilities.tick_ns
-    if has_time:
-        _check_unit(batch, period_ns)
-        tick_ns = max(tick_ns, _shown_tick_ns(batch) if has_sequence else 0)
+    stamped = numbered = None
     if has_time and not (has_sequence and prefers_sequence(tick_ns, period_ns)):
         device_ns = _unwrap(batch.t_device_ns, bits, tick_ns, batch)
-        dated = _fitted(device_ns, batch, descriptor, "device")
+        _check_unit(device_ns, batch.t_host_ns, period_ns)
+        stamped = _fitted(device_ns, batch, descriptor, "device")
         # A stamp is cut down to whole ticks: on average the sample lies half a tick later. The fit
         # does not see it, as it hangs on the stamps that were cut least.
-        return replace(dated, t_host_ns=dated.t_host_ns + tick_ns // 2)
+        stamped = replace(stamped, t_host_ns=stamped.t_host_ns + tick_ns // 2)
+        shown_ns = _shown_tick_ns(device_ns, batch.sequence) if has_sequence else 0
+        if not prefers_sequence(shown_ns, period_ns):
+            return stamped
     if has_sequence:
         numbers = batch.sequence * period_ns
         device_ns = _unwrap(numbers, capabilities.sequence_bits, period_ns, batch)
-        return _fitted(device_ns, batch, descriptor, "sequence")
+        numbered = _fitted(device_ns, batch, descriptor, "sequence")
+    # Samples may really lie on the steps that their stamps show, as those that are polled do: then
+    # they arrive with their stamps.
+    if stamped is not None and numbered is not None:
+        scatter_ms = [one.residual_rms_ms or 0.0 for one in (stamped, numbered)]
+        return numbered if scatter_ms[1] < scatter_ms[0] else stamped
+    if numbered is not None:
+        return numbered
     return _counted(batch, period_ns)
 
 
-def _check_unit(batch: SampleBatch, period_ns: int) -> None:
-    """Refuse stamps of another unit than nanoseconds."""
-    if len(batch) < MIN_COUNTED_SAMPLES:
+def _check_unit(device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int) -> None:
+    """Refuse stamps of another unit, by blocks of samples: the clock may step between them."""
+    edges = np.arange(0, len(device_ns), MIN_COUNTED_SAMPLES)
+    if len(edges) < 2:
         return
-    # Over many samples, since stamps of a coarse unit repeat.
-    apart = len(batch) // 2
-    device_ns = float(np.median(batch.t_device_ns[apart:] - batch.t_device_ns[:-apart])) / apart
-    host_ns = float(np.ptp(batch.t_host_ns)) / (len(batch) - 1)
-    if device_ns <= 0 or host_ns <= 0:
+    device_ns, host_ns = (
+        np.diff(times[edges]) / MIN_COUNTED_SAMPLES for times in (device_ns, t_host_ns)
+    )
+    known = (device_ns > 0) & (host_ns > 0)
+    if not known.any():
         return
-    ratios = np.array([period_ns, host_ns]) / device_ns
-    if (ratios > MIN_UNIT_RATIO).all() or (ratios < 1 / MIN_UNIT_RATIO).all():
-        alike = [name for name, unit_ns in UNITS.items() if 0.5 < ratios[0] / unit_ns < 2]
-        told = f": these look like {alike[0]} taken for nanoseconds" if alike else ""
-        raise ClockFitError(
-            f"got {device_ns:.4g} ns between the device's stamps, expected {period_ns:.4g} ns "
-            f"(samples arrive every {host_ns:.4g} ns){told}; send stamps in the declared unit "
-            "(docs/device_packets.md)",
-            fault="unit",
-        )
+    ratios = np.stack([period_ns / device_ns[known], host_ns[known] / device_ns[known]])
+    is_off = (ratios > MIN_UNIT_RATIO).all(axis=0) | (ratios < 1 / MIN_UNIT_RATIO).all(axis=0)
+    if is_off.mean() < MIN_OFF_SHARE:
+        return
+    ratio = float(np.median(ratios[0]))
+    alike = [what for unit, what in UNITS.items() if 0.5 < ratio / unit < 2]
+    told = f": these look like {alike[0]}" if alike else ""
+    raise ClockFitError(
+        f"got {np.median(device_ns[known]):.4g} ns between the device's stamps, expected "
+        f"{period_ns:.4g} ns (samples arrive every {np.median(host_ns[known]):.4g} ns){told}; send "
+        "stamps in the declared unit (docs/device_packets.md)",
+        fault="unit",
+    )
 
 
-def _shown_tick_ns(batch: SampleBatch) -> int:
+def _shown_tick_ns(device_ns: np.ndarray, sequence: np.ndarray) -> int:
     """The step to which stamps are cut, as those of numbered samples show it; 0 where none shows.
 
     Floats of seconds lose digits as a device's clock runs: after a day, 32 bits leave 8 ms.
     """
-    is_next = np.diff(batch.sequence) == 1
-    steps_ns = np.diff(batch.t_device_ns)[is_next]
+    steps_ns = np.diff(device_ns)[np.diff(sequence) == 1]
     if len(steps_ns) < MIN_COUNTED_SAMPLES:
         return 0
-    tick_ns = int(np.gcd.reduce(steps_ns))
     _, counts = np.unique(steps_ns, return_counts=True)
     is_cut = len(counts) > 1 and bool(counts.max() < (1 - MIN_CUT_SHARE) * len(steps_ns))
-    return tick_ns if is_cut else 0
+    return int(np.gcd.reduce(steps_ns)) if is_cut else 0
 
 
 def _fitted(

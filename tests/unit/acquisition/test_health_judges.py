@@ -317,7 +317,19 @@ def test_poses_that_come_twice_are_found():
     last = {}
     for _ in range(4):
         last = tracker(lambda poses: poses[np.arange(60) // 2 * 2])
-    assert last == {"frozen": "ERROR"}
+    assert last == {"frozen": "WARN"}
+
+
+def test_a_tracker_that_freezes_for_good_remains_frozen():
+    tracker = Tracker()
+    for _ in range(4):
+        assert tracker() == {}
+    kept = []
+    found = [
+        tracker(lambda poses: kept.append(poses[0]) or np.tile(kept[0], (60, 1))) for _ in range(20)
+    ]
+    assert found[1:] == [{"frozen": "ERROR"}] * 19
+    assert tracker() == {} or tracker() == {"frozen": "ERROR"}
 
 
 def test_joints_in_degrees_are_found_as_they_come():

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.schemas import matrix_rows
+from dextouch.streams import ClockCapabilities
 from services.alignment.calibration.tactile_tare import (
     BELOW_TARE,
     DEAD,
@@ -272,13 +273,81 @@ def test_random_and_too_low_readings_of_some_taxels_and_of_all():
         assert refused.value.details["fault"] == fault
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "counts/Pa"), (1e3, "counts/MPa")])
-def test_gains_of_another_unit_are_refused_by_name(factor, unit):
-    matrices, _ = glove()
+def of_gain(factor):
+    matrices, calibration = glove()
     gain = np.array(matrices["tactile_left_gain_counts_per_kpa"]) * factor
     matrices["tactile_left_gain_counts_per_kpa"] = matrix_rows(gain)
-    with pytest.raises(InvalidInputError, match=f"these look like {unit}"):
-        TactileCalibration.from_record(matrices, "left")
+    counts = [readings(calibration)]
+    return TactileCalibration.from_record(matrices, "left"), counts
+
+
+def test_gains_of_another_unit_are_refused_by_name():
+    with pytest.raises(InvalidInputError, match="these look like counts/MPa"):
+        of_gain(1e3)
+    with pytest.raises(InvalidInputError, match="its gain looks like counts/Pa"):
+        unusable_taxels(*of_gain(1e-3))
+    # Gloves of 8 bits have small gains.
+    few, (counts,) = of_gain(1 / 80)
+    eight = np.rint(500 + (counts - 500) / 80)
+    assert not unusable_taxels(few, [eight]).any()
+
+
+def test_a_press_at_full_scale_and_a_frozen_glove_condemn_no_taxel():
+    _, calibration = glove()
+    counts = readings(calibration)
+    counts[600:, calibration.cells[100:140]] = 65535
+    assert reasons_of(calibration, counts) == {}
+    counts = readings(calibration)
+    counts[700:] = counts[700]
+    assert reasons_of(calibration, counts) == {}
+
+
+def test_taps_and_vibrations_are_not_random():
+    _, calibration = glove()
+    rng = np.random.default_rng(3)
+    counts = readings(calibration, num=600)
+    taps = np.where(rng.random(600) < 0.15, 4000, 0)
+    counts[:, calibration.cells[:40]] += taps[:, None]
+    assert reasons_of(calibration, counts) == {}
+    counts = readings(calibration, num=600)
+    vibrates = 2000 + 1500 * np.sin(2 * np.pi * 0.47 * np.arange(600))
+    counts[:, calibration.cells[:200]] += vibrates[:, None]
+    assert reasons_of(calibration, counts) == {}
+
+
+@pytest.mark.parametrize(
+    ("bits", "tick_ns"), [(16, 1_000_000), (16, 100_000), (24, 1_000), (16, 1_000)]
+)
+@pytest.mark.parametrize("seconds", [20, 63.7, 300])
+def test_counters_that_wrap_are_no_other_unit(bits, tick_ns, seconds):
+    true_s = np.arange(round(60 * seconds)) / 60
+    counts = np.floor(true_s * 1e9 / tick_ns).astype(np.int64) % 2**bits
+    batch, descriptor = recordings.stamped(true_s, counts * tick_ns, 60)
+    clock = ClockCapabilities(
+        sequence=True, device_time=True, tick_ns=tick_ns, device_time_bits=bits
+    )
+    timed = time_stream(batch, descriptor.model_copy(update={"capabilities": clock}))
+    assert timed.report.num_steps == 0
+    error_s = timed.t_host_ns / 1e9 - (recordings.START_NS / 1e9 + true_s)
+    assert np.abs(error_s - np.median(error_s)).max() < 1e-3
+
+
+@pytest.mark.parametrize("at", [0.3, 0.5, 0.7])
+def test_a_clock_that_is_set_is_no_other_unit(at):
+    true_s = np.arange(1000) / 100
+    stamps_ns = np.rint(true_s * 1e9).astype(np.int64)
+    stamps_ns[round(1000 * at) :] += 3600 * 10**9
+    timed = time_stream(*recordings.stamped(true_s, stamps_ns, 100))
+    assert timed.report.num_steps == 1
+
+
+def test_stamps_of_a_polled_device_are_kept():
+    # Samples are taken every 16 ms or so, at the polls every 8 ms.
+    true_s = np.ceil(np.arange(1200) / 60 / 0.008) * 0.008
+    timed = time_stream(*recordings.stamped(true_s, np.rint(true_s * 1e9).astype(np.int64), 60))
+    assert timed.report.method == "device"
+    error_s = timed.t_host_ns / 1e9 - (recordings.START_NS / 1e9 + true_s)
+    assert np.abs(error_s - np.median(error_s)).max() < 1e-3
 
 
 @pytest.mark.parametrize("hours", [24, 100, 400])

@@ -63,7 +63,7 @@ def test_without_gloves_the_wrist_has_one_offset_and_the_fingers_are_as_retarget
 
 def test_episodes_with_tracked_wrists_keep_their_ids(store):
     recording = store.recording("whole")
-    given = '{"model_rate_hz":15.0,"max_gap_ms":50.0,"min_num_steps":17}'
+    given = '{"model_rate_hz":15.0,"max_gap_ms":50.0,"max_bridged_ms":250.0,"min_num_steps":17}'
     assert AlignmentOptions().model_dump_json() == given
     assert episode_id_of(recording, AlignmentOptions()) != episode_id_of(recording, TOUCH)
     assert AlignmentOptions.model_validate(TOUCH.model_dump()) == TOUCH

@@ -247,3 +247,89 @@ def test_camera_matrices_that_no_lens_has(change):
     with pytest.raises(InvalidInputError, match="K_head: got focal lengths") as refused:
         check_camera_matrix(K, (640, 480), where="K_head")
     assert refused.value.details["fault"] == "camera_matrix"
+
+
+def first_order(rate_hz, tau_s, rest_s=3.0):
+    """Joints that move, rest exactly for a while, and close as a first-order lag."""
+    lower, upper = hands()
+    t_s = np.arange(round(12 * rate_hz)) / rate_hz
+    middle = (lower + upper) / 2
+    way = 0.2 * np.sin(t_s * 1.3).clip(-1, 0.9)
+    # Rests where it came to a stand, then goes to another place.
+    start = round(4 * rate_hz)
+    stop = start + round(rest_s * rate_hz)
+    way[:start] = 0.2 * np.sin(np.pi * t_s[:start] / 8)
+    way[start:stop] = way[start - 1]
+    way[stop:] = 0.2 - 0.4 * (1 - np.exp(-(t_s[stop:] - t_s[stop - 1]) / tau_s))
+    return middle + way[:, None] * (upper - lower) / 2
+
+
+@pytest.mark.parametrize("rate_hz", [20, 30, 60, 100])
+@pytest.mark.parametrize("tau_s", [0.02, 0.05, 0.1])
+def test_a_robot_that_rests_and_closes_at_once_was_not_frozen(rate_hz, tau_s):
+    lower, upper = hands()
+    assert implausible_joints(first_order(rate_hz, tau_s), lower, upper) == []
+
+
+def test_samples_lost_at_the_end_of_a_rest_are_no_leap():
+    t_ns, poses = movement(100, noise_m=0.0, rests=True)
+    still = (poses[1:] == poses[:-1]).all(axis=1)
+    last = np.flatnonzero(still)[-1]
+    for lost in ([], range(last - 2, last + 60)):
+        kept = np.delete(np.arange(len(poses)), lost)
+        period_ns = 10_000_000
+        assert implausible_poses(t_ns[kept], poses[kept], period_ns=period_ns, can_rest=True) == []
+    poses[last - 2 : last + 60] = np.nan
+    assert found(t_ns, poses, 100) == []
+
+
+@pytest.mark.parametrize(
+    ("held_hz", "rate_hz"), [(15, 120), (15, 100), (24, 100), (25, 120), (22, 100), (40, 60)]
+)
+@pytest.mark.parametrize("noise_m", [0.0, 0.0005])
+def test_any_rate_may_be_held_at_any_other(held_hz, rate_hz, noise_m):
+    t_ns, poses = movement(rate_hz, noise_m=noise_m)
+    held = poses[np.floor(np.arange(len(poses)) * held_hz / rate_hz + 1e-9).astype(int)]
+    (one,) = found(t_ns, held, rate_hz)
+    assert (one.cause, round(one.factor, 1)) == ("repeated", round(rate_hz / held_hz, 1))
+    changed = np.concatenate([[True], (held[1:] != held[:-1]).any(axis=1)])
+    assert np.array_equal(~one.samples, changed)
+
+
+def test_a_held_stream_may_rest_as_well():
+    t_ns, poses = movement(50, noise_m=0.0, rests=True)
+    held, held_ns = np.repeat(poses, 2, axis=0), np.arange(2 * len(t_ns)) * 10_000_000
+    (one,) = implausible_poses(held_ns, held, period_ns=10_000_000, can_rest=True)
+    assert (one.cause, one.factor) == ("repeated", 2)
+    # Half of the rest remains, as of all else.
+    assert abs(one.samples.mean() - 0.5) < 0.01
+
+
+@pytest.mark.parametrize("rate_hz", [60, 120, 250])
+@pytest.mark.parametrize("speed_m_s", [2, 5])
+def test_a_hand_that_hits_the_table_is_plausible(rate_hz, speed_m_s):
+    t_s = np.arange(3 * rate_hz) / rate_hz
+    poses = np.zeros((len(t_s), 7))
+    poses[:, 3] = 1
+    poses[:, 2] = np.interp(t_s, [0, 1, 1 + 0.3 / speed_m_s, 3], [0.3, 0.3, 0.0, 0.0])
+    poses[:, :3] += 5e-4 * np.random.default_rng(0).standard_normal((len(t_s), 3))
+    assert found(np.rint(t_s * 1e9).astype(np.int64), poses, rate_hz) == []
+
+
+def test_two_worlds_of_a_tracker_are_no_outliers():
+    t_ns, poses = movement(60)
+    poses[200:, 0] += 0.6
+    poses[212:, 1] += 0.6
+    assert found(t_ns, poses, 60) == []
+    assert lasting_jumps(t_ns, poses, period_ns=round(1e9 / 60)).tolist() == [200, 212]
+
+
+def test_rounded_poses_may_rest():
+    t_ns, poses = movement(120, rests=True)
+    assert found(t_ns, np.round(poses, 3), 120) == []
+
+
+@pytest.mark.parametrize("shape", [(0, 7), (1, 7), (2, 7)])
+def test_few_samples_say_nothing(shape):
+    assert found(np.arange(shape[0], dtype=np.int64) * 10**7, np.ones(shape) / 2, 100) == []
+    assert list(implausible_repeats(np.ones(shape))) == []

@@ -66,7 +66,7 @@ def test_episodes_without_commands_still_train(toy_episodes):
 
 
 def test_too_short_episodes_and_none_are_refused(toy_episode):
-    with pytest.raises(InvalidInputError, match="shorter than 17"):
+    with pytest.raises(InvalidInputError, match="no 17 measured steps in a row"):
         WindowSampler([toy_episode(0, 12)], np.random.default_rng(0), max_steps=17)
     with pytest.raises(InvalidInputError, match="got 0"):
         WindowSampler([], np.random.default_rng(0), max_steps=17)
