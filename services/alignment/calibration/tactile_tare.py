@@ -508,7 +508,8 @@ class _TaxelTake:
         offset = self._last - self._glove.tare_counts
         below = (self._kept >= MIN_SAMPLES_TO_JUDGE) & (offset < -self._margin)
         least = np.maximum(MIN_ENDED_SAMPLES, ENDED_RATIO * self._longest)
-        quiet = (self._kept >= least) & (self._rest >= MIN_REST_SAMPLES + self._kept)
+        rested = self._rest - np.where(np.abs(offset) < self._margin, self._kept, 0)
+        quiet = (self._kept >= least) & (rested >= MIN_REST_SAMPLES)
         ended = (below | quiet) & (self._last < np.nanmax(self._high))
         return ended & (ended.mean() <= MAX_WRONG_TAXELS)
 

@@ -237,7 +237,9 @@ def test_usable_taxels_remain_with_and_without_noise():
 
 
 @pytest.mark.parametrize(
-    ("value", "reason"), [(0, DEAD), (500, STUCK), (502, STUCK)], ids=["zero", "tare", "near it"]
+    ("value", "reason"),
+    [(0, DEAD), (500, STUCK), (502, STUCK), (2000, STUCK)],
+    ids=["zero", "tare", "near it", "loaded"],
 )
 @pytest.mark.parametrize("taxel", [10, 120], ids=["untouched", "pressed"])
 def test_a_taxel_that_ends_within_the_take(value, reason, taxel):

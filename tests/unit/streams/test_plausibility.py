@@ -170,6 +170,17 @@ def test_a_noisy_stream_that_is_frozen_to_the_end():
     poses[300:] = poses[300]
     (one,) = found(t_ns, poses, 60)
     assert (one.cause, one.samples.sum()) == ("frozen", len(poses) - 301)
+    assert not one.harmless
+
+
+def test_a_noisy_stream_that_goes_on_where_it_was_lost_nothing():
+    t_ns, poses = movement(120)
+    poses[300:420, :3] = poses[300, :3] + 3e-4 * np.random.default_rng(1).standard_normal((120, 3))
+    poses[300:420, 3:] = poses[300, 3:]
+    poses[320:400] = poses[320]
+    (one,) = (one for one in found(t_ns, poses, 120) if one.cause == "frozen")
+    assert one.harmless
+    assert np.flatnonzero(one.samples).tolist() == list(range(321, 400))
 
 
 @pytest.mark.parametrize("times", [2, 3, 4])
