@@ -263,7 +263,7 @@ def report_line(report: AlignmentReport) -> str:
         f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
         for stream, reasons in report.refused_taxels.items()
     )
-    doubts = "".join(f"; {doubt}" for doubt in _doubts(report))
+    doubts = "".join(f"; {doubt}" for doubt in (*_doubts(report), *_implausible(report)))
     return (
         f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
         f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}{doubts}"
@@ -279,7 +279,7 @@ def report_page(report: AlignmentReport) -> Group:
             f"{', '.join(report.absent) or 'nothing'}"
         ),
         _clocks(report),
-        *map(Text, _doubts(report)),
+        *map(Text, (*_doubts(report), *_implausible(report))),
         *([_retargeting(report.retargeting)] if report.retargeting else []),
         _refused(report.refused_parts),
         *(
@@ -302,6 +302,29 @@ def _doubts(report: AlignmentReport) -> list[str]:
         if clock.warnings:
             reasons = " and ".join(whys[warning] for warning in clock.warnings)
             found.append(f"{clock.stream}: unreliable times: {reasons}")
+    return found
+
+
+def _implausible(report: AlignmentReport) -> list[str]:
+    """What of the streams could not be true, and the steps that gaps left to interpolation."""
+    words = {
+        "jump_samples": "samples elsewhere",
+        "lasting_jumps": "leaps of its world",
+        "frozen_samples": "frozen samples",
+        "frozen_nodes": "frozen nodes",
+        "repeated_samples": "repeated samples",
+        "norm_samples": "samples without a rotation",
+        "limits_samples": "samples beyond limits",
+        "repeated_images": "repeated images",
+    }
+    found = [
+        f"{name.removesuffix(f'_num_{what}')}: {count:.0f} {said}"
+        for name, count in report.quality.items()
+        for what, said in words.items()
+        if name.endswith(f"_num_{what}") and count
+    ]
+    if given := report.quality.get("num_steps_interpolated"):
+        found.append(f"{given:.0f} of {report.num_steps} steps interpolated across gaps")
     return found
 
 

@@ -282,10 +282,15 @@ class TakeStateView(FrozenModel):
     reason: str = ""
 
 
+class _RefusedPart(FrozenModel):
+    reason: str
+    stream: str | None = None
+
+
 class _Report(FrozenModel):
     num_steps: int
     duration_s: float = 0.0
-    refused_parts: tuple[object, ...] = ()
+    refused_parts: tuple[_RefusedPart, ...] = ()
 
 
 class _Job(FrozenModel):
@@ -356,10 +361,14 @@ def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
     words = f"{report.duration_s:.1f} s, {report.num_steps} steps"
     if not report.refused_parts:
         return "OK", words
-    return (
-        "WARN",
-        f"{words}; stretches left out: {len(report.refused_parts)} (dextouch align report)",
-    )
+    causes = {
+        f"{part.stream} {part.reason}"
+        for part in report.refused_parts
+        if part.reason in {"jump", "frozen", "limits"}
+    }
+    told = "".join(f"{cause}, " for cause in sorted(causes))
+    words += f"; stretches left out: {len(report.refused_parts)} ({told}dextouch align report)"
+    return "WARN", words
 
 
 def _view(

@@ -9,6 +9,7 @@ has samples only where it was seen, so that gaps show where it was not.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -283,6 +284,7 @@ def _complete_blocks(
 def _image_blocks(
     stream: DatedStream, first: int, stop: int, quality: dict[str, float]
 ) -> Iterator[Block]:
+    """Images as they were encoded; those that repeat the one before are counted."""
     kept = stream.timing.kept
     if stop <= first:
         return
@@ -301,11 +303,18 @@ def _image_blocks(
                 pictures = stream.recording.images_at(stream.name, kept[part])
                 yield Block(stream.t_ns[part], pictures)
             return
+    last = b""
     for low in range(first, stop, IMAGES_AT_ONCE):
         part = kept[low : min(low + IMAGES_AT_ONCE, stop)]
         start = int(part[0])
         images = stream.recording.encoded_images(stream.name, start, int(part[-1]) + 1)
         chosen = [images[number] for number in (part - start).tolist()]
+        # Bytes of two images are equal only if a camera sends one twice.
+        again = sum(one == before for before, one in pairwise([last, *chosen]))
+        if again:
+            name = f"{stream.name}_num_repeated_images"
+            quality[name] = quality.get(name, 0.0) + again
+        last = chosen[-1]
         yield Block(stream.t_ns[low : low + len(part)], encoded_values(chosen))
 
 

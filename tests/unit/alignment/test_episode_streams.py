@@ -88,6 +88,7 @@ def test_encoded_images_are_copied_byte_for_byte(store, unit, no_decoding):
     assert copied == [original[int(number)] for number in numbers]
     # From the group that the first needed image is in.
     first_needed = round((origin_ns - START_NS) * 30e-9) - 1
+    assert "camera_head_num_repeated_images" not in episode.attributes.quality
     expected = first_needed // GOP_IMAGES * GOP_IMAGES if unit == "h264" else first_needed
     assert int(numbers[0]) == expected
     assert int(numbers[-1]) == 89
@@ -183,3 +184,12 @@ def test_a_recording_that_is_deleted_while_it_is_aligned_leaves_no_episode(tmp_p
         align_recording(store, "take", OPTIONS)
     assert store.list() == []
     assert list((store.root / ".staging").glob("*")) == []
+
+
+def test_images_that_come_twice_are_counted(store):
+    values = np.empty(60, dtype=object)
+    values[:] = [IMAGES["jpeg"][number // 2] for number in range(60)]
+    name = add_camera(store, "take", "jpeg", camera_times_ns(60), values)
+    report = align_recording(store, name, OPTIONS)
+    num = report.streams["camera_head"]
+    assert report.quality["camera_head_num_repeated_images"] in {num // 2, num // 2 - 1}

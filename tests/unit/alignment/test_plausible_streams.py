@@ -18,6 +18,7 @@ from services.alignment.calibration.tactile_tare import (
     TactileCalibration,
     unusable_taxels,
 )
+from services.alignment.command_line import report_line
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.plausible_streams import check_quaternion_order
@@ -374,3 +375,27 @@ def test_stamps_of_another_unit_are_refused_by_name(unit):
     with pytest.raises(ClockFitError, match="taken for nanoseconds") as refused:
         time_stream(batch, descriptor)
     assert refused.value.details["fault"] == "unit"
+
+
+def test_the_command_says_what_it_left_out(tmp_path):
+    def fault(name, values):
+        if name == "wrist_left":
+            values[300, 0] += 0.5
+        if name == "head":
+            values[100:300] = values[100]
+        return values
+
+    lost = (("wrist_right", 400, 408),)
+    store = EpisodeStore(tmp_path)
+
+    def edit(name, values):
+        arrived = np.delete(np.arange(SECONDS * 100), range(400, 408))
+        whole = fault(name, moving(name, np.zeros((SECONDS * 100, values.shape[1]))))
+        return whole[arrived] if name == "wrist_right" else whole
+
+    recordings.write_recording(store, "take", seconds=SECONDS, edit=edit, lost=lost)
+    report = align_recording(store, "take", AlignmentOptions())
+    line = report_line(report)
+    assert "head: 199 frozen samples" in line
+    assert "wrist_left: 1 samples elsewhere" in line
+    assert "2 of 46 steps interpolated across gaps" in line

@@ -41,6 +41,10 @@ def service(facts):
     return Upstream("fake", client)
 
 
+GAP = {"start_s": 1.0, "stop_s": 1.5, "reason": "gap", "stream": "head"}
+FROZEN, SHORTER = GAP | {"reason": "frozen"}, GAP | {"reason": "shorter", "stream": None}
+
+
 async def stage(service, alignment="same"):
     view = await last_take(service, service if alignment == "same" else alignment)
     return view.stage, view.level, view.reason
@@ -75,8 +79,16 @@ async def test_on_the_way_to_the_store(service, facts, upload, expected):
         ({"state": "running"}, ("aligning", "OK", "40%")),
         ({"state": "done", "report": REPORT}, ("aligned", "OK", "5.4 s, 81 steps")),
         (
-            {"state": "done", "report": REPORT | {"refused_parts": [{}, {}]}},
+            {"state": "done", "report": REPORT | {"refused_parts": [GAP, SHORTER]}},
             ("aligned", "WARN", "5.4 s, 81 steps; stretches left out: 2 (dextouch align report)"),
+        ),
+        (
+            {"state": "done", "report": REPORT | {"refused_parts": [FROZEN, SHORTER, FROZEN]}},
+            (
+                "aligned",
+                "WARN",
+                "5.4 s, 81 steps; stretches left out: 3 (head frozen, dextouch align report)",
+            ),
         ),
         (
             {"state": "failed", "problem": PROBLEM | {"detail": "K_head is missing"}},
