@@ -102,7 +102,8 @@ def implausible_values(
 ) -> list[Implausible]:
     """What is implausible in samples of a stream of poses, joints or keypoints; of others nothing.
 
-    What is commanded may leap and may be kept: only unit and limits of it are checked.
+    What is commanded may leap, may be kept, and may lie beyond limits to press: only units of it are
+    checked.
 
     Args:
         descriptor: of the stream.
@@ -125,7 +126,7 @@ def implausible_values(
     else:
         return []
     is_commanded = descriptor.name.endswith("_commanded")
-    return [one for one in found if one.whole or not is_commanded]
+    return [one for one in found if not is_commanded or (one.whole and one.cause != "limits")]
 
 
 @cache
@@ -243,7 +244,8 @@ def implausible_joints(
         limits = f"{lower_rad[joint]:.2f} … {upper_rad[joint]:.2f} rad"
         message = f"joint {joint} is at {most_rad:.3g} rad, expected {limits}"
         whole = float(beyond[finite].mean()) > MAX_WRONG_SHARE
-        in_degrees = not _beyond(np.radians(values[finite]), lower_rad, upper_rad).any()
+        excess_rad = _excess(np.radians(values[finite]), lower_rad, upper_rad)
+        in_degrees = (excess_rad > LIMIT_SLACK_RAD).mean() <= MAX_WRONG_SHARE
         usual_rad = float(np.percentile(np.abs(values[finite]), 90))
         is_unit = whole and in_degrees and usual_rad > np.abs([lower_rad, upper_rad]).max()
         told = ": these look like degrees, send radians" if is_unit else ""

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from dextouch.errors import InvalidInputError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.streams import (
+    StreamDescriptor,
     check_camera_matrix,
     implausible_joints,
     implausible_poses,
     implausible_repeats,
+    implausible_values,
     lasting_jumps,
 )
 
@@ -222,6 +224,22 @@ def test_joints_in_degrees_beyond_their_limits_and_within_them():
         False,
         [200],
     )
+
+
+def test_commands_may_press_beyond_limits_but_are_in_radians():
+    lower, upper = hands()
+    joints = np.tile((lower + upper) / 2, (600, 1))
+    joints[:, 20] = upper[20] + 0.4
+    descriptor = StreamDescriptor(
+        name="joints_commanded", kind="robot_state", shape=(40,), dtype="float64", unit="rad",
+        nominal_rate_hz=100,
+    )  # fmt: skip
+    t_ns = np.arange(600, dtype=np.int64) * 10**7
+    assert implausible_values(descriptor, t_ns, joints) == []
+    measured = descriptor.model_copy(update={"name": "joints_measured"})
+    assert [one.cause for one in implausible_values(measured, t_ns, joints)] == ["limits"]
+    moved = np.degrees(joints + 0.1 * np.sin(t_ns / 1e9)[:, None])
+    assert [one.cause for one in implausible_values(descriptor, t_ns, moved)] == ["unit"]
 
 
 @pytest.mark.skipif(not HANDS.is_file(), reason="no recordings in ../shared/data")
