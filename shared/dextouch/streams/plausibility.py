@@ -102,7 +102,7 @@ def implausible_values(
 ) -> list[Implausible]:
     """What is implausible in samples of a stream of poses, joints or keypoints; of others nothing.
 
-    What is commanded may leap, may be kept, and may lie beyond limits to press: only units of it are
+    What is commanded may leap, may be kept, and may lie beyond limits to press: only its unit is
     checked.
 
     Args:
