@@ -391,8 +391,8 @@ def unusable_taxels(
         pieces: consecutive raw readings [T, cells] of the take.
 
     Raises:
-        InvalidInputError: more than half of the taxels are random or below their tare, or some
-            read more than any finger presses.
+        InvalidInputError: more than half of the taxels are random, dead, stuck or below their
+            tare, or some read more than any finger presses.
         ShapeError: not [T, cells].
     """
     reasons, take = calibration.state.copy(), _TaxelTake(calibration)
@@ -405,6 +405,8 @@ def unusable_taxels(
         reasons[(reasons == OK) & taxels] = reason
     for reason, what, advice in (
         (RANDOM, "have nothing to do with the ones before", "check cable, port and protocol"),
+        (DEAD, "are zero throughout or from some moment on", "check cable and power"),
+        (STUCK, "never change, or no more from some moment on", "restart the glove"),
         (BELOW_TARE, "lie below their tare", "tare the glove again"),
     ):
         share = float((reasons == reason)[calibration.state == OK].mean())

@@ -270,6 +270,8 @@ def test_random_and_too_low_readings_of_some_taxels_and_of_all():
     for bad, fault in (
         (rng.integers(0, 65536, counts.shape).astype(float), "random"),
         (counts - 300, "below_tare"),
+        (0 * counts, "dead"),
+        (0 * counts + 900, "stuck"),
     ):
         with pytest.raises(InvalidInputError, match="left glove: readings of") as refused:
             unusable_taxels(calibration, [bad])

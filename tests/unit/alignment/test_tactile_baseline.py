@@ -59,6 +59,7 @@ def test_what_the_calibration_refuses_is_zero_and_its_gain_does_not_matter():
     state, gain = np.zeros(360), GAIN.copy()
     state[cells], gain[cells] = (1, 6), 0.0
     counts = np.rint(np.broadcast_to(TARE + 800, (40, 360))).astype(np.uint16)
+    counts[20:] += 1
     refusing = record("left", gain=gain) | {"tactile_left_taxel_state": [list(state)]}
     glove = TactileCalibration.from_record(refusing, "left")
     refused = refused_taxels(glove, counts)
