@@ -68,6 +68,8 @@ NO_CELL = -1
 MIN_RANDOM_KPA = 5.0
 MIN_RANDOM_RATIO = 0.5
 MAX_RESTING_SHARE = 0.2
+RANDOM_WINDOW = 300
+MIN_RANDOM_SHARE = 0.1
 # How many times more than independent taxels those of a glove may move together.
 MAX_COMMON_RATIO = 10.0
 # More taxels than this that are random, or below their tare: the glove or its tare is wrong.
@@ -429,10 +431,9 @@ class _TaxelTake:
         self._last = np.full(NUM_TAXELS, np.nan)
         self._low = np.full(NUM_TAXELS, np.inf)
         self._high = -self._low
-        self._common_steps2 = 0.0
-        zeros = np.zeros((8, NUM_TAXELS))
-        self._finite, self._below, self._rest, self._kept = zeros[:4]
-        self._longest, self._steps2, self._sum, self._sum2 = zeros[4:]
+        self._num_windows = 0
+        zeros = np.zeros((6, NUM_TAXELS))
+        self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros
 
     def add(self, counts: Float64[np.ndarray, "time 320"]) -> None:
         """The next readings."""
@@ -446,10 +447,8 @@ class _TaxelTake:
         self._below += (offsets < -self._margin).sum(axis=0)
         self._rest += (np.abs(offsets) < self._margin).sum(axis=0)
         self._note_equal(steps == 0)
-        self._steps2 += np.nansum(steps**2, axis=0)
-        self._common_steps2 += float(np.nansum(np.nan_to_num(steps).mean(axis=1) ** 2))
-        self._sum += np.nansum(offsets, axis=0)
-        self._sum2 += np.nansum(offsets**2, axis=0)
+        for first in range(0, len(counts), RANDOM_WINDOW):
+            self._note_random(offsets[first : first + RANDOM_WINDOW])
         self._last = counts[-1]
         self.num_samples += len(counts)
 
@@ -463,6 +462,26 @@ class _TaxelTake:
         columns = np.broadcast_to(np.arange(equal.shape[1]), equal.shape)[~equal]
         np.maximum.at(self._longest, columns, ended)
         self._kept = runs[-1]
+
+    def _note_random(self, offsets: Float64[np.ndarray, "time 320"]) -> None:
+        """Count taxels whose readings have nothing to do with those before, nor with others'."""
+        if len(offsets) < MIN_SAMPLES_TO_JUDGE:
+            return
+        known = np.isfinite(offsets)
+        some = np.maximum(known.sum(axis=0), 1)
+        mean = np.where(known, offsets, 0.0).sum(axis=0) / some
+        around = np.where(known, offsets - mean, 0.0)
+        # A step beside a reading that is missing is none.
+        steps = np.where(known[1:] & known[:-1], np.diff(around, axis=0), 0.0)
+        variance, steps2 = (around**2).sum(axis=0) / some, (steps**2).mean(axis=0)
+        # Of independent readings the mean square of a step is twice the variance.
+        found = steps2 > MIN_RANDOM_RATIO * 2 * variance
+        found &= variance > (MIN_RANDOM_KPA * self._glove.gain_counts_per_kpa) ** 2
+        # What taps returns to rest, and what vibrates moves its neighbours alike.
+        found &= (np.abs(offsets) < self._margin).mean(axis=0) < MAX_RESTING_SHARE
+        common2 = float((steps.mean(axis=1) ** 2).mean())
+        self._random += found & (common2 < MAX_COMMON_RATIO * steps2.mean() / NUM_TAXELS)
+        self._num_windows += 1
 
     def check_pressures(self) -> None:
         """Refuse readings that no finger gives, as a gain per Pa makes them."""
@@ -484,23 +503,11 @@ class _TaxelTake:
         silent |= self._ended() & ~(is_below & (self._last != 0))
         return {
             ABSENT: 1.0 - self._finite / n > MAX_MISSING,
-            RANDOM: self._random(),
+            RANDOM: self._random > MIN_RANDOM_SHARE * self._num_windows,
             DEAD: silent & (self._last == 0),
             BELOW_TARE: is_below,
             STUCK: silent,
         }
-
-    def _random(self) -> Bool[np.ndarray, "320"]:
-        """Taxels whose readings have nothing to do with those before, nor with other taxels'."""
-        n, gain = self.num_samples, self._glove.gain_counts_per_kpa
-        variance = self._sum2 / n - (self._sum / n) ** 2
-        # Of independent readings the mean square of a step is twice the variance.
-        found = self._steps2 > MIN_RANDOM_RATIO * 2 * n * variance
-        found &= variance > (MIN_RANDOM_KPA * gain) ** 2
-        # What taps returns to rest, and what vibrates moves its neighbours alike.
-        found &= self._rest < MAX_RESTING_SHARE * n
-        alone = self._steps2.sum() / NUM_TAXELS**2
-        return found & (self._common_steps2 < MAX_COMMON_RATIO * alone)
 
     def _ended(self) -> Bool[np.ndarray, "320"]:
         """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.

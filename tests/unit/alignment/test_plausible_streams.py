@@ -297,6 +297,14 @@ def test_gains_of_another_unit_are_refused_by_name():
     assert not unusable_taxels(few, [eight]).any()
 
 
+def test_taxels_that_are_random_from_some_moment_on():
+    _, calibration = glove()
+    counts = readings(calibration, num=3000)
+    last = counts[2300:]
+    last[:, calibration.cells[:20]] = np.random.default_rng(1).integers(0, 65536, (700, 20))
+    assert reasons_of(calibration, counts)[REASONS[RANDOM]].tolist() == list(range(20))
+
+
 def test_a_press_at_full_scale_and_a_frozen_glove_condemn_no_taxel():
     _, calibration = glove()
     counts = readings(calibration)
