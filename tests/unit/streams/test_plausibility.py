@@ -175,6 +175,16 @@ def test_a_noisy_stream_that_is_frozen_to_the_end():
     assert not one.harmless
 
 
+def test_a_noisy_stream_of_single_floats_that_hardly_turns():
+    t_ns, poses = movement(100)
+    turned = Rotation.from_rotvec(1e-3 * poses[:, :3]).as_quat()[:, [3, 0, 1, 2]]
+    poses = np.concatenate([poses[:, :3], turned], axis=1).astype(np.float32)
+    assert found(t_ns, poses, 100) == []
+    poses[500:] = poses[500]
+    (one,) = found(t_ns, poses, 100)
+    assert (one.cause, one.samples.sum()) == ("frozen", len(poses) - 501)
+
+
 def test_a_noisy_stream_that_goes_on_where_it_was_lost_nothing():
     t_ns, poses = movement(120)
     poses[300:420, :3] = poses[300, :3] + 3e-4 * np.random.default_rng(1).standard_normal((120, 3))
