@@ -68,6 +68,8 @@ NO_CELL = -1
 MIN_RANDOM_KPA = 5.0
 MIN_RANDOM_RATIO = 0.5
 MAX_RESTING_SHARE = 0.2
+# Samples that are judged together (5 s of our gloves), and the share of such windows of a take that
+# touch alone never makes random; chosen: one in ten.
 RANDOM_WINDOW = 300
 MIN_RANDOM_SHARE = 0.1
 # How many times more than independent taxels those of a glove may move together.
@@ -341,7 +343,7 @@ class TactileCalibration:
         state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        if num_cells == NUM_RAW_TAXELS and (state == OK).any() and (gain[cells] > 0).all():
+        if num_cells == NUM_RAW_TAXELS and (state == OK).any():
             _check_full_scale(gain[cells[state == OK]], f"{glove}_gain_counts_per_kpa")
         gain = np.where(state == OK, gain[cells], 1.0)
         return cls(side, num_cells, cells, tare[cells], gain, state)
@@ -441,8 +443,9 @@ class _TaxelTake:
             return
         offsets = counts - self._glove.tare_counts
         steps = np.diff(counts, axis=0, prepend=self._last[None])
-        self._low = np.fmin(self._low, counts.min(axis=0))
-        self._high = np.fmax(self._high, counts.max(axis=0))
+        # Readings that are missing hide no others.
+        self._low = np.fmin(self._low, np.fmin.reduce(counts, axis=0))
+        self._high = np.fmax(self._high, np.fmax.reduce(counts, axis=0))
         self._finite += np.isfinite(counts).sum(axis=0)
         self._below += (offsets < -self._margin).sum(axis=0)
         self._rest += (np.abs(offsets) < self._margin).sum(axis=0)
@@ -525,8 +528,10 @@ class _TaxelTake:
 
 def _check_full_scale(gain_counts_per_kpa: np.ndarray, name: str) -> None:
     """Refuse gains of our gloves that are per MPa; those per Pa show in what is measured."""
-    full_scale_kpa = FULL_SCALE_COUNTS / float(np.median(gain_counts_per_kpa))
-    if 0 < full_scale_kpa < MIN_FULL_SCALE_KPA:
+    gain = float(np.median(gain_counts_per_kpa))
+    # A gain that is not positive is refused by name where the calibration is made.
+    if gain * MIN_FULL_SCALE_KPA > FULL_SCALE_COUNTS:
+        full_scale_kpa = FULL_SCALE_COUNTS / gain
         raise InvalidInputError(
             f"calibration {name!r}: makes {full_scale_kpa:.3g} kPa of full scale, expected at "
             f"least {MIN_FULL_SCALE_KPA:g} kPa; these look like counts/MPa: calibrate it again",

@@ -28,6 +28,7 @@ MIN_LATENESS_NS = 5e6
 
 # Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.
 MIN_UNIT_RATIO = 20.0
+# Of the blocks of samples between which a clock may step; chosen: all but one of ten.
 MIN_OFF_SHARE = 0.9
 UNITS = {
     1e3: "microseconds taken for nanoseconds",
@@ -170,10 +171,10 @@ def _check_unit(device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int) ->
         return
     ratio = float(np.median(ratios[0]))
     alike = [what for unit, what in UNITS.items() if 0.5 < ratio / unit < 2]
-    told = f": these look like {alike[0]}" if alike else ""
+    hint = f": these look like {alike[0]}" if alike else ""
     raise ClockFitError(
         f"got {np.median(device_ns[known]):.4g} ns between the device's stamps, expected "
-        f"{period_ns:.4g} ns (samples arrive every {np.median(host_ns[known]):.4g} ns){told}; send "
+        f"{period_ns:.4g} ns (samples arrive every {np.median(host_ns[known]):.4g} ns){hint}; send "
         "stamps in the declared unit (docs/device_packets.md)",
         fault="unit",
     )

@@ -69,7 +69,7 @@ _UNITS: Final = {"millimetres": 1e3, "centimetres": 1e2}
 _USUAL_DISTANCE_M: Final = 0.7
 _USUAL_SPEED_M_S: Final = 0.4
 _USUAL_RATIO: Final = 50.0
-_TO_M_S: Final = 1e9
+_NS_PER_S: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,9 @@ def implausible_poses(
         expected = (
             f"expected below {MAX_DISTANCE_M:g} m, {MAX_SPEED_M_S:g} m/s, {MAX_TURN_RAD_S:g} rad/s"
         )
-        told = f": these look like {unit}, send metres" if unit else ""
+        hint = f": these look like {unit}, send metres" if unit else ""
         cause: ImplausibleCause = "unit" if unit else "speed"
-        return [Implausible(cause, f"{got}, {expected}{told}", everything, whole=True)]
+        return [Implausible(cause, f"{got}, {expected}{hint}", everything, whole=True)]
     # Only a leap between samples that follow each other shows that one was frozen before.
     follows = np.diff(seen_ns) < 1.5 * period_ns
     repeats = implausible_repeats(seen, can_rest=can_rest, follows=follows)
@@ -248,9 +248,9 @@ def implausible_joints(
         in_degrees = (excess_rad > LIMIT_SLACK_RAD).mean() <= MAX_WRONG_SHARE
         usual_rad = float(np.percentile(np.abs(values[finite]), 90))
         is_unit = whole and in_degrees and usual_rad > np.abs([lower_rad, upper_rad]).max()
-        told = ": these look like degrees, send radians" if is_unit else ""
+        hint = ": these look like degrees, send radians" if is_unit else ""
         cause: ImplausibleCause = "unit" if is_unit else "limits"
-        found.append(Implausible(cause, message + told, beyond, whole=whole))
+        found.append(Implausible(cause, message + hint, beyond, whole=whole))
     return found
 
 
@@ -425,7 +425,7 @@ def _speeds(
 ) -> tuple[Float64[np.ndarray, " steps"], Float64[np.ndarray, " steps"]]:
     """Speeds of each step, in m/s and rad/s."""
     # Times of bursts are closer than the samples were.
-    steps_s = np.maximum(np.diff(t_ns), max(period_ns / 2, MIN_STEP_NS)) / _TO_M_S
+    steps_s = np.maximum(np.diff(t_ns), max(period_ns / 2, MIN_STEP_NS)) / _NS_PER_S
     speeds_m_s = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / steps_s
     quaternions = poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     cosines = np.abs((quaternions[1:] * quaternions[:-1]).sum(axis=1)).clip(max=1.0)
@@ -468,7 +468,7 @@ def _outliers(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.nd
     between = poses[:-2, :3] * (1 - weight) + poses[2:, :3] * weight
     off = np.pad(poses[1:-1, :3] - between, ((1, 1), (0, 0)))
     off_m = np.linalg.norm(off, axis=1)
-    step_s = np.maximum(np.maximum(np.diff(t_ns)[1:], np.diff(t_ns)[:-1]), period_ns) / _TO_M_S
+    step_s = np.maximum(np.maximum(np.diff(t_ns)[1:], np.diff(t_ns)[:-1]), period_ns) / _NS_PER_S
     needed_m = np.maximum(
         0.5 * MAX_ACCELERATION_M_S2 * step_s**2,
         max(MIN_OUTLIER_M, OUTLIER_SIGMAS * float(np.median(off_m[1:-1]))),
@@ -486,7 +486,7 @@ def _outliers(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.nd
 
 def _is_away(t_ns: np.ndarray, poses: np.ndarray, before: int, after: int) -> bool:
     """Whether poses between two are elsewhere, while the hand came from one to the other."""
-    span_s = (t_ns[after] - t_ns[before]) / _TO_M_S
+    span_s = (t_ns[after] - t_ns[before]) / _NS_PER_S
     ends = poses[[before, after]]
     way_m = float(np.linalg.norm(ends[1, :3] - ends[0, :3]))
     if way_m > MAX_RETURN_M_S * span_s + MIN_AWAY_M:
@@ -497,7 +497,7 @@ def _is_away(t_ns: np.ndarray, poses: np.ndarray, before: int, after: int) -> bo
     units = poses[before : after + 1, 3:]
     units = units / np.linalg.norm(units, axis=1, keepdims=True)
     cosines = np.abs(units[1:-1] @ units[[0, -1]].T).min(axis=1).clip(max=1.0)
-    turned = 2 * np.arccos(cosines) > MAX_TURN_RAD_S * MIN_STEP_NS / _TO_M_S
+    turned = 2 * np.arccos(cosines) > MAX_TURN_RAD_S * MIN_STEP_NS / _NS_PER_S
     return bool(((away_m > MIN_AWAY_M) | turned).all())
 
 

@@ -297,6 +297,30 @@ def test_gains_of_another_unit_are_refused_by_name():
     assert not unusable_taxels(few, [eight]).any()
 
 
+def test_readings_that_are_missing_hide_no_change():
+    _, calibration = glove()
+    counts = readings(calibration)
+    # In one of the pieces it changes, and misses a reading as well.
+    cell = calibration.cells[50]
+    counts[:, cell] = 900
+    counts[:50, cell] = 900 + np.arange(50)
+    counts[20, cell] = np.nan
+    assert reasons_of(calibration, counts) == {}
+
+
+def test_faulty_taxels_without_a_gain_leave_the_unit_of_the_others_checked():
+    matrices, _ = glove()
+    gain = np.array(matrices["tactile_left_gain_counts_per_kpa"]) * 1e3
+    state = np.zeros((1, 360))
+    gain[0, :4], state[0, :4] = 0.0, 1
+    faulty = {
+        "tactile_left_gain_counts_per_kpa": matrix_rows(gain),
+        "tactile_left_taxel_state": matrix_rows(state),
+    }
+    with pytest.raises(InvalidInputError, match="these look like counts/MPa"):
+        TactileCalibration.from_record(matrices | faulty, "left")
+
+
 def test_taxels_that_are_random_from_some_moment_on():
     _, calibration = glove()
     counts = readings(calibration, num=3000)
