@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands import NUM_KEYPOINTS
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, chain_indices, mean_hand_m
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting.hand_checks import checked_keypoints
 from services.alignment.retargeting.hand_profile import HandProfile, measure_profile, person_arrays
@@ -148,8 +148,8 @@ class HandRetargeter:
 
         Raises:
             ShapeError: wrong shapes.
-            InvalidInputError: times that do not rise, wrong unit, or a finger that is not tracked
-                in any sample.
+            InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
+                followed in no sample. Joints of one that is never tracked are at rest.
         """
         keypoints = checked_keypoints(keypoints_m)
         if valid is not None:
@@ -159,19 +159,22 @@ class HandRetargeter:
         elapsed_s = _elapsed_s(len(keypoints), t_s)
         person = self._person
         if self.profile is None:
-            person = person_arrays(measure_profile(keypoints, self.hand), self.hand)
+            seen = _with_every_finger(keypoints, self.hand.side)
+            person = person_arrays(measure_profile(seen, self.hand), self.hand)
         # Of slow trackers, not every sample is a loss.
         lost_s = max(self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
         result = self._follow(tables, (keypoints, elapsed_s), self._blank())
-        fingers = zip(self.hand.fingers, result.solved.T, strict=True)
-        never = [finger.chain for finger, solved in fingers if not solved.any()]
-        if never:
+        is_tracked = (result.finger_status == IMPLAUSIBLE).any(axis=0)
+        if not result.solved.any():
+            is_tracked[:] = True
+        fingers = zip(self.hand.fingers, is_tracked & ~result.solved.any(axis=0), strict=True)
+        if never := [finger.chain for finger, is_other in fingers if is_other]:
             raise InvalidInputError(
                 f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "
                 "(bones or knuckles are not those of the profile, or nodes are missing); expected "
-                "every finger at least once"
+                "every finger that is tracked at least once"
             )
         return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
@@ -212,6 +215,8 @@ class HandRetargeter:
         filled = result.joints_rad.copy()
         for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
             known = result.solved[:, finger]
+            if not known.any():
+                continue
             filled[~known, joint] = np.interp(
                 t_s[~known], t_s[known], result.joints_rad[known, joint]
             )
@@ -222,6 +227,20 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
+
+
+def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
+    """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
+
+    So that a person whose finger is never seen, or missing, has a profile of the others.
+    """
+    filled = keypoints_m
+    for chain in CHAINS:
+        nodes = chain_indices(chain)
+        if not np.isfinite(keypoints_m[:, nodes]).all(axis=(-1, -2)).any():
+            filled = filled.copy() if filled is keypoints_m else filled
+            filled[:, nodes] = mean_hand_m(side)[nodes]
+    return filled
 
 
 def _checked_valid(valid: np.ndarray, num_samples: int) -> Bool[np.ndarray, "time 25"]:
