@@ -407,6 +407,12 @@ def test_a_core_learns_nothing_from_taxels_that_were_not_measured(config):
     filled = tables[1].tactile_kpa[0, :, 0, :80].reshape(-1, 5, 4, 4).numpy()
     np.testing.assert_allclose(filled[:, 1, 0], tips[: len(filled), 1, 2].astype(np.float16))
     assert (filled[:, 0] == 0.0).all()
+    # Nor does what stands for it: it is an input alone.
+    stood_in = dataclasses.replace(tables[0], tactile_kpa=tables[0].tactile_kpa.clone())
+    stood_in.tactile_kpa[:, 1:, 0, :24] = 30.0
+    latents = touch_latents(dynamics.codec, tables[0])
+    losses = [_loss_of(CoreData(t, latents, {}), config, settings) for t in (tables[0], stood_in)]
+    assert losses[0] == losses[1]
     unfelt = dataclasses.replace(tables[0], felt=tables[0].felt.clone())
     unfelt.felt[:, 9:, 1] = False
     other = dataclasses.replace(unfelt, tactile_kpa=unfelt.tactile_kpa.clone())
