@@ -63,6 +63,7 @@ from .table import select_episodes as select_episodes
 from .trash import TRASH_KINDS as TRASH_KINDS
 from .trash import TrashKind as TrashKind
 from .validity import interpolated_actions as interpolated_actions
+from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions
 from .validity import measured_taxels as measured_taxels
 from .writer import EpisodeWriter as EpisodeWriter

@@ -39,22 +39,36 @@ COLUMNS: Final[Mapping[str, slice]] = {
 _JOINTS_OF_FINGER: Final = (JOINTS_LEFT.stop - JOINTS_LEFT.start) // len(FINGERS)
 
 
-def finger_columns(side: str, finger: int) -> slice:
-    """Columns of the joints of a finger, 0 the thumb."""
-    first = COLUMNS[f"keypoints_{side}"].start + _JOINTS_OF_FINGER * finger
-    return slice(first, first + _JOINTS_OF_FINGER)
-
-
-def absent_columns(absent: tuple[str, ...]) -> Bool[np.ndarray, "67"]:
-    """Columns of actions that no step has: parts are streams, or fingers such as `thumb_left`."""
+def columns_of(parts: tuple[str, ...]) -> Bool[np.ndarray, "67"]:
+    """Columns of actions that belong to some parts: streams, or fingers such as `thumb_left`."""
     found = np.zeros(ACTION_DIM, dtype=np.bool_)
-    for part in absent:
+    for part in parts:
         finger, _, side = part.partition("_")
         if part in COLUMNS:
             found[COLUMNS[part]] = True
         elif finger in FINGERS and side in SIDES:
-            found[finger_columns(side, FINGERS.index(finger))] = True
+            first = COLUMNS[f"keypoints_{side}"].start + _JOINTS_OF_FINGER * FINGERS.index(finger)
+            found[first : first + _JOINTS_OF_FINGER] = True
     return found
+
+
+def interpolated_spans(calibration: Mapping[str, Matrix]) -> list[tuple[str, int, int]]:
+    """Parts of the action that were interpolated, from when and until when (ns), in order of time.
+
+    A part is a stream, or a finger such as `thumb_left`.
+    """
+    spans = [
+        (stream, start_s, stop_s)
+        for stream in COLUMNS
+        for start_s, stop_s in calibration.get(f"interpolated_{stream}_s", ())
+    ]
+    spans += [
+        (f"{FINGERS[int(finger)]}_{side}", start_s, stop_s)
+        for side in SIDES
+        for start_s, stop_s, finger in calibration.get(f"interpolated_fingers_{side}_s", ())
+    ]
+    found = [(part, round(start_s * 1e9), round(stop_s * 1e9)) for part, start_s, stop_s in spans]
+    return sorted(found, key=lambda span: span[1:])
 
 
 def interpolated_actions(
@@ -62,17 +76,10 @@ def interpolated_actions(
 ) -> Bool[np.ndarray, "steps 67"]:
     """Columns of actions that were interpolated, by step."""
     found = np.zeros((len(t_ref_ns), ACTION_DIM), dtype=np.bool_)
-
-    def inside(start_s: float, stop_s: float) -> Bool[np.ndarray, " steps"]:
-        # Stamps are whole nanoseconds, and so far these seconds may be off them.
-        return (t_ref_ns >= start_s * 1e9 - 1) & (t_ref_ns < stop_s * 1e9 - 1)
-
-    for stream, columns in COLUMNS.items():
-        for start_s, stop_s in calibration.get(f"interpolated_{stream}_s", ()):
-            found[inside(start_s, stop_s), columns] = True
-    for side in SIDES:
-        for start_s, stop_s, finger in calibration.get(f"interpolated_fingers_{side}_s", ()):
-            found[inside(start_s, stop_s), finger_columns(side, int(finger))] = True
+    for part, start_ns, stop_ns in interpolated_spans(calibration):
+        # Seconds in floats may be a nanosecond off the stamps.
+        inside = (t_ref_ns >= start_ns - 1) & (t_ref_ns < stop_ns - 1)
+        found[np.ix_(inside, columns_of((part,)))] = True
     return found
 
 
@@ -80,7 +87,7 @@ def measured_actions(
     about: EpisodeAttributes, t_ref_ns: Int64[np.ndarray, " steps"]
 ) -> Bool[np.ndarray, "steps 67"]:
     """Columns of actions that were measured (or commanded), neither interpolated nor absent."""
-    return ~(interpolated_actions(about.calibration, t_ref_ns) | absent_columns(about.absent))
+    return ~(interpolated_actions(about.calibration, t_ref_ns) | columns_of(about.absent))
 
 
 def measured_taxels(calibration: Mapping[str, Matrix]) -> Bool[np.ndarray, "2 320"]:
