@@ -17,6 +17,7 @@ from services.alignment.calibration.intrinsics import (
     calibrate_found,
 )
 from services.alignment.calibration.motion import DegenerateMotionError
+from services.alignment.station_calibration.boards import BoardView, camera_coverage
 
 SIZE_PX = (1280, 960)
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.03
@@ -117,6 +118,16 @@ def test_a_fisheye_is_named(fisheye_deg):
             calibrate_found(boards)
         # The noise of both axes together.
         assert refusal.value.details["fisheye_rms_px"] == pytest.approx(0.28, abs=0.02)
+
+
+def test_the_guide_names_a_fisheye_and_asks_for_no_tilt():
+    found, _ = photographed(np.random.default_rng(0), fisheye_deg=130.0)
+    views = [
+        BoardView("", points, pixels, CHESSBOARD, is_blurred=False)
+        for points, pixels in zip(found.points_board, found.pixels_px, strict=True)
+    ]
+    (advice,) = camera_coverage(views, SIZE_PX).todo
+    assert "fisheye" in advice
 
 
 def test_a_bent_board_shows_its_bend_and_moves_no_focal_length():

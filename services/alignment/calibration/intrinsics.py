@@ -44,7 +44,7 @@ MAX_SAME_PLACE = 0.005
 MAX_CHANCE = 1e-6
 MIN_MISFIT_SHARE, MIN_MISFIT_PX = 0.5, 0.3
 # Change of the focal length along the photos; a smaller one is part of the sigmas. That of 13
-# photos of a real camera is 0.35 %.
+# photos of a real camera is 0.1 %.
 MAX_FOCAL_DRIFT = 0.01
 # The fisheye model is named where it leaves less than this of the residual.
 FISHEYE_SHARE = 0.7

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.polynomial import chebyshev
 
+from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.structure import Structure, structure
 
@@ -83,7 +84,13 @@ class _Camera(NamedTuple):
 def fit_lens(
     points_board: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size_px: tuple[int, int]
 ) -> LensFit:
-    """Fit a camera to corners [k, 3] (m) of a flat board and where photos show them [k, 2] (px)."""
+    """Fit a camera to corners [k, 3] (m) of a flat board and where photos show them [k, 2] (px).
+
+    The points are one board's, in the same coordinates in all photos.
+
+    Raises:
+        InvalidInputError: no camera shows the corners so.
+    """
     points = [np.asarray(one, dtype=np.float64) for one in points_board]
     pixels = [np.asarray(one, dtype=np.float64) for one in pixels]
     everywhere = np.concatenate(points)
@@ -92,47 +99,60 @@ def fit_lens(
     bends = [_bends((one - middle) / radius_m) for one in points]
     camera = _calibrated(points, pixels, size_px, None)
     design = _design(points, pixels, bends, camera, size_px)
-    num_others, bend = 6 * len(points), np.zeros(bends[0].shape[1])
-    fitted = design.lens
-    if structure(design.residuals, fitted, design.bend, num_others=num_others).p_value < MAX_BEND_P:
-        for _ in range(BEND_ROUNDS):
-            step = structure(design.residuals, design.lens, design.bend).coefficients
-            if np.abs(bend + step).max() > MAX_BEND * radius_m:
-                break
-            bend += step
-            bent = [
-                one + np.outer(b @ bend, [0, 0, 1.0]) for one, b in zip(points, bends, strict=True)
-            ]
-            camera = _calibrated(bent, pixels, size_px, camera)
-            design = _design(bent, pixels, bends, camera, size_px)
-        fitted = np.column_stack([design.lens, design.bend])
-    residuals = design.residuals
+    bend = np.zeros(bends[0].shape[1])
+    flat = structure(design.residuals, design.lens, design.bend, num_others=6 * len(points))
+    for _ in range(BEND_ROUNDS if flat.p_value < MAX_BEND_P else 0):
+        step = structure(design.residuals, design.lens, design.bend).coefficients
+        if np.abs(bend + step).max() > MAX_BEND * radius_m:
+            break
+        bend += step
+        bent = [
+            one + np.outer(heights @ bend, [0.0, 0.0, 1.0])
+            for one, heights in zip(points, bends, strict=True)
+        ]
+        camera = _calibrated(bent, pixels, size_px, camera)
+        design = _design(bent, pixels, bends, camera, size_px)
+    return _judged(camera, design, np.concatenate(bends) @ bend, [len(one) for one in points])
+
+
+def _judged(
+    camera: _Camera, design: _Design, heights_m: np.ndarray, num_corners: list[int]
+) -> LensFit:
+    """The fit with its covariance and the structure of its residuals."""
+    residuals, num_others = design.residuals, 6 * len(num_corners)
+    with_bend = np.column_stack([design.lens, design.bend])
+    fitted = with_bend if heights_m.any() else design.lens
+    # Beside what the image explains: a lens of another model is no lens that changes.
+    drift = structure(
+        residuals,
+        np.column_stack([fitted, design.image]),
+        design.drift,
+        num_others=num_others,
+    )
     # With what the solver did not reach, as it does not for lenses far from the model.
-    whole = np.column_stack([design.lens, design.bend, design.image])
+    whole = np.column_stack([with_bend, design.image])
     image = structure(residuals, whole[:, :0], whole, num_others=num_others)
-    drift = structure(residuals, fitted, design.drift, num_others=num_others)
     smooth = np.column_stack([design.bend, design.image, design.drift])
     found = structure(residuals, fitted, smooth, num_others=num_others)
-    variance = max(found.ratio, 1.0) * found.rest
+    freedom = len(residuals) - num_others - fitted.shape[1]
+    variance = max(found.ratio * found.rest, float(residuals @ residuals) / freedom)
     scale = 1 / np.linalg.norm(fitted, axis=0)
-    covariance = np.linalg.pinv((fitted * scale).T @ (fitted * scale), hermitian=True)
-    heights_m = np.concatenate(bends) @ bend
+    shares = np.linalg.pinv((fitted * scale).T @ (fitted * scale), hermitian=True)
+    squares = max(float(np.square(camera.by_photo_px) @ num_corners), np.finfo(float).tiny)
+    noise = image.rest * freedom
     turns = np.array(camera.turns, dtype=np.float64).reshape(-1, 3)
-    num_corners = len(everywhere)
-    squares = max(float(np.square(camera.by_photo_px) @ [len(one) for one in points]), 1e-12)
-    noise = image.rest * (len(residuals) - num_others - fitted.shape[1])
     return LensFit(
         K=camera.K,
         distortion=camera.distortion,
-        covariance=(variance * np.outer(scale, scale) * covariance)[:9, :9],
+        covariance=(variance * np.outer(scale, scale) * shares)[:9, :9],
         normals=rotation_from_vector(turns)[:, :, 2],
         board_bend_m=float(np.ptp(heights_m)),
         image=image,
         drift=drift,
-        misfit_px=float(np.sqrt(max(squares - noise, 0.0) / num_corners)),
+        misfit_px=float(np.sqrt(max(squares - noise, 0.0) / sum(num_corners))),
         image_share=max(1 - noise / squares, 0.0),
         focal_drift=float(np.abs(2 * drift.coefficients[:2] / np.diag(camera.K)[:2]).max()),
-        rms_px=float(np.sqrt(squares / num_corners)),
+        rms_px=float(np.sqrt(squares / sum(num_corners))),
         rms_by_photo_px=camera.by_photo_px,
     )
 
@@ -148,9 +168,12 @@ def fisheye_rms_px(
         | cv2.fisheye.CALIB_FIX_SKEW
         | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
     )
-    views = [[np.asarray(one, dtype=np.float64)[None] for one in s] for s in (points_board, pixels)]
+    boards, seen = (
+        [np.asarray(one, dtype=np.float64)[None] for one in series]
+        for series in (points_board, pixels)
+    )
     try:
-        rms_px, *_ = cv2.fisheye.calibrate(*views, size_px, guess, np.zeros(4), flags=flags)
+        rms_px, *_ = cv2.fisheye.calibrate(boards, seen, size_px, guess, np.zeros(4), flags=flags)
     except cv2.error:
         return float("inf")
     return float(rms_px)
@@ -162,12 +185,18 @@ def _calibrated(
     size_px: tuple[int, int],
     start: _Camera | None,
 ) -> _Camera:
-    guess = (np.eye(3), np.zeros(5)) if start is None else (start.K.copy(), start.distortion.copy())
+    K, distortion = (np.eye(3), np.zeros(5)) if start is None else start[:2]
     flags = 0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS
-    single = [[one.astype(np.float32) for one in series] for series in (points, pixels)]
-    _, K, distortion, turns, shifts, _, _, by_photo = cv2.calibrateCameraExtended(
-        *single, size_px, *guess, flags=flags
-    )
+    boards, seen = ([one.astype(np.float32) for one in series] for series in (points, pixels))
+    try:
+        _, K, distortion, turns, shifts, _, _, by_photo = cv2.calibrateCameraExtended(
+            boards, seen, size_px, K.copy(), distortion.copy(), flags=flags
+        )
+    except cv2.error as error:
+        raise InvalidInputError(
+            f"intrinsics: the corners of {len(points)} photos give no camera ({error.err}); check "
+            "that all photos are of one camera, and the size and kind of the board"
+        ) from error
     K, distortion = (np.asarray(values, dtype=np.float64) for values in (K, distortion))
     return _Camera(
         K, distortion.ravel()[:5], turns, shifts, np.asarray(by_photo, dtype=np.float64).ravel()

@@ -12,6 +12,8 @@ from scipy.special import fdtrc
 
 # Directions of which the fitted unknowns leave less than this say nothing of their own.
 MIN_INDEPENDENCE = 1e-4
+# Fitted unknowns may be nearly the same, of which a fit makes use to the last digit.
+MIN_INDEPENDENCE_OF_FITTED = 1e-10
 
 
 class Structure(NamedTuple):
@@ -49,7 +51,8 @@ def structure(
         functions: what the residuals might follow.
         num_others: unknowns that were fitted, too, and of which nothing is left in all three.
     """
-    Q, _ = np.linalg.qr(fitted / _lengths(fitted))
+    U, s, _ = np.linalg.svd(fitted / _lengths(fitted), full_matrices=False)
+    Q = U[:, s > MIN_INDEPENDENCE_OF_FITTED]
     lengths = _lengths(functions)
     own = functions / lengths
     own, left = own - Q @ (Q.T @ own), residuals - Q @ (Q.T @ residuals)
@@ -57,7 +60,7 @@ def structure(
     U, s, Vt = (part[s > MIN_INDEPENDENCE] for part in (U.T, s, Vt))
     along = U @ left
     explained, num = float(along @ along), len(s)
-    freedom = max(len(residuals) - num_others - fitted.shape[1] - num, 1)
+    freedom = max(len(residuals) - num_others - Q.shape[1] - num, 1)
     rest = max(float(left @ left) - explained, np.finfo(float).tiny) / freedom
     ratio = explained / max(num, 1) / rest
     p_value = float(fdtrc(max(num, 1), freedom, ratio))
