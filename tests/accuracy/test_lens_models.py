@@ -120,6 +120,20 @@ def test_a_fisheye_is_named(fisheye_deg):
         assert refusal.value.details["fisheye_rms_px"] == pytest.approx(0.28, abs=0.02)
 
 
+@pytest.mark.long
+def test_a_lens_that_nearly_fits_has_a_sigma_to_match():
+    """Fisheyes of 100 degrees leave 0.1 to 0.5 px, and move focal lengths by several px."""
+    off = []
+    for seed in range(10):
+        boards, K = photographed(np.random.default_rng(seed), fisheye_deg=100.0)
+        try:
+            off.append(in_sigmas(calibrate_found(boards), K))
+        except LensModelError:
+            continue
+    assert len(off) >= 4
+    assert np.sqrt(np.square(off).mean(axis=0)).max() < 2
+
+
 def test_the_guide_names_a_fisheye_and_asks_for_no_tilt():
     found, _ = photographed(np.random.default_rng(0), fisheye_deg=130.0)
     views = [
