@@ -23,7 +23,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform
 from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
-from services.alignment.calibration.places import structure_over_time
+from services.alignment.calibration.places import excess_over_time
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30
@@ -143,8 +143,8 @@ def weighted_bundle(
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
-    tracker_sigma = tracker.tracker_rotation_rad, tracker.tracker_translation_m
-    components = sensor_components("tracker", C, tracker_sigma) | own
+    declared = tracker.tracker_rotation_rad, tracker.tracker_translation_m
+    components = sensor_components("tracker", C, declared) | own
     left_over = twist(invert(series.Ts_mounted_target) @ Ts)
     free = free_unknowns(is_mount_known=agreed.is_mount_known, is_scale_known=scale_sigma == 0)
     found = estimate_sigmas(left_over, J[:, :, free], list(components.values()))
@@ -164,8 +164,8 @@ def weighted_bundle(
     J, C = predicted_jacobians(Ts, bundle.X @ Ts, bundle.scale)
     Ts[:, :3, 3] /= bundle.scale
     left_over = (whiten @ twist(invert(series.Ts_mounted_target) @ Ts)[..., None])[..., 0]
-    change = structure_over_time(series, left_over, whiten @ J, whiten @ C, free)
-    return replace(bundle, covariance=max(change.ratio, 1.0) * bundle.covariance), sigmas
+    excess = excess_over_time(series, left_over, whiten @ J, whiten @ C, free, declared)
+    return replace(bundle, covariance=excess * bundle.covariance), sigmas
 
 
 def sensor_components(

@@ -23,6 +23,10 @@ from services.alignment.calibration.structure import Structure, structure
 MAX_SAME_PLACE_RAD, MAX_SAME_PLACE_M = np.deg2rad(2.0), 0.01
 # Probability that a healthy calibration is refused for a change.
 MAX_CHANCE = 1e-6
+# Changes that are smaller than this many lengths of the expected noise are part of the sigmas.
+MIN_CHANGE = 2.0
+# Of neighbours; independent errors have less in 98 of 100 series.
+MIN_CORRELATION_SIGMAS = 2.0
 # Places on either side of a change; a pose has as many numbers as one of them.
 MIN_SIDE = 3
 
@@ -64,13 +68,14 @@ def mean_series(series: Series, labels: np.ndarray) -> Series:
     return series._replace(Ts_world_body=means[0], Ts_mounted_target=means[1])
 
 
-def structure_over_time(
+def excess_over_time(
     series: Series,
     residuals: Float64[np.ndarray, "n 6"],
     J: Float64[np.ndarray, "n 6 13"],
     C: Float64[np.ndarray, "n 6 6"],
     free: np.ndarray,
-) -> Structure:
+    expected: tuple[float, float],
+) -> float:
     """Test whether mount, target and clock are the same at all places, in their order.
 
     Args:
@@ -79,9 +84,11 @@ def structure_over_time(
         J: how they change with mount, target and scale.
         C: how they change with errors of the body's poses, as twists.
         free: unknowns that were fitted.
+        expected: noise of the body's poses, rad and m an axis.
 
     Returns:
-        Structure of drift of mount and target, linear in time, and an offset of time.
+        By how much the variances of what was fitted are larger than independent errors make them:
+        drifts and neighbours that err alike.
 
     Raises:
         InvalidInputError: the mount slipped, the target or the body's frame moved, or the two
@@ -98,14 +105,41 @@ def structure_over_time(
         after = J * (np.arange(num_places) >= at)[:, None, None]
         for name, unknowns in (("mount", slice(6)), ("target", slice(6, 12))):
             functions = after[:, :, unknowns].reshape(6 * num_places, -1)
-            changes[name, at] = structure(left, fitted, functions)
-    changes["clock", 0] = structure(left, fitted, late)
+            changes[name, at] = _change(left, fitted, functions)
+    changes["clock", 0] = _change(left, fitted, late)
     (name, at), worst = min(changes.items(), key=lambda change: change[1].p_value)
-    if worst.p_value * len(changes) < MAX_CHANCE:
+    size = worst.coefficients
+    size = (
+        size.reshape(2, 3)
+        if name != "clock"
+        else size * np.sqrt(np.square(passed).mean(axis=0)).reshape(2, 3)
+    )
+    is_large = np.linalg.norm(size, axis=1) > MIN_CHANGE * np.sqrt(3) * np.array(expected)
+    if worst.p_value * len(changes) < MAX_CHANCE and is_large.any():
         raise InvalidInputError(_refusal(series, name, at, worst))
     times = np.linspace(-1, 1, num_places)[:, None, None]
     trends = (times * J[:, :, :12]).reshape(6 * num_places, -1)
-    return structure(left, fitted, np.column_stack([trends, late]))
+    found = structure(left, fitted, np.column_stack([trends, late]))
+    return max(found.ratio, _num_together(left), 1.0)
+
+
+def _change(left: np.ndarray, fitted: np.ndarray, functions: np.ndarray) -> Structure:
+    """Test for a change among errors that may be alike from one place to the next."""
+    found = structure(left, fitted, functions)
+    return structure(left, fitted, functions, num_together=_num_together(found.remaining))
+
+
+def _num_together(residuals: np.ndarray) -> float:
+    """How many places in turn err alike, from the correlation of neighbours (1 if by chance).
+
+    That of an autoregressive series of first order. A tracker whose error varies smoothly over the
+    room errs so while it is moved on.
+    """
+    errors = residuals.reshape(-1, 6)
+    correlation = float((errors[1:] * errors[:-1]).sum() / np.square(errors).sum())
+    if correlation < MIN_CORRELATION_SIGMAS / np.sqrt(errors.size):
+        return 1.0
+    return (1 + correlation) / (1 - correlation)
 
 
 def _refusal(series: Series, name: str, at: int, worst: Structure) -> str:

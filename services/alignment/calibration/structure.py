@@ -26,6 +26,7 @@ class Structure(NamedTuple):
         explained: sum of squares that they explain.
         rest: mean square of what they do not, by each of its `freedom` degrees of freedom.
         coefficients: of the functions, by least squares.
+        remaining: residuals that they do not explain.
     """
 
     ratio: float
@@ -34,6 +35,7 @@ class Structure(NamedTuple):
     rest: float
     freedom: int
     coefficients: Float64[np.ndarray, " m"]
+    remaining: Float64[np.ndarray, " n"]
 
 
 def structure(
@@ -42,6 +44,7 @@ def structure(
     functions: Float64[np.ndarray, "n m"],
     *,
     num_others: int = 0,
+    num_together: float = 1.0,
 ) -> Structure:
     """Test whether functions explain residuals of a fit better than chance.
 
@@ -50,6 +53,7 @@ def structure(
         fitted: how the residuals change with the unknowns that were fitted.
         functions: what the residuals might follow.
         num_others: unknowns that were fitted, too, and of which nothing is left in all three.
+        num_together: how many errors in turn are alike, and count as one.
     """
     U, s, _ = np.linalg.svd(fitted / _lengths(fitted), full_matrices=False)
     Q = U[:, s > MIN_INDEPENDENCE_OF_FITTED]
@@ -62,9 +66,11 @@ def structure(
     explained, num = float(along @ along), len(s)
     freedom = max(len(residuals) - num_others - Q.shape[1] - num, 1)
     rest = max(float(left @ left) - explained, np.finfo(float).tiny) / freedom
-    ratio = explained / max(num, 1) / rest
-    p_value = float(fdtrc(max(num, 1), freedom, ratio))
-    return Structure(ratio, p_value, explained, rest, freedom, (Vt.T @ (along / s)) / lengths)
+    ratio = explained / max(num, 1) / rest / num_together
+    p_value = float(fdtrc(max(num, 1), freedom / num_together, ratio))
+    return Structure(
+        ratio, p_value, explained, rest, freedom, (Vt.T @ (along / s)) / lengths, left - U.T @ along
+    )
 
 
 def _lengths(columns: np.ndarray) -> np.ndarray:
