@@ -1,7 +1,9 @@
 """Places at which poses were recorded, and whether residuals change from one place to the next.
 
 A tracker errs by the same amount as long as it stands still, so that fifteen views of one place
-tell hardly more of it than one. They are averaged to one before anything is estimated.
+tell hardly more of it than one. They are averaged to one before anything is estimated. Residuals
+that follow the order of the places tell of a mount that slipped, a target or a frame that moved,
+and poses of other times.
 """
 
 import numpy as np
