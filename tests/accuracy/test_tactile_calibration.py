@@ -265,6 +265,23 @@ def test_what_is_common_to_all_presses_is_part_of_sigma(name, capsys):
     assert least < rms < 1.6
 
 
+def test_a_taxel_pressed_with_one_pressure_may_bend():
+    """Pads that were pressed one after the other, each with a pressure of its own."""
+    glove = Glove(4)
+    tare = measure_tare(glove.take(0.0), side="left")
+    tips = np.arange(NUM_TAXELS) < 80
+    presses = glove.presses((10.0, 20.0, 20.0))
+    parts = [tips, ~tips, tips]
+    rows = [
+        TaxelPress(press.pressure_kpa, press.sigma_kpa, press.counts, part)
+        for press, part in zip(presses, parts, strict=True)
+    ]
+    found = fit_gain(tare, rows)
+    share = found.sigma_counts_per_kpa / found.gain_counts_per_kpa
+    assert np.median(share[tips]) < 0.025
+    assert np.median(share[~tips]) == pytest.approx(np.hypot(0.01, 0.05 / np.sqrt(3)), rel=0.03)
+
+
 def test_a_drift_from_press_to_press_is_named():
     glove = Glove(3)
     tare = measure_tare(glove.take(0.0), side="left")

@@ -319,17 +319,21 @@ def _creep(press: TaxelPress, tare: TaxelTare) -> float:
     return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
 
 
-def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> float:
-    """Error of all gains together, as a share, from trends over pressure and from press to press.
+def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, "320"]:
+    """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
+
+    Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
 
     Raises:
         InvalidInputError: it is too large; the trend is named.
     """
     used = points.used[:-1] & good & (gain > 0)
+    highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
+    has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
     told = used.any(axis=1)
+    if not told.any():
+        return np.zeros(NUM_TAXELS)
     P = points.pressure_kpa[:-1][told, 0]
-    if len(np.unique(P)) < 2:
-        return MAX_NONLINEARITY / np.sqrt(3)
     response_kpa = (points.counts[:-1] - points.counts[-1]) / np.where(gain > 0, gain, 1.0)
     seen_kpa = np.array(
         [np.median(r[u]) for r, u in zip(response_kpa[told], used[told], strict=True)]
@@ -362,7 +366,7 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> float:
             "these takes, or the glove did not settle; check the list of presses, take the rest "
             "take just before them, and press less where the response bends"
         )
-    return found.get(worst, 0.0)
+    return np.where(has_one, MAX_NONLINEARITY / np.sqrt(3), found.get(worst, 0.0))
 
 
 def _check_direction(points: _Points) -> None:
