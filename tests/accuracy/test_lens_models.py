@@ -190,6 +190,24 @@ def test_photos_of_one_place_count_once(counts, capsys):
     assert 0.75 < rms < 1.3
 
 
+def test_photos_of_one_place_may_show_different_corners():
+    """As of a ChArUco board, of which each photo shows a part."""
+    rng = np.random.default_rng(2)
+    boards, K = photographed(rng, num=16)
+    parts = [np.sort(rng.permutation(54)[:40]) for _ in range(48)]
+    repeated = replace(
+        boards,
+        points_board=tuple(boards.points_board[k // 3][part] for k, part in enumerate(parts)),
+        pixels_px=tuple(boards.pixels_px[k // 3][part] for k, part in enumerate(parts)),
+        photos=tuple(range(48)),
+        num_photos=48,
+    )
+    found = calibrate_found(repeated)
+    assert found.rms_by_place_px.shape == (16,)
+    assert found.used_images == tuple(range(48))
+    assert np.abs(in_sigmas(found, K)).max() < 4
+
+
 def test_many_photos_of_few_places_are_refused():
     boards, _ = photographed(np.random.default_rng(3), num=4)
     again = replace(

@@ -240,7 +240,7 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
 
 
 class _Place(NamedTuple):
-    """Corners of the board in one place, by the mean of the photos that show them."""
+    """Corners of the board in one place: the first photo's, averaged over photos of the same."""
 
     points_board: np.ndarray
     pixels_px: np.ndarray
@@ -248,27 +248,33 @@ class _Place(NamedTuple):
 
 
 def _places(found: FoundBoards) -> list[_Place]:
-    """Photos by place: each belongs to the first before it that shows the same corners nearby."""
+    """Photos by place: each belongs to the first before it that shows common corners nearby."""
     limit_px = MAX_SAME_PLACE * float(np.hypot(*found.image_size_px))
     groups: list[list[int]] = []
-    for index, (points, pixels) in enumerate(zip(found.points_board, found.pixels_px, strict=True)):
+    for index in range(len(found.photos)):
         for group in groups:
-            first = group[0]
-            if np.array_equal(points, found.points_board[first]):
-                apart_px = np.linalg.norm(pixels - found.pixels_px[first], axis=1)
-                if np.sqrt(np.mean(apart_px**2)) < limit_px:
-                    group.append(index)
-                    break
+            if _apart_px(found, group[0], index) < limit_px:
+                group.append(index)
+                break
         else:
             groups.append([index])
-    return [
-        _Place(
-            found.points_board[group[0]],
-            np.mean([found.pixels_px[index] for index in group], axis=0),
-            tuple(found.photos[index] for index in group),
-        )
-        for group in groups
-    ]
+    places = []
+    for group in groups:
+        points = found.points_board[group[0]]
+        same = [index for index in group if np.array_equal(found.points_board[index], points)]
+        mean = np.mean([found.pixels_px[index] for index in same], axis=0)
+        places.append(_Place(points, mean, tuple(found.photos[index] for index in group)))
+    return places
+
+
+def _apart_px(found: FoundBoards, first: int, second: int) -> float:
+    """Distance between the corners that both photos show, RMS; infinite where these are few."""
+    is_same = (found.points_board[first][:, None] == found.points_board[second]).all(axis=-1)
+    rows, columns = np.nonzero(is_same)
+    if len(rows) < MIN_CORNERS:
+        return float("inf")
+    apart_px = found.pixels_px[first][rows] - found.pixels_px[second][columns]
+    return float(np.sqrt(np.square(apart_px).sum(axis=1).mean()))
 
 
 def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
