@@ -1,14 +1,17 @@
 """Driver of a camera on the station itself, whose images are stamped, checked and encoded here.
 
-Stamps of the driver are on this host's monotonic clock; an image carries the middle of its
-exposure. A camera whose stamps are on another clock gives arrival stamps only, and says so.
+Stamps of the driver are on CLOCK_MONOTONIC and converted to the clock of the station; an image
+carries the middle of its exposure. A camera whose stamps are on another clock gives arrival stamps
+only, and says so.
 """
 
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import CLOCK_MONOTONIC
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -410,6 +413,8 @@ class StationCamera(Driver):
         max_encode_wait_s: float | None = None,
     ) -> None:
         self._stamps = DriverStamps(settings)
+        # CLOCK_MONOTONIC and the station's clock at the last image but one and at the last.
+        self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
         encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
@@ -487,7 +492,7 @@ class StationCamera(Driver):
                 f"{self.name}: sends images {image.shape}, expected {expected}; plug it in again"
             )
         statistics.packets += 1
-        stamp = self._stamps.accept(captured.t_driver_ns, t_host_ns)
+        stamp = self._stamps.accept(self._on_station_clock(captured.t_driver_ns), t_host_ns)
         if stamp is None:
             return
         t_driver_ns, number = stamp
@@ -496,6 +501,19 @@ class StationCamera(Driver):
         t_device_ns = self._middle_of_exposure_ns(t_driver_ns) if has_time else NO_DEVICE_TIME
         if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
+
+    def _on_station_clock(self, t_driver_ns: int | None) -> int | None:
+        """A stamp on CLOCK_MONOTONIC, whose rate NTP changes, on the station's clock."""
+        self._clock_pairs.append((self._clock.read_ns(CLOCK_MONOTONIC), self._clock.now_ns()))
+        if t_driver_ns is None:
+            return None
+        # A stamp lies between the readings at its image and at the one before.
+        since_ns, ahead_ns = zip(
+            *((a - t_driver_ns, b - a) for a, b in self._clock_pairs), strict=True
+        )
+        reference_ns = ahead_ns[-1]
+        rest_ns = np.interp(0, since_ns, [ahead - reference_ns for ahead in ahead_ns])
+        return t_driver_ns + reference_ns + round(float(rest_ns))
 
     def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
         half_ns = (self._exposure_ns or 0) // 2
