@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import CLOCK_MONOTONIC
+from time import CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -342,6 +342,8 @@ class DriverStamps(Decoder):
     def accept(self, t_driver_ns: int | None, t_host_ns: int) -> tuple[int, int] | None:
         """Stamp and number of an image; without a usable clock the values for "none".
 
+        Both times are on CLOCK_MONOTONIC.
+
         Returns:
             None if the image must be dropped: repeated, or with a stamp that cannot be.
 
@@ -413,7 +415,7 @@ class StationCamera(Driver):
         max_encode_wait_s: float | None = None,
     ) -> None:
         self._stamps = DriverStamps(settings)
-        # CLOCK_MONOTONIC and the station's clock at the last image but one and at the last.
+        # CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the last image but one and at the last.
         self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
@@ -468,6 +470,8 @@ class StationCamera(Driver):
         """
         if self._link.wait(READ_TIMEOUT_S):
             t_host_ns = self._clock.now_ns()
+            pair = [self._clock.read_ns(which) for which in (CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW)]
+            self._clock_pairs.append((pair[0], pair[1]))
             self._heard_ns = t_host_ns
             self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._settings.period_ns)
             self._take(self._link.retrieve(), t_host_ns)
@@ -492,28 +496,25 @@ class StationCamera(Driver):
                 f"{self.name}: sends images {image.shape}, expected {expected}; plug it in again"
             )
         statistics.packets += 1
-        stamp = self._stamps.accept(self._on_station_clock(captured.t_driver_ns), t_host_ns)
+        stamp = self._stamps.accept(captured.t_driver_ns, self._clock_pairs[-1][0])
         if stamp is None:
             return
         t_driver_ns, number = stamp
         has_time = t_driver_ns != NO_DEVICE_TIME
         self._checker.check(image, t_driver_ns if has_time else None)
-        t_device_ns = self._middle_of_exposure_ns(t_driver_ns) if has_time else NO_DEVICE_TIME
+        t_device_ns = NO_DEVICE_TIME
+        if has_time:
+            t_device_ns = self._middle_of_exposure_ns(self._on_station_clock(t_driver_ns))
         if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
 
-    def _on_station_clock(self, t_driver_ns: int | None) -> int | None:
+    def _on_station_clock(self, t_driver_ns: int) -> int:
         """A stamp on CLOCK_MONOTONIC, whose rate NTP changes, on the station's clock."""
-        self._clock_pairs.append((self._clock.read_ns(CLOCK_MONOTONIC), self._clock.now_ns()))
-        if t_driver_ns is None:
-            return None
         # A stamp lies between the readings at its image and at the one before.
-        since_ns, ahead_ns = zip(
-            *((a - t_driver_ns, b - a) for a, b in self._clock_pairs), strict=True
-        )
-        reference_ns = ahead_ns[-1]
-        rest_ns = np.interp(0, since_ns, [ahead - reference_ns for ahead in ahead_ns])
-        return t_driver_ns + reference_ns + round(float(rest_ns))
+        since_ns = [monotonic_ns - t_driver_ns for monotonic_ns, _ in self._clock_pairs]
+        ahead_ns = [raw_ns - monotonic_ns for monotonic_ns, raw_ns in self._clock_pairs]
+        rest_ns = np.interp(0, since_ns, [ahead - ahead_ns[-1] for ahead in ahead_ns])
+        return t_driver_ns + ahead_ns[-1] + round(float(rest_ns)) + self._clock.suspended_ns()
 
     def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
         half_ns = (self._exposure_ns or 0) // 2
