@@ -99,8 +99,8 @@ def test_clumps_are_no_warning():
     assert report.warnings == ()
 
 
-@pytest.mark.parametrize(("late_ms", "warnings"), [(8, ()), (30, ("residual",))])
-def test_samples_that_are_all_later_than_a_period_are_a_warning(late_ms, warnings):
+@pytest.mark.parametrize(("late_ms", "warnings"), [(1, ()), (8, ("residual",))])
+def test_samples_that_are_all_late_are_a_warning(late_ms, warnings):
     """A clock loses so much in ten seconds and gains it in ten: the line lies below its arcs."""
     index = np.arange(6000, dtype=np.int64)
     arc = 1 - np.abs(index / 1000 % 2 - 1)
