@@ -27,7 +27,7 @@ MAX_RATE_ERROR_PPM = 20_000.0
 MIN_LATENESS_NS = 5e6
 # Stamps are better: all samples of five seconds are later than a USB frame of 1 ms and a half only
 # with a wrong fit or a delay that lasts.
-MAX_STAMPED_LATENESS_NS = 1.5e6
+MAX_STAMPED_LATENESS_NS = 1e6
 
 
 # Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.

@@ -55,6 +55,8 @@ SUDDEN_S = 0.2
 # It was a delay if this many arrivals return within this time; single stamps may be wrong.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
+# So many samples in a row are hardly ever all late by chance.
+NUM_BETWEEN = 5
 # What rises so near to the end of a take, and stays, is more often a delay than a stop, unless it
 # rises by more than paths hold back without pause.
 END_NS = 5_000_000_000
@@ -495,14 +497,20 @@ class _Levels:
         first, index, last = around
         host = self._host[index:last]
         within = int(np.searchsorted(host, host[0] + RETURN_NS))
-        back = np.flatnonzero(self._straight_ns[index : index + within] < sum(levels_ns) / 2)
+        back = np.flatnonzero(self._straight_ns[start : index + within] < sum(levels_ns) / 2)
         if len(back) >= MIN_RETURNED:
-            return _Rise(start, index + int(back[0]), is_unsure=False)
+            stop = start + int(back[0])
+            # What comes back to another level may have been a stop and a slew.
+            back_ns = self._straight_ns[stop : stop + self._count].min() - levels_ns[0]
+            return _Rise(start, stop, bool(abs(back_ns) > self._threshold_ns))
         is_at_end = last == len(self._host) and host[-1] - host[0] < END_NS
         is_delay = is_at_end and levels_ns[1] - levels_ns[0] < MAX_END_DELAY_NS
         # Less than a second of samples is too short to judge the end of the take.
         is_delay = is_delay and index - first >= self._count
-        return _Rise(start, last if is_delay else None, is_unsure=within == len(host))
+        # A clock that stood has no samples between the levels; one that is slewed has.
+        newest_ns = self._straight_ns[max(first, start - NUM_BETWEEN) : start].min()
+        is_gradual = bool(newest_ns - levels_ns[0] > self._threshold_ns)
+        return _Rise(start, last if is_delay else None, is_gradual or within == len(host))
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:

@@ -172,6 +172,15 @@ class OnlineClock:
         """Recent mean of the path delay above its minimum."""
         return self._envelope.spread_ns
 
+    @property
+    def doubt_ns(self) -> float:
+        """How much later than estimated the last sample may have been taken; 0 if it came promptly.
+
+        A sample that is late has been delayed, or the device's timer has stood still for so long.
+        `update` assumes a delay, for ten seconds; who needs certain times skips samples in doubt.
+        """
+        return self._envelope.doubt_ns
+
     def update(
         self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None
     ) -> int:
