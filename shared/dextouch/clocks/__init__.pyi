@@ -7,7 +7,6 @@ from .online_clocks import CountedSample as CountedSample
 from .online_clocks import CountedTake as CountedTake
 from .online_clocks import CountingClock as CountingClock
 from .online_clocks import OnlineClock as OnlineClock
-from .online_clocks import TickCounter as TickCounter
 from .online_clocks import count_lost_samples as count_lost_samples
 from .online_clocks import date_by_counting as date_by_counting
 from .online_clocks import prefers_sequence as prefers_sequence

@@ -105,11 +105,11 @@ class ClockModel:
         skew_ppm: how much faster the host's clock runs, mean over all segments.
         residual_rms_ns: RMS of arrival minus fitted time: queueing on the path, not the error of
             the fit (which is far smaller).
-        lateness_ns: minimum of arrival minus fitted time within a second (90 % quantile over all
-            seconds), excluding detected delays. Near zero for a good fit, even on paths with
-            queueing, bursts and stalls.
-        has_unsure_stops: whether a stop of the device's clock may have been a delay, or a delay at
-            the end of the take a stop.
+        lateness_ns: minimum of arrival minus fitted time within five seconds, the largest of the
+            take, excluding detected delays. Near zero for a good fit, even on paths with queueing,
+            bursts and stalls.
+        has_unsure_stops: whether a stop of the device's clock may have been a delay or a slew, or
+            a delay at the end of the take a stop.
     """
 
     segments: tuple[ClockSegment, ...]
