@@ -204,7 +204,7 @@ class RunningEnvelope:
         self._min_slope_span_s = min_slope_span_s
         self._is_counted = is_counted
         self.num_steps = 0
-        self._num_points = 0
+        self._num_points = self._num_pending = 0
         self.spread_ns = self._spread_before_ns = 0.0
         self.doubt_ns = 0.0
         self.slope_ns_per_s = 0.0
@@ -240,6 +240,9 @@ class RunningEnvelope:
         return offset_ns
 
     def _start(self, hull: LowerHull) -> None:
+        if self._num_pending:
+            # The pending points were not late.
+            self.spread_ns = self._spread_before_ns
         self._hull = hull
         self._line: Line | None = None
         self._num_followed = 0
@@ -275,8 +278,6 @@ class RunningEnvelope:
 
     def _confirm(self, line: Line) -> None:
         """Confirm that the pending points lie above the line because of a step."""
-        # They were not late.
-        self.spread_ns = self._spread_before_ns
         (odd_x_s, distance_s), pending = self._odd, self._pending
         if pending.span_s >= MIN_SLOPE_SPAN_S:
             own = pending.supporting_line(self._last_x_s - pending.span_s / 2)
@@ -332,7 +333,8 @@ class RunningEnvelope:
 
     def _thresholds_ns(self) -> tuple[float, float]:
         """Detection thresholds below and above the line."""
-        spread_ns = self.spread_ns
+        # Points that may follow a step say nothing about delays.
+        spread_ns = self._spread_before_ns if self._num_pending else self.spread_ns
         late_ns = self._step_ns + LATE_SPREADS * spread_ns
         if self._slope_span_s < MIN_SLOPE_SPAN_S:
             unsure_ns = UNSURE_STEP_NS + UNSURE_SPREADS * spread_ns

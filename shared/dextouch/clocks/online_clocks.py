@@ -181,7 +181,8 @@ class OnlineClock:
         offset_ns = self._envelope.add(since_ns * 1e-9, float(ahead_ns), now_s)
         # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
         # does not show it, since it is determined by the stamps with the smallest truncation.
-        return device_ns + reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
+        estimate_ns = min(device_ns + reference_ns + round(offset_ns), t_host_ns)
+        return estimate_ns + self._counter.resolution_ns // 2
 
 
 class DeviceCounter:
