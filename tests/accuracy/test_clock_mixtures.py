@@ -16,7 +16,7 @@ HIDDEN_MS = 2.0
 # Beside a slew that was taken for a stop; the worst of 6000 draws is 0.94 ms.
 SLEWED_BOUND_MS = 1.0
 # Of the clock online: before its slope is known, steps below 4 ms are not found.
-ONLINE_BOUND_MS = 3.0
+ONLINE_BOUND_MS = 4.0
 # Seconds after an event in which the clock online may be wrong: after a step it needs this long to
 # be sure, and for ten seconds a stop could be a delay.
 RECOVERY_S = {"step": 1.2, "stop": 12.0, "slew": 12.0, "glitch": 0.05}
