@@ -8,7 +8,7 @@ import pytest
 from dextouch.clocks import OnlineClock
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
-from tests.accuracy.clock_mixtures import ORIGIN_NS, draw, simulate
+from tests.accuracy.clock_mixtures import ORIGIN_NS, Event, Mixture, draw, simulate
 
 BOUND_MS = 0.5
 # Stops, slews and steps below it may be missed: no fit can tell them from delays on a path.
@@ -121,6 +121,15 @@ def test_every_sample_is_right_or_its_stream_in_doubt(seeds, capsys):
         )
     assert len(sure_ms) > 0.4 * len(mixtures)
     assert max(sure_ms) <= 0
+
+
+@pytest.mark.parametrize("slew_s", [0.05, -0.05, 0.005, -0.005])
+@pytest.mark.parametrize("seconds", [60.0, 170.0])
+def test_a_slew_is_named(slew_s, seconds):
+    """As a recording of CLOCK_BOOTTIME shows it where chrony corrected the host."""
+    for seed in range(3):
+        slew = Event("slew", 25.0, slew_s, lasts_s=0.6)
+        assert offline_excess_ms(Mixture((slew,), seed, seconds=seconds)) is None
 
 
 @pytest.mark.parametrize(
