@@ -13,7 +13,7 @@ from tests.accuracy.clock_mixtures import ORIGIN_NS, Event, Mixture, draw, simul
 BOUND_MS = 0.5
 # Stops, slews and steps below it may be missed: no fit can tell them from delays on a path.
 HIDDEN_MS = 2.0
-# Beside a slew that was taken for a stop; the worst of 6000 draws is 0.94 ms.
+# Beside a slew that was taken for a stop; the worst of 3000 draws is 0.94 ms.
 SLEWED_BOUND_MS = 1.0
 # Of the clock online: before its slope is known, steps below 4 ms are not found.
 ONLINE_BOUND_MS = 4.0

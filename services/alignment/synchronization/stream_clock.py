@@ -25,8 +25,8 @@ MAX_SKEW_PPM = 1000.0
 MAX_RATE_ERROR_PPM = 20_000.0
 # A path's ordinary scatter exceeds the period of a fast stream.
 MIN_LATENESS_NS = 5e6
-# Stamps are better: all samples of five seconds are later than a USB frame of 1 ms and a half only
-# with a wrong fit or a delay that lasts.
+# Stamps are better: all samples of five seconds are later than a USB frame of 1 ms only with a
+# wrong fit or a delay that lasts.
 MAX_STAMPED_LATENESS_NS = 1e6
 
 

@@ -46,7 +46,8 @@ MATCH_SHARE = 0.2
 MATCH_CHANGE_SHARE = 0.5
 REGULAR_QUANTILE = 0.9
 # A clock that stood still shows in no distance of stamps, only in the arrivals: within a fifth of a
-# second they become late, and stay so. A rise of so much must last for so long, by both clocks.
+# second they become late, and stay so. A rise of so much must last for so long, by both clocks; the
+# smallest is above a USB frame of 1 ms, and a path may hold back all samples for some seconds.
 SUDDEN_RISES = ((25e6, 1_000_000_000), (1.5e6, 7_000_000_000))
 # The path may have become longer little by little and then stay so: the fit follows after a minute
 # anyway. A continuing rise is a change of rate.
