@@ -2,11 +2,11 @@ from .clock_model import ClockModel as ClockModel
 from .clock_model import ClockSegment as ClockSegment
 from .clock_model import fit_clock as fit_clock
 from .clock_model import lateness_ns as lateness_ns
+from .clock_model import mend_stamps as mend_stamps
 from .online_clocks import CountedSample as CountedSample
 from .online_clocks import CountedTake as CountedTake
 from .online_clocks import CountingClock as CountingClock
 from .online_clocks import OnlineClock as OnlineClock
-from .online_clocks import TickCounter as TickCounter
 from .online_clocks import count_lost_samples as count_lost_samples
 from .online_clocks import date_by_counting as date_by_counting
 from .online_clocks import prefers_sequence as prefers_sequence
