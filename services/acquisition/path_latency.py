@@ -68,7 +68,7 @@ class _StreamPath:
     def follow(self) -> None:
         """Estimate the times of the samples since the last call."""
         if self._queue:
-            # Samples in doubt tell no delay.
+            # Samples of uncertain time show no delay.
             self._newest = None
         for _ in range(len(self._queue)):
             t_host_ns, t_device_ns = self._queue.popleft()
@@ -78,7 +78,7 @@ class _StreamPath:
                 # The device left its stamp out; health says so.
                 self._restart()
                 continue
-            if self._clock.doubt_ns == 0.0:
+            if self._clock.uncertainty_ns == 0.0:
                 self._newest = (t_device_ns, estimate_ns)
             self._num_samples += 1
             if self._clock.num_steps > self._num_steps:

@@ -89,7 +89,7 @@ def online_excess_ms(mixture):
     stamps = zip(take.host_ns.tolist(), take.device_ns.tolist(), take.true_ns.tolist(), strict=True)
     for index, (host_ns, device_ns, true_ns) in enumerate(stamps):
         error_ns = abs(clock.update(t_host_ns=host_ns, t_device_ns=device_ns) - true_ns)
-        excess_ms[index] = (error_ns - clock.doubt_ns) * 1e-6
+        excess_ms[index] = (error_ns - clock.uncertainty_ns) * 1e-6
     at_s = since_start_s(take.true_ns)
     is_judged = at_s > WARM_UP_S
     for event in mixture.events:

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.clocks import (
+    corrected_stamps,
     count_lost_samples,
     date_by_counting,
     fit_clock,
     lateness_ns,
-    mend_stamps,
     prefers_sequence,
     unwrap_counter,
 )
@@ -204,7 +204,7 @@ def _fitted(
     device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: ClockMethod
 ) -> _Dated:
     if method == "device":
-        device_ns = mend_stamps(device_ns, batch.t_host_ns)
+        device_ns = corrected_stamps(device_ns, batch.t_host_ns)
     model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
     if not (batch.sequence == NO_SEQUENCE).any():
         bits = descriptor.capabilities.sequence_bits

@@ -1,8 +1,8 @@
 from .clock_model import ClockModel as ClockModel
 from .clock_model import ClockSegment as ClockSegment
+from .clock_model import corrected_stamps as corrected_stamps
 from .clock_model import fit_clock as fit_clock
 from .clock_model import lateness_ns as lateness_ns
-from .clock_model import mend_stamps as mend_stamps
 from .online_clocks import CountedSample as CountedSample
 from .online_clocks import CountedTake as CountedTake
 from .online_clocks import CountingClock as CountingClock

@@ -182,7 +182,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
             clock steps explain) or "length" (unequal lengths).
     """
     device, host = _checked(t_device_ns, t_host_ns)
-    device = mend_stamps(device, host)
+    device = corrected_stamps(device, host)
     cuts, waiting, has_unsure_stops = find_steps(device, host)
     bounds = list(zip([0, *cuts], [*cuts, len(device)], strict=True))
     fitted_to = [a + np.flatnonzero(~waiting[a:b]) for a, b in bounds]
@@ -389,7 +389,7 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
     return Steps(sorted(set(cuts)), waiting, is_unsure)
 
 
-def mend_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
+def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
     """Replace one or two wrong stamps in a row by whole periods from the right ones beside them.
 
     Stamps of a regular device are wrong if those beside them are whole periods apart and they are

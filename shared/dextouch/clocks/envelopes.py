@@ -190,7 +190,7 @@ class RunningEnvelope:
         num_steps: restarts of the line so far.
         slope_ns_per_s: of the line.
         spread_ns: mean distance of the last few hundred points above the line.
-        doubt_ns: how far the last point lies above the line if that is no usual delay; else 0.
+        uncertainty_ns: how far the last point lies above the line if that is no usual delay, or 0.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class RunningEnvelope:
         self.num_steps = 0
         self._num_points = self._num_pending = 0
         self.spread_ns = self._spread_before_ns = 0.0
-        self.doubt_ns = 0.0
+        self.uncertainty_ns = 0.0
         self.slope_ns_per_s = 0.0
         self._slope_span_s = 0.0
         self._last_x_s = 0.0
@@ -236,7 +236,7 @@ class RunningEnvelope:
             offset_ns = self._line.at(x_s) if is_left_out else self._follow(x_s, y_ns)
         self._last_x_s = x_s
         above_ns = y_ns - offset_ns
-        self.doubt_ns = above_ns if above_ns > self._thresholds_ns()[1] else 0.0
+        self.uncertainty_ns = above_ns if above_ns > self._thresholds_ns()[1] else 0.0
         return offset_ns
 
     def _start(self, hull: LowerHull) -> None:

@@ -137,13 +137,13 @@ class OnlineClock:
         return self._envelope.spread_ns
 
     @property
-    def doubt_ns(self) -> float:
+    def uncertainty_ns(self) -> float:
         """How much later than estimated the last sample may have been taken; 0 if it came promptly.
 
         A sample that is late has been delayed, or the device's timer has stood still for so long.
-        `update` assumes a delay, for ten seconds; who needs certain times skips samples in doubt.
+        `update` assumes a delay, for ten seconds; where times must be right, skip the sample.
         """
-        return self._envelope.doubt_ns
+        return self._envelope.uncertainty_ns
 
     def update(
         self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None

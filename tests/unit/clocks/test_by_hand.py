@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from dextouch.clocks import OnlineClock, fit_clock
-from dextouch.clocks.clock_model import ClockModel, ClockSegment, find_steps, mend_stamps
+from dextouch.clocks.clock_model import ClockModel, ClockSegment, corrected_stamps, find_steps
 from dextouch.clocks.envelopes import LowerHull
 from dextouch.clocks.online_clocks import DeviceCounter
 from dextouch.errors import ClockFitError, InvalidInputError
@@ -142,11 +142,11 @@ def test_wrong_stamps_lie_alone_or_in_pairs_between_two_that_agree():
     stamps_ns, host_ns = right_ns.copy(), right_ns + 5 * MS
     for wrong, by_ns in ((20, 3 * MS), (100, 43 * MS), (150, -2 * MS), (151, 4 * MS)):
         stamps_ns[wrong] += by_ns
-    assert mend_stamps(stamps_ns, host_ns).tolist() == right_ns.tolist()
+    assert corrected_stamps(stamps_ns, host_ns).tolist() == right_ns.tolist()
     # Beside three lost ones the arrival tells which of the four it is.
     after_loss_ns = np.delete(np.arange(200, dtype=np.int64), [80, 81, 83]) * PERIOD_NS
     wrong_ns = after_loss_ns + 4 * MS * (after_loss_ns == 82 * PERIOD_NS)
-    assert mend_stamps(wrong_ns, after_loss_ns + MS).tolist() == after_loss_ns.tolist()
+    assert corrected_stamps(wrong_ns, after_loss_ns + MS).tolist() == after_loss_ns.tolist()
 
 
 def test_what_is_no_wrong_stamp_stays():
@@ -158,7 +158,7 @@ def test_what_is_no_wrong_stamp_stays():
     stepped_ns[[80, 81]] = stepped_ns[[81, 80]]
     irregular_ns = np.sort(np.random.default_rng(0).uniform(0, 2e9, 200).astype(np.int64))
     for stamps_ns in (stepped_ns, irregular_ns):
-        assert mend_stamps(stamps_ns, stamps_ns + MS).tolist() == stamps_ns.tolist()
+        assert corrected_stamps(stamps_ns, stamps_ns + MS).tolist() == stamps_ns.tolist()
 
 
 def test_no_sample_is_dated_after_its_arrival():
