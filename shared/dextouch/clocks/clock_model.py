@@ -405,10 +405,13 @@ def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np
         return device
     period_ns = max(stamps.period_ns, 1.0)
     limit_ns = max(STEP_NS, WRONG_SCATTERS * stamps.scatter_ns)
+    # The last of several equal stamps is no right one.
+    rises = np.diff(device, prepend=device[0] - 1) > 0
     for run in (1, 2):
         span_ns = (device[run + 1 :] - device[: -run - 1]).astype(np.float64)
         num = np.rint(span_ns / period_ns)
         is_wrong = (num > run) & (np.abs(span_ns - num * period_ns) < limit_ns)
+        is_wrong &= rises[: -run - 1]
         for k in range(1, run + 1):
             since_ns = device[k : k - run - 1] - device[: -run - 1]
             nearest = np.rint(since_ns / period_ns)
