@@ -23,6 +23,11 @@ DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
 # Keeps a joint that moves nothing where it is; far below what the points see (m²/rad²).
 RIDGE_M2 = 1e-12
+# Directions count as points at this distance: the mean length of a phalanx.
+BONE_M = 0.03
+# 1.7 degrees at that distance.
+BONE_BEND_M = 0.0009
+LEAST_LENGTH_M2 = 1e-12
 # A start that reaches every point to a hundredth of a millimetre needs no other one beside it.
 EXACT_COST_M2 = 1e-10
 
@@ -95,8 +100,8 @@ def linearize(hand, person, work, finger, joints):
 
 @compiled
 @no_type_check
-def finger_terms(work, finger, num_joints, joints):
-    """Cost of one finger; its Hessian (Gauss–Newton) and gradient into the scratch.
+def point_terms(work, finger, num_joints):
+    """Squared distances of points, for a hand whose bones and knuckles are known exactly.
 
     An unknown shift of the knuckle that all points share is integrated out: with a variance of
     rho times a point's, residuals lose 1 - 1/sqrt(1 + K rho) of their mean.
@@ -104,8 +109,6 @@ def finger_terms(work, finger, num_joints, joints):
     measured, usable = work.measured, work.usable
     hessian, gradient = work.hessian[finger], work.gradient[finger]
     point, slope = work.point[finger], work.slope[finger]
-    hessian[:] = 0.0
-    gradient[:] = 0.0
     count = 0
     for index in range(NUM_POINTS):
         count += 1 if usable[finger, index] else 0
@@ -130,6 +133,59 @@ def finger_terms(work, finger, num_joints, joints):
                 gradient[joint] += row[joint] * residual
                 for other in range(joint + 1):
                     hessian[joint, other] += row[joint] * row[other]
+    return cost
+
+
+@compiled
+@no_type_check
+def bone_terms(work, finger, num_joints):
+    """Differences of the bones' unit vectors, times `BONE_M`, for people.
+
+    The cost is quadratic up to some `BONE_BEND_M`, and beyond it grows linearly (pseudo-Huber):
+    a bone that the robot cannot turn as the person's would turn the other bones as well. Over a
+    missing point, the chord between its neighbours is a bone.
+    """
+    measured, usable = work.measured[finger], work.usable[finger]
+    hessian, gradient = work.hessian[finger], work.gradient[finger]
+    point, slope = work.point[finger], work.slope[finger]
+    cost, row = 0.0, work.row[0]
+    base = -1
+    for index in range(NUM_POINTS):
+        if not usable[index]:
+            continue
+        if base >= 0:
+            squared, length = 0.0, LEAST_LENGTH_M2
+            for k in range(3):
+                bone = measured[index, k] - measured[base, k]
+                residual = point[index, k] - point[base, k] - bone
+                length += bone * bone
+                squared += residual * residual
+            weight = BONE_M**2 / length
+            bend = np.sqrt(1.0 + weight * squared / BONE_BEND_M**2)
+            cost += 2.0 * BONE_BEND_M**2 * (bend - 1.0)
+            weight /= bend
+            for k in range(3):
+                residual = point[index, k] - point[base, k] - measured[index, k] + measured[base, k]
+                for joint in range(num_joints):
+                    row[joint] = slope[index, joint, k] - slope[base, joint, k]
+                    gradient[joint] += weight * row[joint] * residual
+                    for other in range(joint + 1):
+                        hessian[joint, other] += weight * row[joint] * row[other]
+        base = index
+    return cost
+
+
+@compiled
+@no_type_check
+def finger_terms(person, work, finger, num_joints, joints):
+    """Cost of one finger; its Hessian (Gauss–Newton) and gradient into the scratch."""
+    hessian, gradient = work.hessian[finger], work.gradient[finger]
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    if person.is_rigid:
+        cost = point_terms(work, finger, num_joints)
+    else:
+        cost = bone_terms(work, finger, num_joints)
     pull, keep = work.pull_m2[finger], work.posture_weight_m2[finger]
     for joint in range(num_joints):
         moved = joints[joint] - work.before[finger, joint]
@@ -187,7 +243,7 @@ def evaluate(hand, person, work, group, joints):
     cost = 0.0
     for finger in group:
         linearize(hand, person, work, finger, joints[finger])
-        cost += finger_terms(work, finger, hand.num_joints[finger], joints[finger])
+        cost += finger_terms(person, work, finger, hand.num_joints[finger], joints[finger])
     if len(group) > 1:
         cost += pinch_terms(hand, work, group)
     return cost
