@@ -20,6 +20,7 @@ from services.alignment.retargeting.solver.arrays import (
     hand_arrays,
     joint_places,
 )
+from services.alignment.retargeting.solver.smoothing import smoothed
 from services.alignment.retargeting.solver.solve import retarget_samples
 
 
@@ -157,9 +158,11 @@ class HandRetargeter:
                 _checked_valid(valid, len(keypoints))[..., None], keypoints, np.nan
             )
         elapsed_s = _elapsed_s(len(keypoints), t_s)
-        person = self._person
-        if self.profile is None:
-            person = person_arrays(measure_profile(keypoints, self.hand), self.hand)
+        profile = self.profile or measure_profile(keypoints, self.hand)
+        person = person_arrays(profile, self.hand)
+        if not profile.is_rigid:
+            keypoints = smoothed(keypoints, profile.point_sigma_m)
+            person["noise_m2"] = 0.0
         # Of slow trackers, not every sample is a loss.
         lost_s = max(self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()

@@ -23,10 +23,14 @@ DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
 # Keeps a joint that moves nothing where it is; far below what the points see (m²/rad²).
 RIDGE_M2 = 1e-12
-# Directions count as points at this distance: the mean length of a phalanx.
-BONE_M = 0.03
-# 1.7 degrees at that distance.
-BONE_BEND_M = 0.0009
+# Directions count as points at this distance (chosen: the longest phalanx of the mean hand, 39.8 mm,
+# so that no bone counts for less than its points would).
+BONE_M = 0.04
+# Beyond, a bone's direction counts in proportion to its angle. Chosen: the mean angle over a real
+# hand's thumb is 8.2 degrees with squares alone, 7.4 from 3 degrees on and 7.2 from 1.7 (this one);
+# the best possible is 7.0.
+BONE_BEND_RAD = 0.03
+# Keeps the weight of a bone of no length finite.
 LEAST_LENGTH_M2 = 1e-12
 # A start that reaches every point to a hundredth of a millimetre needs no other one beside it.
 EXACT_COST_M2 = 1e-10
@@ -138,12 +142,10 @@ def point_terms(work, finger, num_joints):
 
 @compiled
 @no_type_check
-def bone_terms(work, finger, num_joints):
-    """Differences of the bones' unit vectors, times `BONE_M`, for people.
+def bone_terms(hand, work, finger):
+    """Squared differences of the bones' unit vectors, times `BONE_M`, for people.
 
-    The cost is quadratic up to some `BONE_BEND_M`, and beyond it grows linearly (pseudo-Huber):
-    a bone that the robot cannot turn as the person's would turn the other bones as well. Over a
-    missing point, the chord between its neighbours is a bone.
+    Over a missing point, the chord between its neighbours is a bone.
     """
     measured, usable = work.measured[finger], work.usable[finger]
     hessian, gradient = work.hessian[finger], work.gradient[finger]
@@ -154,18 +156,12 @@ def bone_terms(work, finger, num_joints):
         if not usable[index]:
             continue
         if base >= 0:
-            squared, length = 0.0, LEAST_LENGTH_M2
-            for k in range(3):
-                bone = measured[index, k] - measured[base, k]
-                residual = point[index, k] - point[base, k] - bone
-                length += bone * bone
-                squared += residual * residual
-            weight = BONE_M**2 / length
-            bend = np.sqrt(1.0 + weight * squared / BONE_BEND_M**2)
-            cost += 2.0 * BONE_BEND_M**2 * (bend - 1.0)
-            weight /= bend
+            weight = work.bone_weight[finger, index - 1]
+            # Joints further out do not turn this bone.
+            num_joints = hand.point_joints[finger, index] if index < 3 else hand.num_joints[finger]
             for k in range(3):
                 residual = point[index, k] - point[base, k] - measured[index, k] + measured[base, k]
+                cost += weight * residual * residual
                 for joint in range(num_joints):
                     row[joint] = slope[index, joint, k] - slope[base, joint, k]
                     gradient[joint] += weight * row[joint] * residual
@@ -177,15 +173,56 @@ def bone_terms(work, finger, num_joints):
 
 @compiled
 @no_type_check
-def finger_terms(person, work, finger, num_joints, joints):
+def weigh_bones(work, finger, ease):
+    """Weights of a finger's bones from their lengths and `ease`, which is kept between samples."""
+    measured, usable = work.measured[finger], work.usable[finger]
+    base = -1
+    for index in range(NUM_POINTS):
+        if not usable[index]:
+            continue
+        if base >= 0:
+            squared = LEAST_LENGTH_M2
+            for k in range(3):
+                squared += (measured[index, k] - measured[base, k]) ** 2
+            work.bone_weight[finger, index - 1] = ease[index - 1] * BONE_M**2 / squared
+        base = index
+
+
+@compiled
+@no_type_check
+def ease_bones(work, finger, ease):
+    """Let bones that the robot cannot turn as the person's weigh less in the next sample.
+
+    So does a pseudo-Huber loss, minimized by reweighting (Holland and Welsch 1977), once a sample:
+    beyond `BONE_BEND_RAD`, what a bone is off counts in proportion, no longer squared.
+    """
+    measured, usable, point = work.measured[finger], work.usable[finger], work.point[finger]
+    base = -1
+    for index in range(NUM_POINTS):
+        if not usable[index]:
+            continue
+        if base >= 0:
+            squared, length = 0.0, LEAST_LENGTH_M2
+            for k in range(3):
+                bone = measured[index, k] - measured[base, k]
+                squared += (point[index, k] - point[base, k] - bone) ** 2
+                length += bone * bone
+            ease[index - 1] = 1.0 / np.sqrt(1.0 + squared / (length * BONE_BEND_RAD**2))
+        base = index
+
+
+@compiled
+@no_type_check
+def finger_terms(hand, person, work, finger, joints):
     """Cost of one finger; its Hessian (Gauss–Newton) and gradient into the scratch."""
     hessian, gradient = work.hessian[finger], work.gradient[finger]
+    num_joints = hand.num_joints[finger]
     hessian[:] = 0.0
     gradient[:] = 0.0
     if person.is_rigid:
         cost = point_terms(work, finger, num_joints)
     else:
-        cost = bone_terms(work, finger, num_joints)
+        cost = bone_terms(hand, work, finger)
     pull, keep = work.pull_m2[finger], work.posture_weight_m2[finger]
     for joint in range(num_joints):
         moved = joints[joint] - work.before[finger, joint]
@@ -243,7 +280,7 @@ def evaluate(hand, person, work, group, joints):
     cost = 0.0
     for finger in group:
         linearize(hand, person, work, finger, joints[finger])
-        cost += finger_terms(person, work, finger, hand.num_joints[finger], joints[finger])
+        cost += finger_terms(hand, person, work, finger, joints[finger])
     if len(group) > 1:
         cost += pinch_terms(hand, work, group)
     return cost

@@ -30,11 +30,14 @@ from services.alignment.retargeting.solver.arrays import (
 from services.alignment.retargeting.solver.minimize import (
     POSTURE_TOLERANCE_RAD,
     STEP_TOLERANCE_RAD,
+    ease_bones,
     linearize,
     minimize,
     place_joints,
     solve_cold,
+    weigh_bones,
 )
+from services.alignment.retargeting.solver.smoothing import follow_point, noise_of_bones
 
 # Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
 MAX_BEND_COSINE = -0.766
@@ -42,16 +45,24 @@ MAX_BEND_COSINE = -0.766
 
 @compiled
 @no_type_check
-def read_sample(hand, work, keypoints):
-    """The points of every finger into the scratch; a missing one is zero."""
+def read_sample(hand, person, work, keypoints, memory):
+    """The points of every finger, smoothed, into the scratch; a missing one is zero."""
+    noise_m2 = person.noise_m2
+    if noise_m2 < 0.0:
+        noise_m2 = noise_of_bones(memory.bones_m, keypoints, hand.nodes)
     for finger in range(hand.num_fingers):
         for index in range(NUM_POINTS):
             node = hand.nodes[finger, index]
             x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
             seen = node >= 0 and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
             work.usable[finger, index] = seen
+            point = memory.points_m[finger, index]
+            if seen and noise_m2 > 0.0:
+                follow_point(point, keypoints[node], noise_m2)
+            else:
+                point = keypoints[node]
             for k in range(3):
-                work.measured[finger, index, k] = keypoints[node, k] if seen else 0.0
+                work.measured[finger, index, k] = point[k] if seen else 0.0
 
 
 @compiled
@@ -219,6 +230,10 @@ def solve_alone(hand, person, tuning, work, memory, output):
         work.posture_weight_m2[finger] = 0.0
         work.pull_m2[finger] = 0.0
         if unsolved_s >= tuning.reacquire_after_s:
+            memory.ease[finger] = 1.0
+        if not person.is_rigid:
+            weigh_bones(work, finger, memory.ease[finger])
+        if unsolved_s >= tuning.reacquire_after_s:
             solve_cold(hand, person, work, finger, memory.alone_rad, tuning.num_starts)
             if np.isfinite(unsolved_s):
                 status[finger] = REACQUIRED
@@ -230,6 +245,8 @@ def solve_alone(hand, person, tuning, work, memory, output):
         if not at_rest:
             status[finger] = UNCONVERGED
         errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
+        if not person.is_rigid:
+            ease_bones(work, finger, memory.ease[finger])
 
 
 @compiled
@@ -314,7 +331,7 @@ def retarget_samples(tables, samples, memory, output):
     for t in range(len(keypoints)):
         status = output.finger_status[t]
         found = (status, output.tip_error_m[t])
-        read_sample(hand, work, keypoints[t])
+        read_sample(hand, person, work, keypoints[t], memory)
         work.elapsed_s = elapsed_s[t]
         work.sent[:num_fingers] = joints
         for finger in range(num_fingers):
