@@ -175,7 +175,8 @@ class RetargetOptions:
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
-            weight, or directions of bones of people, which count as points at 40 mm; at other rates in proportion to the rate. 0 follows every sample exactly.
+            weight (directions of people's bones count as points at 40 mm); at other rates in
+            proportion to the rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
         max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
             regardless of the elapsed time; the default is 9.6 rad/s at 30 Hz, the rate of the

@@ -23,7 +23,7 @@ DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
 # Keeps a joint that moves nothing where it is; far below what the points see (m²/rad²).
 RIDGE_M2 = 1e-12
-# Directions count as points at this distance. Chosen: the longest phalanx of the mean hand, 39.8 mm.
+# Directions count as points at this distance. Chosen: the longest bone of the mean hand's fingers.
 BONE_M = 0.04
 # Beyond, a bone's direction counts in proportion to its angle. Chosen: the mean angle over a real
 # hand's thumb is 8.2 degrees with squares alone, 7.4 from 3 degrees on and 7.2 from 1.7 (this one);
