@@ -21,7 +21,7 @@ from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.grid_actions import (
-    REQUIRED,
+    ACTION_STREAMS,
     GriddedStreams,
     make_actions,
     place_streams,
@@ -157,7 +157,7 @@ def align_by_arrivals(
         domain="human",
         origin="recorded",
         anchor=StoredAnchor.from_poses(actions.anchor),
-        K_head=source.calibration["K_head"],
+        K_head=source.calibration.get("K_head"),
         quality={"origin_after_start_ns": float(after_start_ns)},
     )
     action = StreamDescriptor(
@@ -192,7 +192,7 @@ def first_arrivals(arrival_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " k
 
 
 def _on_grid(streams: dict[str, DatedStream], *, nearest: bool) -> tuple[int, GriddedStreams]:
-    parts = {name: streams[name].load() for name in REQUIRED["human"]}
+    parts = {name: streams[name].load() for name in ACTION_STREAMS["human"]}
     start_ns = max(int(part.t_ns[0]) for part in parts.values())
     stop_ns = min(int(part.t_ns[-1]) for part in parts.values())
     num_steps = int((stop_ns - start_ns) * 1e-9 * OPTIONS.model_rate_hz) + 1

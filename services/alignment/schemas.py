@@ -59,11 +59,11 @@ class AlignmentReport(FrozenModel):
     """Report of one aligned recording.
 
     `created` is False where the same recording had been aligned with the same options before.
-    `duration_s` is that of the model grid. `absent` lists streams that an episode may have and this
-    one has not; `refused_parts` the stretches of the recording that are not in the episode, and
-    why; `retargeting` figures of each hand: tip error (mean and 95th percentile, mm) and the share
-    of steps by status. `refused_taxels` names, by stream and reason, taxels (anatomical order) that
-    are zero because they were not measured.
+    `duration_s` is that of the model grid. `absent` lists parts of the action and streams that an
+    episode may have and this one has not; `refused_parts` the stretches of the recording that are
+    not in the episode, and why; `retargeting` figures of each hand: tip error (mean and 95th
+    percentile, mm) and the share of steps by status. `refused_taxels` names, by stream and reason,
+    taxels (anatomical order) that are zero because they were not measured.
     """
 
     recording_id: str
@@ -205,7 +205,10 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
         num_steps=episode.num_steps,
         duration_s=episode.num_steps / attributes.model_rate_hz,
         streams={name: episode.num_samples(name) for name in episode.streams},
-        absent=tuple(name for name in EXPECTED_STREAMS if name not in episode.streams),
+        absent=(
+            *attributes.absent,
+            *(name for name in EXPECTED_STREAMS if name not in episode.streams),
+        ),
         clocks=attributes.clocks,
         quality=attributes.quality,
         retargeting=_retargeting_figures(attributes.quality),

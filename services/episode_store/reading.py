@@ -15,7 +15,15 @@ from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
 from pydantic import BaseModel, Field
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader, encode_window
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    ImageForm,
+    RecordingReader,
+    encode_window,
+    interpolated_spans,
+    measured_taxels,
+)
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, poses_from_actions
@@ -24,6 +32,7 @@ from dextouch.images import encode_jpeg
 from dextouch.schemas import (
     ActionKind,
     EpisodeDetail,
+    InterpolatedSpan,
     ItemKind,
     Playback,
     PlayedStream,
@@ -31,6 +40,7 @@ from dextouch.schemas import (
 )
 from dextouch.serving import MSGPACK
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, pack
+from dextouch.tactile.layout import SIDES
 from services.episode_store.keys import MAY_READ
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -354,6 +364,7 @@ def playback_of(reader: Reader) -> Playback:
         own = {
             "kind": "episode",
             "origin": reader.attributes.origin,
+            "absent": reader.attributes.absent,
             "at": reader.attributes.created_at,
             "model_rate_hz": reader.attributes.model_rate_hz,
             "num_steps": reader.num_steps,
@@ -374,6 +385,12 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     steps_ns = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
     longest = np.sort(gaps[np.argsort(steps_ns[gaps], kind="stable")[-MAX_GAPS:]])
+    calibration = reader.attributes.calibration
+    spans = interpolated_spans(calibration) if stream.name.startswith("action") else []
+    taxels = np.zeros(0, dtype=np.int64)
+    for side, measured in zip(SIDES, measured_taxels(calibration), strict=True):
+        if stream.name == f"tactile_{side}":
+            taxels = np.flatnonzero(~measured)
     return PlayedStream(
         name=stream.name,
         kind=stream.kind,
@@ -387,6 +404,11 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         last_ns=int(stamps_ns[-1]) if len(stamps_ns) else None,
         num_gaps=len(gaps),
         gaps_ns=tuple((int(stamps_ns[k]), int(stamps_ns[k + 1])) for k in longest),
+        interpolated=tuple(
+            InterpolatedSpan(part=part, start_ns=start_ns, stop_ns=stop_ns)
+            for part, start_ns, stop_ns in spans
+        ),
+        unmeasured_taxels=tuple(taxels.tolist()),
     )
 
 

@@ -46,7 +46,7 @@ MIDDLE_ENDS: Final = (32, 48, 64)
 # Last step of the episodes that these steps belong to; in others they lie as far along.
 _USUAL_END: Final = 80
 # What an episode of a judge must have.
-JUDGED: Final = (needs.WHOLE, needs.OUTCOME, needs.longer_than(16), needs.IMAGES)
+JUDGED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.longer_than(16), needs.IMAGES)
 NUM_PAD_FEATURES = 24
 _PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
 # Success is decided by millimetres within half a metre, so distances enter features of poses twice:

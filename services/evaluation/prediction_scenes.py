@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
@@ -140,13 +140,21 @@ class Future:
 
     Steps are counted from 1, the one after the first observation; `image_steps` are those of the
     images. `objects_m` are the positions of the task's objects at the last step in the world, NaN
-    where they are not known, and None of what says nothing of objects.
+    where they are not known, and None of what says nothing of objects. `measured_taxels` are those
+    whose pressure was measured; None: all.
     """
 
     images: UInt8[np.ndarray, "shown h w 3"]
     tactile_kpa: Float32[np.ndarray, "steps 2 320"]
     image_steps: tuple[int, ...]
     objects_m: Float64[np.ndarray, "objects 3"] | None = None
+    measured_taxels: Bool[np.ndarray, "steps 2 320"] | None = None
+
+    def is_measured(self) -> Bool[np.ndarray, "steps 2 320"]:
+        """Taxels at steps whose pressure is known."""
+        if self.measured_taxels is None:
+            return np.ones(self.tactile_kpa.shape, dtype=np.bool_)
+        return self.measured_taxels
 
 
 @dataclass(frozen=True)
@@ -228,12 +236,13 @@ def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: in
         anchor=reader.anchor(first_step),
         K_head=grid.K_head,
     )
-    touch_kpa, _ = reader.touch(first_step + 1, num_steps)
+    touch_kpa, is_sampled = reader.touch(first_step + 1, num_steps)
     truth = Future(
         grid.images([first_step + step for step in shown]),
         touch_kpa,
         shown,
         _objects_m(grid, first_step + num_steps),
+        is_sampled[..., None] & grid.measured_taxels,
     )
     actions = reader.actions(first_step, num_steps + 1, kind=kind)[1:]
     return Scene(

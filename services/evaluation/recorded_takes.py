@@ -43,7 +43,7 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
 # What a take must have to be replayed.
-REPLAYED: Final = (needs.WHOLE, needs.OUTCOME, needs.IMAGES)
+REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.IMAGES)
 # Name of the replayed actions among the policies.
 REPLAY: Final = "recorded actions"
 _DRAWS: Final = 1000

@@ -59,7 +59,9 @@ def prediction_main(arguments: Sequence[str]) -> int:
     store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
     world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
     tasks = options.tasks or world.description.tasks
-    readers = select_episodes([store], domain="robot", tasks=tasks, needs=(needs.IMAGES,))
+    readers = select_episodes(
+        [store], domain="robot", tasks=tasks, needs=(needs.EVERY_PART, needs.IMAGES)
+    )
     wanted = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}

@@ -59,7 +59,7 @@ def chosen_episodes(
         lambda reader: seeds is None or reader.attributes.seed in seeds,
         is_choice=True,
     )
-    wanted = (in_seeds, needs.IMAGES, *also)
+    wanted = (in_seeds, needs.EVERY_PART, needs.IMAGES, *also)
     readers = select_episodes(
         [store], domain="robot", tasks=tasks or (), splits=splits, needs=wanted
     )

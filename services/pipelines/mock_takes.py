@@ -291,7 +291,7 @@ def _aligned(
         _played(truth.streams),
         TakePrompt(task=about.task, instruction=about.instruction, domain=about.domain),
         about.success,
-        {**about.calibration, "K_head": about.K_head, **_session_gloves(session)},
+        about.matrices() | _session_gloves(session),
         recording_id="take",
         seed=zlib.crc32(episode_id.encode()),
         unit_seed=session,

@@ -48,7 +48,18 @@ def played(tmp_path_factory):
     streams = items.write_episode(store)
     raw = items.write_recording(store)
     items.write_episode(store, "no-cameras", cameras=False)
-    items.write_episode(store, "one-hand", sides=("left",), instruction=items.HOSTILE)
+    refused = [float(taxel in (7, 200)) for taxel in range(320)]
+    items.write_episode(
+        store,
+        "one-hand",
+        sides=("left",),
+        instruction=items.HOSTILE,
+        absent=("wrist_right", "keypoints_right"),
+        calibration={
+            "interpolated_fingers_left_s": [[2.0, 4.0, 3.0]],
+            "tactile_left_refused_taxels": [refused],
+        },
+    )
     return folder, streams, raw
 
 
@@ -306,6 +317,16 @@ def test_one_hand_and_hostile_text(watched, address, played):
     expect(watched.locator("#facts")).to_contain_text("onerror")
     assert "broken" not in watched.title()
     assert watched.locator("main img").count() == 0
+
+
+@pytest.mark.slow
+def test_what_was_not_measured_is_marked(watched, address, played):
+    opened(watched, f"{address}/episodes/episode/one-hand?at=3")
+    lane = watched.locator(".lane[data-stream=action]")
+    title = "ring_left: interpolated from 2 to 4 s"
+    expect(lane.locator(".interpolated")).to_have_attribute("title", title)
+    expect(lane).to_contain_text("1 interpolated")
+    expect(watched.locator("#facts")).to_contain_text("wrist_right, keypoints_right")
 
 
 @pytest.mark.slow

@@ -362,4 +362,4 @@ def replay_streams(reader: EpisodeReader) -> list[ReplayStream]:
 
 def replay_calibration(reader: EpisodeReader) -> dict[str, Matrix]:
     """What a stored episode knows of its cameras and mounts."""
-    return {**reader.attributes.calibration, "K_head": reader.attributes.K_head}
+    return reader.attributes.matrices()

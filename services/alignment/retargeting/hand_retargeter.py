@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands import NUM_KEYPOINTS
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, mean_hand_m, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting.hand_checks import checked_keypoints
 from services.alignment.retargeting.hand_profile import HandProfile, measure_profile, person_arrays
@@ -149,8 +149,8 @@ class HandRetargeter:
 
         Raises:
             ShapeError: wrong shapes.
-            InvalidInputError: times that do not rise, wrong unit, or a finger that is not tracked
-                in any sample.
+            InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
+                followed in no sample. Joints of one that is never tracked are at rest.
         """
         keypoints = checked_keypoints(keypoints_m)
         if valid is not None:
@@ -158,7 +158,9 @@ class HandRetargeter:
                 _checked_valid(valid, len(keypoints))[..., None], keypoints, np.nan
             )
         elapsed_s = _elapsed_s(len(keypoints), t_s)
-        profile = self.profile or measure_profile(keypoints, self.hand)
+        profile = self.profile or measure_profile(
+            _with_every_finger(keypoints, self.hand.side), self.hand
+        )
         person = person_arrays(profile, self.hand)
         if not profile.is_rigid:
             keypoints = smoothed(keypoints, profile.point_sigma_m)
@@ -168,13 +170,15 @@ class HandRetargeter:
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
         result = self._follow(tables, (keypoints, elapsed_s), self._blank())
-        fingers = zip(self.hand.fingers, result.solved.T, strict=True)
-        never = [finger.chain for finger, solved in fingers if not solved.any()]
-        if never:
+        is_tracked = (result.finger_status == IMPLAUSIBLE).any(axis=0)
+        if not result.solved.any():
+            is_tracked[:] = True
+        fingers = zip(self.hand.fingers, is_tracked & ~result.solved.any(axis=0), strict=True)
+        if never := [finger.chain for finger, is_other in fingers if is_other]:
             raise InvalidInputError(
                 f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "
                 "(bones or knuckles are not those of the profile, or nodes are missing); expected "
-                "every finger at least once"
+                "every finger that is tracked at least once"
             )
         return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
@@ -215,6 +219,8 @@ class HandRetargeter:
         filled = result.joints_rad.copy()
         for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
             known = result.solved[:, finger]
+            if not known.any():
+                continue
             filled[~known, joint] = np.interp(
                 t_s[~known], t_s[known], result.joints_rad[known, joint]
             )
@@ -225,6 +231,21 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
+
+
+def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
+    """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
+
+    So that a person whose finger is never seen, or missing, has a profile of the others. Trackers
+    may lack the metacarpals of all fingers, which no profile has.
+    """
+    filled = keypoints_m
+    for chain in CHAINS:
+        nodes = solver_indices(chain)
+        if not np.isfinite(keypoints_m[:, nodes]).all(axis=(-1, -2)).any():
+            filled = filled.copy() if filled is keypoints_m else filled
+            filled[:, nodes] = mean_hand_m(side)[nodes]
+    return filled
 
 
 def _checked_valid(valid: np.ndarray, num_samples: int) -> Bool[np.ndarray, "time 25"]:

@@ -13,8 +13,8 @@ from dextouch.tactile import pad_forces_n
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.grid_actions import (
+    ACTION_STREAMS,
     COMMANDED_STREAMS,
-    REQUIRED,
     TOUCH_STREAMS,
     GridActions,
     GriddedStreams,
@@ -41,6 +41,7 @@ from services.alignment.synchronization.resampling import (
     MAX_GAP_PERIODS,
     bridged_run,
     grid_times_ns,
+    interpolated_fingers,
     interpolated_matrices,
     refused_edges,
     refused_matrices,
@@ -101,7 +102,7 @@ def build_episode(
     for number, name in enumerate(recording.streams):
         on_progress(progress_within("dating", number / len(recording.streams), name))
         streams[name] = date_stream(recording, name)
-    streams = with_tracked_objects(streams, objects)
+    streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
     checked = {
         name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
         for name, stream in streams.items()
@@ -111,7 +112,13 @@ def build_episode(
     stretch = _find_stretch(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded
-    actions = make_actions(gridded, source.domain, source.calibration, wrist=options.wrist)
+    actions = make_actions(
+        gridded,
+        source.domain,
+        source.calibration,
+        wrist=options.wrist,
+        max_gap_ns=options.max_gap_ns,
+    )
     inside_ns = (stretch.origin_ns, stretch.origin_ns + int(np.ptp(gridded.grid_ns)))
     seen = marker_streams(
         recording,
@@ -139,7 +146,9 @@ def build_episode(
     listed = () if objects is None else objects.tasks[source.task]
     more = {
         "model_rate_hz": options.model_rate_hz,
-        "calibration": attributes.calibration | stretch.matrices,
+        "calibration": attributes.calibration
+        | stretch.matrices
+        | interpolated_fingers(grid_ns, actions.unseen_fingers),
         "object_names": tuple(one.name for one in listed),
         "object_boxes_m": tuple(one.box_m for one in listed),
     }
@@ -155,7 +164,7 @@ def _find_stretch(
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes, streams = recording.attributes, {n: one.stream for n, one in checked.items()}
     where = f"recording {attributes.recording_id!r}"
-    wanted = [*REQUIRED[attributes.domain], *COMMANDED_STREAMS]
+    wanted = [*ACTION_STREAMS[attributes.domain], *COMMANDED_STREAMS]
     if attributes.domain == "human" and options.wrist == "touch":
         wanted += TOUCH_STREAMS
     names = [name for name in wanted if name in streams]
@@ -226,7 +235,8 @@ def _episode_attributes(
         station=source.station,
         operator=source.operator,
         anchor=StoredAnchor.from_poses(actions.anchor),
-        K_head=source.calibration["K_head"],
+        K_head=source.calibration.get("K_head"),
+        absent=actions.absent,
         success=source.success,
         recovered=source.recovered,
         complete=source.complete,
@@ -243,25 +253,19 @@ def _episode_attributes(
 
 
 def check_complete(recording: RecordingReader) -> None:
-    """Refuse a recording from which no episode can be made.
+    """Refuse a recording from which no episode can be made: one without any hand.
 
     Raises:
-        InvalidInputError: names the streams or the calibration that are missing or do not fit.
+        InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
     attributes = recording.attributes
-    where = f"recording {attributes.recording_id!r}"
-    missing = [name for name in REQUIRED[attributes.domain] if name not in recording.streams]
-    if missing:
+    of_hands = [name for name in ACTION_STREAMS[attributes.domain] if name != "head"]
+    if not any(name in recording.streams for name in of_hands):
         raise InvalidInputError(
-            f"{where}: streams {missing} are missing, which an episode of domain "
-            f"{attributes.domain!r} needs; it has {sorted(recording.streams)}",
-            missing=missing,
-        )
-    if "K_head" not in attributes.calibration:
-        raise InvalidInputError(
-            f"{where}: calibration 'K_head' (3 by 3, pixels) is missing; it has "
-            f"{sorted(attributes.calibration)}",
-            missing=["K_head"],
+            f"recording {attributes.recording_id!r}: streams {of_hands} are missing, of which an "
+            f"episode of domain {attributes.domain!r} needs one at least; it has "
+            f"{sorted(recording.streams)}",
+            missing=of_hands,
         )
     _check_lenses(recording)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
-from dextouch.tactile.layout import SIDES, Side
+from dextouch.tactile.layout import FINGERS, SIDES, Side
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.wrist_frame import hand_axes_check
@@ -33,7 +33,8 @@ COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_co
 TOUCH_STREAMS = ("tactile_left", "tactile_right")
 # The influence of touch on wrists and fingertips lasts as long.
 TOUCH_GAP_NS = 300_000_000
-REQUIRED: Mapping[Domain, tuple[str, ...]] = {
+# What an action is made of; a take has at least one of a hand.
+ACTION_STREAMS: Mapping[Domain, tuple[str, ...]] = {
     "human": (*POSE_STREAMS, "keypoints_left", "keypoints_right"),
     "robot": (*POSE_STREAMS, "joints_measured"),
 }
@@ -61,7 +62,9 @@ class GriddedStreams:
         return np.logical_and.reduce(needed)
 
     def poses(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
-        """Transforms of a pose stream at the steps."""
+        """Transforms of a pose stream at the steps; the identity if there is none."""
+        if name not in self.streams:
+            return np.broadcast_to(np.eye(4), (len(self.grid_ns), 4, 4))
         return poses_on_grid(self.streams[name].values, self.at[name])
 
     def vectors(self, name: str) -> Float64[np.ndarray, "n ..."]:
@@ -71,11 +74,26 @@ class GriddedStreams:
 
 @dataclass(frozen=True)
 class GridActions:
-    """Actions on the grid; `commanded` is None where nothing was commanded."""
+    """Actions on the grid; `commanded` is None where nothing was commanded.
+
+    `absent` are the parts of actions that no step has, and `unseen_fingers` says by side at which
+    steps a finger was in a gap of its own.
+    """
 
     anchor: AnchorPoses
     measured: Float64[np.ndarray, "n 67"]
     commanded: Float64[np.ndarray, "n 67"] | None
+    quality: dict[str, float]
+    absent: tuple[str, ...] = ()
+    unseen_fingers: Mapping[Side, Bool[np.ndarray, "n 5"]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RetargetedHand:
+    """Joint angles of a hand at the steps, and where a finger was in a gap of its own."""
+
+    joints_rad: Float64[np.ndarray, "n 20"]
+    unseen: Bool[np.ndarray, "n 5"]
     quality: dict[str, float]
 
 
@@ -99,17 +117,33 @@ def make_actions(
     calibration: Mapping[str, Matrix],
     *,
     wrist: WristChoice = "tracked",
+    max_gap_ns: int = 0,
 ) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
-    Human hands are retargeted, a robot's joints taken as they are. `wrist` says where the robot's
-    wrists are that stand for human ones.
+    Human hands are retargeted, a robot's joints taken as they are. Parts that were not recorded
+    have the identity as their pose, and joints at rest.
+
+    Args:
+        gridded: placed streams.
+        domain: whose hands act.
+        calibration: of the recording.
+        wrist: where the robot's wrists are that stand for human ones.
+        max_gap_ns: longest time without a finger that is no gap of it; of slow streams longer.
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
+    absent = [name for name in ACTION_STREAMS[domain] if name not in gridded.streams]
+    hands: dict[Side, RetargetedHand] = {}
+    joints_rad, quality = np.zeros((len(gridded.grid_ns), 40)), dict[str, float]()
     if domain == "human":
-        joints_rad, quality = retarget_hands(gridded.streams, gridded.at, calibration)
-    else:
-        joints_rad, quality = gridded.vectors("joints_measured"), {}
+        hands = retarget_hands(gridded, calibration, max_gap_ns=max_gap_ns)
+        for side, hand in hands.items():
+            joints_rad[:, slice(0, 20) if side == "left" else slice(20, 40)] = hand.joints_rad
+            quality |= hand.quality
+            never = np.flatnonzero(hand.unseen.all(axis=0)).tolist()
+            absent += [f"{FINGERS[finger]}_{side}" for finger in never]
+    elif "joints_measured" in gridded.streams:
+        joints_rad = gridded.vectors("joints_measured")
     by_side = np.split(joints_rad, 2, axis=1)
     trajectory = HandTrajectory(left, right, by_side[0], by_side[1], head)
     if domain == "human" and wrist == "touch":
@@ -126,7 +160,14 @@ def make_actions(
         # Nobody commands the head: where it was is where it should have been.
         wanted = HandTrajectory(left, right, by_side[0], by_side[1], head)
         commanded = actions_from_poses(wanted, anchor)
-    return GridActions(anchor, actions_from_poses(trajectory, anchor), commanded, quality)
+    return GridActions(
+        anchor,
+        actions_from_poses(trajectory, anchor),
+        commanded,
+        quality,
+        tuple(absent),
+        {side: hand.unseen for side, hand in hands.items()},
+    )
 
 
 def _moved_by_touch(
@@ -137,6 +178,8 @@ def _moved_by_touch(
     moved: dict[str, np.ndarray] = {}
     figures: dict[str, float] = {}
     for side in SIDES:
+        if not {f"wrist_{side}", f"keypoints_{side}"} <= set(gridded.streams):
+            continue
         name = f"tactile_{side}"
         forces = np.zeros((len(t_s), NUM_PADS))
         if name in gridded.streams and len(gridded.streams[name].t_ns) > 1:
@@ -158,39 +201,35 @@ def _moved_by_touch(
 
 
 def retarget_hands(
-    streams: Mapping[str, LoadedStream],
-    at: Mapping[str, GridPlacement],
-    calibration: Mapping[str, Matrix],
-) -> tuple[Float64[np.ndarray, "n 40"], dict[str, float]]:
-    """Joint angles of both hands, left before right, on the grid, and quality figures.
-
-    Each hand is retargeted in its own thread.
+    gridded: GriddedStreams, calibration: Mapping[str, Matrix], *, max_gap_ns: int = 0
+) -> dict[Side, RetargetedHand]:
+    """Joint angles of the recorded hands on the grid, each from a thread of its own.
 
     Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
-    take the line between their two neighbours, which `at` has found to be in no gap.
+    take the line between their two neighbours, which `gridded.at` has found to be in no gap.
 
-    `at` is valid at every step. `hand_profile_SIDE` of the calibration is the person's hand, which
-    is measured from the recording itself where it is absent.
+    The placement is valid at every step. `hand_profile_SIDE` of the calibration is the person's
+    hand, which is measured from the recording itself where it is absent.
 
     Raises:
         InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see
             `hand_axes_check` and `HandRetargeter.retarget`.
     """
-    hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in SIDES}
+    recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
+    hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}
 
-    def retarget(side: Side) -> tuple[np.ndarray, dict[str, float]]:
-        name = f"keypoints_{side}"
-        return _retarget(hands[side], streams[name], at[name])
+    def retarget(side: Side) -> RetargetedHand:
+        return _retarget(hands[side], gridded, max_gap_ns)
 
     with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:
-        (left_rad, left), (right_rad, right) = threads.map(retarget, SIDES)
-    return np.concatenate([left_rad, right_rad], axis=1), left | right
+        return dict(zip(recorded, threads.map(retarget, recorded), strict=True))
 
 
 def _retarget(
-    retargeter: HandRetargeter, stream: LoadedStream, at: GridPlacement
-) -> tuple[Float64[np.ndarray, "n 20"], dict[str, float]]:
+    retargeter: HandRetargeter, gridded: GriddedStreams, max_gap_ns: int
+) -> RetargetedHand:
     side = retargeter.hand.side
+    stream, at = gridded.streams[f"keypoints_{side}"], gridded.at[f"keypoints_{side}"]
     first, stop = int(at.left.min()), int(at.left.max()) + 2
     keypoints_m = stream.values[first:stop]
     # What the calibration turns was turned when the stream was read: the rest is refused.
@@ -203,7 +242,13 @@ def _retarget(
     # Extrapolation beyond the first or last sample could exceed the limits.
     hand = retargeter.hand
     joints_rad = np.clip(vectors_on_grid(result.joints_rad, near), hand.lower_rad, hand.upper_rad)
-    return joints_rad, _quality(side, result, near)
+    period_ns = stream.descriptor.period_ns()
+    gap_ns = stream_gap_ns(max_gap_ns, period_ns)
+    seen = [
+        place_on_grid(t_ns[solved], gridded.grid_ns, period_ns=period_ns, max_gap_ns=gap_ns).valid
+        for solved in result.solved.T
+    ]
+    return RetargetedHand(joints_rad, ~np.stack(seen, axis=1), _quality(side, result, near))
 
 
 def _quality(side: Side, result: RetargetResult, at: GridPlacement) -> dict[str, float]:

@@ -319,7 +319,9 @@ def _image_blocks(
 
 
 def with_tracked_objects(
-    streams: Mapping[str, DatedStream], objects: SceneObjects | None
+    streams: Mapping[str, DatedStream],
+    objects: SceneObjects | None,
+    calibration: Mapping[str, Matrix],
 ) -> dict[str, DatedStream]:
     """The streams, those of trackers on objects moved to the objects.
 
@@ -331,12 +333,13 @@ def with_tracked_objects(
         stream = streams.get(one.stream)
         if one.markers:
             missing = [name for name in (HEAD_CAMERA, "head") if name not in streams]
+            missing += [] if "K_head" in calibration else ["calibration K_head"]
             if missing or stream is not None:
                 raise InvalidInputError(
                     f"object {one.name!r}: has markers, and the recording "
                     + (f"has no {missing}" if missing else f"a stream {one.stream!r} of its own")
-                    + "; expected the streams of the head camera and its pose, and one source of "
-                    "the object's pose"
+                    + "; expected the streams of the head camera and its pose, its matrix, and one "
+                    "source of the object's pose"
                 )
         elif stream is None or stream.descriptor.kind != "pose":
             raise InvalidInputError(

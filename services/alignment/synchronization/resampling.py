@@ -17,6 +17,7 @@ from pydantic import FiniteFloat
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import bracket, interpolate_linear, interpolate_poses, transform_from_pose
 from dextouch.schemas import Matrix, matrix_rows
+from dextouch.tactile.layout import Side
 
 # How far beyond its first and last sample a stream may be continued, in nominal periods.
 EDGE_PERIODS = 1.5
@@ -177,17 +178,39 @@ def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> 
 
     `t_ns` are times of the steps on the episode's clock; rows are start and stop in seconds.
     """
-    step_ns = int(t_ns[1] - t_ns[0]) if len(t_ns) > 1 else 0
-    rows = {
-        name: [
-            (t_ns[start] / NS_PER_S, (t_ns[stop - 1] + step_ns) / NS_PER_S)
-            for start, stop in runs_of(~mine)
-        ]
-        for name, mine in valid.items()
-    }
+    rows = {name: _rows_s(t_ns, ~mine) for name, mine in valid.items()}
     return {
         f"interpolated_{name}_s": matrix_rows(np.array(runs)) for name, runs in rows.items() if runs
     }
+
+
+def interpolated_fingers(
+    t_ns: np.ndarray, unseen: Mapping[Side, Bool[np.ndarray, "n 5"]]
+) -> dict[str, Matrix]:
+    """When each finger was missing at steps of the episode, as it carries that.
+
+    Rows are start and stop in seconds on the episode's clock, and the finger. Fingers that no step
+    has are absent parts of the episode instead.
+    """
+    found = {}
+    for side, of_hand in unseen.items():
+        rows = [
+            (*row, float(finger))
+            for finger in np.flatnonzero(~of_hand.all(axis=0)).tolist()
+            for row in _rows_s(t_ns, of_hand[:, finger])
+        ]
+        if rows:
+            found[f"interpolated_fingers_{side}_s"] = matrix_rows(np.array(rows))
+    return found
+
+
+def _rows_s(t_ns: np.ndarray, steps: np.ndarray) -> list[tuple[float, float]]:
+    """Start and stop of each stretch of these steps, in seconds."""
+    step_ns = int(t_ns[1] - t_ns[0]) if len(t_ns) > 1 else 0
+    return [
+        (t_ns[start] / NS_PER_S, (t_ns[stop - 1] + step_ns) / NS_PER_S)
+        for start, stop in runs_of(steps)
+    ]
 
 
 def with_causes(

@@ -15,6 +15,7 @@ export const STATES = {
   gone: { level: "ERROR", mark: "cross", text: "gone: sends no number" },
   refused: { level: "STALE", mark: "ring", text: "refused by the calibration, which gives it the gain of its pad" },
   absent: { level: "STALE", mark: "dot", text: "absent: no cell of this glove measures it" },
+  unmeasured: { level: "STALE", mark: "dot", text: "not measured: alignment refused it, it reads zero" },
 };
 
 // States in which a taxel still measures; undefined is one in order.

@@ -49,7 +49,13 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 # Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
 # What an episode of a cloned policy must have.
-IMITATED: Final = (needs.WHOLE, needs.OUTCOME, needs.SUCCESS, needs.image_every(DECISION_STRIDE))
+IMITATED: Final = (
+    needs.EVERY_PART,
+    needs.WHOLE,
+    needs.OUTCOME,
+    needs.SUCCESS,
+    needs.image_every(DECISION_STRIDE),
+)
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
 MOMENTS_AN_EPISODE = 3

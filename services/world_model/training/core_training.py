@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from services.world_model.dynamics.core import RecurrentCore, SceneStart, own_features
+from services.world_model.dynamics.core import NUM_PADS, RecurrentCore, SceneStart, own_features
 from services.world_model.dynamics.features import (
     STEPS_PER_LATENT,
     Commands,
@@ -18,6 +18,7 @@ from services.world_model.dynamics.features import (
     ObjectPoses,
     TouchCodec,
 )
+from services.world_model.dynamics.model import by_pad
 from services.world_model.dynamics.start_reader import Reading
 from services.world_model.dynamics.trees import Part, chosen, mapped
 from services.world_model.settings import CoreSettings
@@ -255,29 +256,39 @@ def core_loss(
     contact = table.in_contact[rows][:, steps] & moves.view(-1, 1, 1, 1)
     # Part of the batch suffices: each of its rows has thousands of taxels.
     few = slice(0, -(-len(rows) // _TAXEL_SHARE))
-    felt = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
-    felt &= moves[few].view(-1, 1, 1, 1, 1)
+    pressed = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
+    pressed &= moves[few].view(-1, 1, 1, 1, 1)
     contact_error = functional.binary_cross_entropy_with_logits(
         future.contact[:, 1:], contact.float(), reduction="none"
     )
     taxel_error = functional.binary_cross_entropy_with_logits(
-        core.taxels(future.pattern[few, 1:]), felt.float(), reduction="none"
+        core.taxels(future.pattern[few, 1:]), pressed.float(), reduction="none"
     )
+    felt, taxels = table.felt[rows][:, steps], table.measured_taxels[rows]
+    pads = torch.from_numpy(by_pad(taxels.float().numpy(), np.max) > 0)[:, None, None]
+    pads = pads & felt.repeat_interleave(NUM_PADS // 2, dim=-1)
+    taxels = taxels[few, None, None] & felt[few, ..., None]
+    touch_error = (future.touch[:, 1:] - touch).square().sum(-1)
     return (
         success
         + weights.objects * _object_error(future.objects, true, known)
-        + weights.touch * _mean_within((future.touch[:, 1:] - touch).square().sum(-1), counted)
-        + weights.contact * _mean_within(contact_error, counted)
-        + weights.taxels * _mean_within(taxel_error, counted[few])
+        + weights.touch * _mean_within(touch_error, counted, felt)
+        + weights.contact * _mean_within(contact_error, counted, pads)
+        + weights.taxels * _mean_within(taxel_error, counted[few], taxels)
     )
 
 
 def _mean_within(
-    each: Float32[Tensor, "batch latents ..."], within: Bool[Tensor, "batch latents"]
+    each: Float32[Tensor, "batch latents ..."],
+    within: Bool[Tensor, "batch latents"],
+    measured: Bool[Tensor, "batch latents ..."],
 ) -> Float32[Tensor, ""]:
-    """Mean over the latent steps that count."""
-    by_latent = each.flatten(2).mean(-1)
-    return (by_latent * within).sum() / within.sum().clamp_min(1)
+    """Mean over what was measured at the latent steps that count."""
+    if bool(measured.all()):
+        by_latent = each.flatten(2).mean(-1)
+        return (by_latent * within).sum() / within.sum().clamp_min(1)
+    counted = measured & within.view(*within.shape, *[1] * (each.ndim - 2))
+    return (each * counted).sum() / counted.sum().clamp_min(1)
 
 
 def _success_error(

@@ -32,7 +32,7 @@ from dextouch.streams import HEAD_CAMERA
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # What an episode must have for windows to be cut from it.
-CUT: Final = (needs.EVERY_IMAGE,)
+CUT: Final = (needs.EVERY_PART, needs.EVERY_IMAGE)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
 

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, Shaped, UInt8
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS
+from dextouch.tactile.layout import NUM_TAXELS, split_pads
 from services.world_model.dynamics.features import (
     FREE_KPA,
     MAX_DISTANCE_M,
@@ -36,6 +38,8 @@ from services.world_model.rendering.training import SceneClip
 _MOVED_M = 2e-3
 MEASURED_ERROR_M = 5e-3
 _MEASURED_MOVED_M = 4 * MEASURED_ERROR_M
+# Touch of a hand of which less is measured says too little; alignment refuses such gloves, too.
+LEAST_MEASURED = 0.5
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,13 @@ class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
     `length` is the number of an episode's own steps, of which `interpolated` ones have actions that
-    nothing measured; `objects_known` are the steps at which the
-    pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
-    measurement, `touched` those of tasks of which some have poses from touch, and `placed_sd_m` is
-    the standard deviation of positions from clicks or touch, 0 of others. `images` are those of the
-    steps `image_steps`, where `shown`; `in_contact` marks pads in contact; `sent` are commanded
+    nothing measured; `objects_known` are the steps at which the pose of an object is known,
+    `measured_objects` marks episodes whose poses have the errors of a measurement, `touched` those
+    of tasks of which some have poses from touch, and `placed_sd_m` is the standard deviation of
+    positions from clicks or touch, 0 of others. `images` are those of the steps `image_steps`,
+    where `shown`; `in_contact` marks pads in contact. Taxels that are not `measured_taxels` have
+    the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at a
+    step, for want of a sample or of half of their taxels, count in no loss. `sent` are commanded
     hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
     episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
     follows from their number. `labelled` marks episodes whose object poses are trained on;
@@ -79,6 +85,8 @@ class SceneTable:
     tactile_kpa: Float16[Tensor, "episodes steps 2 320"]
     pads_kpa: Float32[Tensor, "episodes steps 12"]
     in_contact: Bool[Tensor, "episodes steps 12"]
+    felt: Bool[Tensor, "episodes steps 2"]
+    measured_taxels: Bool[Tensor, "episodes 2 320"]
     images: UInt8[Tensor, "episodes images px px 3"]
     shown: Bool[Tensor, "episodes images"]
     image_steps: tuple[int, ...]
@@ -273,7 +281,7 @@ def scene_table(
     for one in episodes:
         measured.append(hand_motion(_filled(one.measured, one, num_steps), one.anchor))
         sent.append(hand_motion(_filled(one.sent, one, num_steps), one.anchor))
-    tactile = np.stack([_filled(e.touch()[0].astype(np.float16), e, num_steps) for e in episodes])
+    tactile, felt = _touch(episodes, num_steps)
     tracked = list(zip(episodes, tracks, strict=True))
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
@@ -289,6 +297,8 @@ def scene_table(
         tactile_kpa=torch.from_numpy(tactile),
         pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean)),
         in_contact=torch.from_numpy(by_pad(tactile, np.max) >= FREE_KPA),
+        felt=torch.from_numpy(felt),
+        measured_taxels=torch.from_numpy(np.stack([e.measured_taxels for e in episodes])),
         images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
         shown=torch.from_numpy(np.stack([np.isin(steps, e.image_steps) for e in episodes])),
         image_steps=tuple(steps),
@@ -322,6 +332,38 @@ def _filled(
 ) -> Shaped[np.ndarray, "filled ..."]:
     """Values of an episode's steps, the last one repeated up to the length of the table."""
     return values[np.arange(num_steps).clip(max=_whole(episode) - 1)]
+
+
+def _touch(
+    episodes: Sequence[EpisodeGrid], num_steps: int
+) -> tuple[Float16[np.ndarray, "episodes steps 2 320"], Bool[np.ndarray, "episodes steps 2"]]:
+    """Pressures (kPa) at every step, those of unmeasured taxels filled, and which hands count."""
+    tactile, felt = [], []
+    for one in episodes:
+        touch_kpa, is_sampled = one.touch()
+        measured = one.measured_taxels
+        nearest = np.stack([_nearest_measured(hand) for hand in measured])
+        is_known = np.take_along_axis(measured, nearest, axis=-1)
+        touch_kpa = np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known
+        tactile.append(_filled(touch_kpa.astype(np.float16), one, num_steps))
+        is_felt = is_sampled & (measured.mean(axis=-1) >= LEAST_MEASURED)
+        felt.append(_filled(is_felt, one, num_steps))
+    return np.stack(tactile), np.stack(felt)
+
+
+def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:
+    """For each taxel the nearest measured one in rows and columns of its pad, or itself."""
+    nearest = np.arange(NUM_TAXELS)
+    if measured.all():
+        return nearest
+    tips, palm = split_pads(nearest)
+    for pad in (*tips, palm):
+        if measured[pad].any():
+            places = distance_transform_edt(
+                ~measured[pad], return_distances=False, return_indices=True
+            )
+            nearest[pad] = pad[tuple(places)]
+    return nearest
 
 
 def _known(

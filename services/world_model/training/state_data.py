@@ -50,7 +50,7 @@ logger = structlog.get_logger(__name__)
 _LEAST_GRIPS: Final = 5
 # Larger corrections are made with a warning: the file may describe another grip or object.
 _LARGE_SHIFT_MM, _LARGE_TURN_DEG = 100.0, 45.0
-_NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
+_NEEDED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
 
 
 class SceneGrid(EpisodeGrid):

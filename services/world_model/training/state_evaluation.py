@@ -87,6 +87,7 @@ def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> di
         if not whole.any():
             break
         true = table.tactile_kpa[whole, steps].float().numpy()
+        measured = table.felt[whole, steps, :, None] & table.measured_taxels[whole, None]
         said = slice(first - start, first - start + CHUNK_STEPS)
         guesses = {"": imagined.tactile_kpa[whole, said].numpy()}
         if start == 0:
@@ -94,7 +95,11 @@ def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> di
             guesses["_of_copy"] = np.broadcast_to(before, true.shape)
         for name, guess in guesses.items():
             chunk = f"{place}chunk_{index + 1}{name}"
-            pair = {"predicted_kpa": guess, "true_kpa": true}
+            pair = tactile_metrics.measured_hands(
+                predicted_kpa=guess, true_kpa=true, measured=measured.numpy()
+            )
+            if not len(pair["true_kpa"]):
+                continue
             figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
             figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
         off_mm, there = _object_errors(

@@ -156,10 +156,10 @@ class _Export:
             self._channel_ids.append(self._channel(f"/{stream.name}", message, metadata))
 
     def _calibration(self) -> dict[str, object]:
-        matrices: dict[str, object] = dict(self._reader.attributes.calibration)
-        if isinstance(self._reader, EpisodeReader):
-            matrices["K_head"] = self._reader.attributes.K_head
-        return matrices
+        about = self._reader.attributes
+        if isinstance(about, EpisodeAttributes):
+            return dict(about.matrices())
+        return dict(about.calibration)
 
     def _channel(self, topic: str, message: str, metadata: dict[str, str]) -> int:
         if message not in self._schema_ids:

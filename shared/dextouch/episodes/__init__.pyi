@@ -58,9 +58,12 @@ from .stream_writer import ContentDigest as ContentDigest
 from .table import TRUE_ORIGINS as TRUE_ORIGINS
 from .table import EpisodeGrid as EpisodeGrid
 from .table import data_hash as data_hash
-from .table import interpolated_steps as interpolated_steps
 from .table import is_rejected as is_rejected
 from .table import select_episodes as select_episodes
 from .trash import TRASH_KINDS as TRASH_KINDS
 from .trash import TrashKind as TrashKind
+from .validity import interpolated_actions as interpolated_actions
+from .validity import interpolated_spans as interpolated_spans
+from .validity import measured_actions as measured_actions
+from .validity import measured_taxels as measured_taxels
 from .writer import EpisodeWriter as EpisodeWriter

@@ -28,6 +28,11 @@ class Need:
 ACTIONS: Final = Need(
     "without actions", "align them from a recording", lambda reader: reader.num_steps > 0
 )
+EVERY_PART: Final = Need(
+    "without a hand, a finger, or the pose or matrix of the head camera",
+    "track both hands and the head, and calibrate the head camera",
+    lambda reader: not reader.attributes.absent and reader.attributes.K_head is not None,
+)
 WHOLE: Final = Need(
     "cut short when their writer died",
     "record them again: an outcome is that of the whole take",

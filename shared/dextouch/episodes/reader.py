@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from dextouch.episodes.format import STAMPS, stream_arrays, stream_content
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
+from dextouch.episodes.validity import measured_actions, measured_taxels
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
@@ -39,7 +40,12 @@ _WINDOW_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "actions": ("float64", (-1, 67)),
     "t_ref_ns": ("int64", (-1,)),
     "anchor": ("float64", (3, 4, 4)),
+}
+# These are sent only where something was not measured, or is known.
+_RARE_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "K_head": ("float64", (3, 3)),
+    "actions_measured": ("bool", (-1, 67)),
+    "taxels_measured": ("bool", (2, 320)),
 }
 
 
@@ -61,8 +67,9 @@ class Window:
     `images` are the nearest ones (one channel if requested in gray), `image_dt_ns` the image's
     stamp minus the step's. `tactile_kpa` [step, left/right, taxel] is the mean of the samples in
     (t−1, t]; where `tactile_valid` is false there was none, and the row is zero. `actions` are
-    relative to the *measured* poses of the first step, whose absolute poses are `anchor`; `K_head`
-    is in pixels.
+    relative to the *measured* poses of the first step, whose absolute poses are `anchor`; where
+    `actions_measured` is false, alignment interpolated them, or no such part was recorded. Taxels
+    that are not `taxels_measured` are zero. `K_head` is in pixels, None if unknown.
     """
 
     images: dict[str, UInt8[np.ndarray, "n h w c"]]
@@ -74,7 +81,9 @@ class Window:
     instruction: str
     t_ref_ns: Int64[np.ndarray, " n"]
     anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
+    K_head: Float64[np.ndarray, "3 3"] | None
+    actions_measured: Bool[np.ndarray, "n 67"]
+    taxels_measured: Bool[np.ndarray, "2 320"]
 
     def __len__(self) -> int:
         return len(self.t_ref_ns)
@@ -89,7 +98,7 @@ class NativeWindow:
     stop_ns: int
     instruction: str
     anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
+    K_head: Float64[np.ndarray, "3 3"] | None
 
 
 def step_ranges(
@@ -138,6 +147,11 @@ def encode_window(window: Window) -> bytes:
     """Serialize a window."""
     arrays = {name: getattr(window, name) for name in _WINDOW_ARRAYS}
     arrays["anchor"] = np.stack(window.anchor.as_tuple())
+    if window.K_head is not None:
+        arrays["K_head"] = window.K_head
+    for name in ("actions_measured", "taxels_measured"):
+        if not (measured := getattr(window, name)).all():
+            arrays[name] = measured
     for camera, images in window.images.items():
         arrays[_IMAGES + camera] = images
         arrays[_IMAGE_DT + camera] = window.image_dt_ns[camera]
@@ -162,6 +176,13 @@ def decode_window(data: bytes, *, max_bytes: int) -> Window:
         )
     plain: dict[str, Any] = {name: arrays[name] for name in _WINDOW_ARRAYS}
     plain["anchor"] = AnchorPoses(*arrays["anchor"])
+    plain["K_head"] = arrays.get("K_head")
+    plain["actions_measured"] = arrays.get(
+        "actions_measured", np.ones(plain["actions"].shape, dtype=np.bool_)
+    )
+    plain["taxels_measured"] = arrays.get(
+        "taxels_measured", np.ones(plain["tactile_kpa"].shape[1:], dtype=np.bool_)
+    )
     return Window(
         images={camera: arrays[_IMAGES + camera] for camera in cameras},
         image_dt_ns={camera: arrays[_IMAGE_DT + camera] for camera in cameras},
@@ -175,7 +196,8 @@ def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
     n = len(arrays["t_ref_ns"]) if "t_ref_ns" in arrays and arrays["t_ref_ns"].ndim else 0
     expected = {
         name: (dtype, tuple(n if size < 0 else size for size in shape))
-        for name, (dtype, shape) in _WINDOW_ARRAYS.items()
+        for name, (dtype, shape) in (_WINDOW_ARRAYS | _RARE_ARRAYS).items()
+        if name in _WINDOW_ARRAYS or name in arrays
     }
     for camera in cameras:
         # Height and width vary by camera; gray images have one channel.
@@ -339,8 +361,13 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             instruction=self.attributes.instruction,
             t_ref_ns=steps_ns.copy(),
             anchor=self.anchor(start),
-            K_head=self.attributes.K_head_matrix(),
+            K_head=self._K_head(),
+            actions_measured=measured_actions(self.attributes, steps_ns),
+            taxels_measured=measured_taxels(self.attributes.calibration),
         )
+
+    def _K_head(self) -> Float64[np.ndarray, "3 3"] | None:  # noqa: N802 (K is the camera matrix)
+        return None if self.attributes.K_head is None else self.attributes.K_head_matrix()
 
     def touch(
         self, start: int, num_steps: int
@@ -399,7 +426,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             stop_ns=stop_ns,
             instruction=self.attributes.instruction,
             anchor=self.anchor(start),
-            K_head=self.attributes.K_head_matrix(),
+            K_head=self._K_head(),
         )
 
     def shown_steps(

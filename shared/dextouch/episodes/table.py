@@ -5,9 +5,8 @@ select episodes here and read them through `EpisodeGrid`, so that they agree on 
 """
 
 import hashlib
-import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Final
 
@@ -21,14 +20,14 @@ from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
+from dextouch.episodes.validity import interpolated_actions, measured_actions, measured_taxels
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
-from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Matrix, Observation, Origin
+from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
 from dextouch.streams import HEAD_CAMERA
 
-INTERPOLATED: Final = re.compile(r"interpolated_\w+_s")
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 
 logger = structlog.get_logger(__name__)
@@ -167,21 +166,6 @@ class _Chosen:
         self._first = first
 
 
-def interpolated_steps(
-    calibration: Mapping[str, Matrix], t_ref_ns: Int64[np.ndarray, " steps"]
-) -> Bool[np.ndarray, " steps"]:
-    """Steps whose actions were interpolated, as the matrices `interpolated_STREAM_s` say.
-
-    Their rows are from when on and until when (s, on the episode's clock) a stream was missing.
-    """
-    found = np.zeros(len(t_ref_ns), dtype=np.bool_)
-    for name, rows in calibration.items():
-        if INTERPOLATED.fullmatch(name):
-            for start_s, stop_s in rows:
-                found |= (t_ref_ns >= start_s * 1e9 - 1) & (t_ref_ns < stop_s * 1e9 - 1)
-    return found
-
-
 def data_hash(contents: Iterable[str], **options: object) -> str:
     """SHA-256 of a set of episodes, in any order, as every checkpoint notes what it learned from.
 
@@ -269,14 +253,20 @@ class EpisodeGrid:
 
     @cached_property
     def interpolated(self) -> Bool[np.ndarray, " steps"]:
-        """Steps whose actions alignment interpolated across a gap of a stream."""
-        if not any(map(INTERPOLATED.fullmatch, self.about.calibration)):
+        """Steps of which alignment interpolated some part of the action across a gap."""
+        if not any(name.startswith("interpolated_") for name in self.about.calibration):
             return np.zeros(len(self), dtype=np.bool_)
-        return interpolated_steps(self.about.calibration, self.t_ref_ns)
+        columns = interpolated_actions(self.about.calibration, self.t_ref_ns)
+        return np.asarray(columns.any(axis=1))
 
     def is_measured(self, first: int, stop: int) -> bool:
         """Whether no action of the steps first … stop − 1 is interpolated."""
         return not self.interpolated[first:stop].any()
+
+    @cached_property
+    def measured_columns(self) -> Bool[np.ndarray, "steps 67"]:
+        """Columns of the actions that were measured, neither interpolated nor absent."""
+        return measured_actions(self.about, self.t_ref_ns)
 
     @cached_property
     def measured(self) -> Float64[np.ndarray, "steps 67"]:
@@ -298,6 +288,11 @@ class EpisodeGrid:
     def touch(self) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
         """Mean pressures (kPa) of each step, and where there was a sample."""
         return self.reader.touch(0, len(self))
+
+    @property
+    def measured_taxels(self) -> Bool[np.ndarray, "2 320"]:
+        """Taxels that were measured; the others, which alignment refused, are zero throughout."""
+        return measured_taxels(self.about.calibration)
 
     @cached_property
     def image_steps(self) -> Int64[np.ndarray, " shown"]:

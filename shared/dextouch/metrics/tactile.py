@@ -1,10 +1,11 @@
 """Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., 320].
 
 Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.layout`). Exclude invalid hands before calling: NaN is refused.
+at least 2 kPa (`dextouch.tactile.layout`). NaN is refused: take `measured_hands` before calling.
 """
 
 import numpy as np
+from jaxtyping import Bool
 
 from dextouch.metrics.image import checked_pair, decibels, similarity
 from dextouch.tactile import in_contact
@@ -17,6 +18,21 @@ SSIM_WINDOW_TAXELS = 4
 
 def _pair(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
     return checked_pair(predicted, true, what=f"{what} of taxels", tail=(NUM_TAXELS,))
+
+
+def measured_hands(
+    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Bool[np.ndarray, "*batch 320"]
+) -> dict[str, np.ndarray]:
+    """Arguments of the metrics here: hands of which some taxel was measured, others left out.
+
+    Unmeasured taxels of these are 0 in both: no contact, and no error. All are [..., 320].
+    """
+    hands = measured.any(axis=-1)
+    known = measured[hands]
+    return {
+        "predicted_kpa": np.where(known, predicted_kpa[hands], 0.0),
+        "true_kpa": np.where(known, true_kpa[hands], 0.0),
+    }
 
 
 def mse(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:

@@ -6,6 +6,7 @@ from .catalog import ComparedGroups as ComparedGroups
 from .catalog import Finding as Finding
 from .catalog import HoursByField as HoursByField
 from .catalog import HoursOf as HoursOf
+from .catalog import InterpolatedSpan as InterpolatedSpan
 from .catalog import ItemKind as ItemKind
 from .catalog import Lineage as Lineage
 from .catalog import LineageNode as LineageNode

@@ -212,8 +212,19 @@ class HoursByField(FrozenModel):
     rows: tuple[HoursOf, ...]
 
 
+class InterpolatedSpan(FrozenModel):
+    """From when to when a part of the action, a stream or a finger, was interpolated."""
+
+    part: str
+    start_ns: int
+    stop_ns: int
+
+
 class PlayedStream(FrozenModel):
     """A stream on the item's clock; `gaps_ns` are the longest gaps in order of time.
+
+    `interpolated` are the spans of actions that nothing measured, `unmeasured_taxels` those that
+    alignment refused.
 
     A gap is an interval of more than one and a half nominal periods between samples. Times are
     those of the reference clock for episodes, of the host's arrivals for recordings; None if the
@@ -232,13 +243,16 @@ class PlayedStream(FrozenModel):
     last_ns: int | None = None
     num_gaps: int = 0
     gaps_ns: tuple[tuple[int, int], ...] = ()
+    interpolated: tuple[InterpolatedSpan, ...] = ()
+    unmeasured_taxels: tuple[int, ...] = ()
 
 
 class Playback(FrozenModel):
     """What can be played of a recording or an episode, from `start_ns` to `stop_ns`.
 
     `started_t_host_ns` is a recording's host time at its start, `origin_after_start_ns` how much
-    later an episode that was aligned from it begins; None where unknown.
+    later an episode that was aligned from it begins; None where unknown. `absent` are the parts of
+    the action that no step of an episode has.
     """
 
     kind: ItemKind
@@ -251,6 +265,7 @@ class Playback(FrozenModel):
     operator: str | None = None
     success: bool | None = None
     recovered: bool = False
+    absent: tuple[str, ...] = ()
     at: AwareDatetime | None = None
     model_rate_hz: float | None = None
     num_steps: int = 0

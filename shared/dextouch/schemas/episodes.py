@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import AwareDatetime, BaseModel, Field, FiniteFloat, field_validator, model_validator
 
+from dextouch.errors import InvalidInputError
 from dextouch.free_text import check_texts
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import rigid_error
@@ -104,7 +105,9 @@ class ClockReport(FrozenModel):
 class EpisodeAttributes(FrozenModel):
     """Metadata of an episode.
 
-    `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
+    `anchor` and `K_head` (pixels, None if unknown) belong to step 0. `absent` are parts of the
+    action that no step has: streams, or fingers that were never seen (`ring_left`); their columns
+    are those of a hand at rest at the origin of the world. `streams` is completed by the writer;
     `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures;
     `recovered` marks an episode of an interrupted take, or of the intact samples of a damaged one.
     `object_boxes_m` has one box per object, centre and half sizes in the object's own frame.
@@ -126,7 +129,8 @@ class EpisodeAttributes(FrozenModel):
     seed: int | None = None
     model_rate_hz: FiniteFloat = Field(default=15.0, gt=0)
     anchor: StoredAnchor
-    K_head: Matrix
+    K_head: Matrix | None = None
+    absent: tuple[str, ...] = Field(default=(), exclude_if=not_)
     success: bool | None = None
     recovered: bool = False
     complete: bool = Field(default=True, exclude_if=bool)
@@ -145,15 +149,28 @@ class EpisodeAttributes(FrozenModel):
 
     @field_validator("K_head")
     @classmethod
-    def _is_camera_matrix(cls, rows: Matrix) -> Matrix:
-        return _check_matrix(rows, (3, 3))
+    def _is_camera_matrix(cls, rows: Matrix | None) -> Matrix | None:
+        return None if rows is None else _check_matrix(rows, (3, 3))
 
     def head_distortion(self) -> Float64[np.ndarray, "5"]:
         """Distortion of the head camera's lens, k1 k2 p1 p2 k3; zeros where none is known."""
         return np.array(self.calibration.get("distortion_head", ((0.0,) * 5,))[0], dtype=np.float64)
 
+    def matrices(self) -> dict[str, Matrix]:
+        """The calibration, with `K_head` if it is known."""
+        return self.calibration | ({} if self.K_head is None else {"K_head": self.K_head})
+
     def K_head_matrix(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802 (K is the camera matrix)
-        """The head camera's matrix in pixels."""
+        """The head camera's matrix in pixels.
+
+        Raises:
+            InvalidInputError: it is not known.
+        """
+        if self.K_head is None:
+            raise InvalidInputError(
+                f"episode {self.episode_id!r}: the matrix K_head of its head camera is not known; "
+                "calibrate the camera (`dextouch station calibrate camera`), and record again"
+            )
         return np.array(self.K_head)
 
 

@@ -14,7 +14,7 @@ def write_recording(
     store,
     recording_id,
     *,
-    streams=("wrist_left", "wrist_right", "head"),
+    streams=("wrist_left", "wrist_right", "head", "joints_measured"),
     seconds=2.0,
     lost=(),
     calibration=None,
@@ -38,7 +38,7 @@ def write_recording(
     )
     t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000
     with store.writer(kind="recording", attributes=attributes) as writer:
-        for name in (*streams, "joints_measured"):
+        for name in streams:
             row = POSE if name != "joints_measured" else np.full(40, 0.25)
             stream = StreamDescriptor(
                 name=name,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeGrid, EpisodeStore, interpolated_steps
+from dextouch.episodes import EpisodeGrid, EpisodeStore
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.resampling import bridged_run, longest_run
@@ -109,9 +109,3 @@ def test_windows_keep_clear_of_interpolated_steps(tmp_path):
     for start in range(len(grid) - 16):
         is_clear = not grid.interpolated[start : start + 17].any()
         assert (start in starts) == is_clear == grid.is_measured(start, start + 17)
-
-
-def test_rows_are_half_open_on_the_clock_of_the_episode():
-    t_ns = np.rint(np.arange(6) * 1e9 / 15).astype(np.int64)
-    rows = {"interpolated_head_s": ((t_ns[1] / 1e9, t_ns[3] / 1e9),), "K_head": ((0.0, 1.0),)}
-    assert interpolated_steps(rows, t_ns).tolist() == [False, True, True, False, False, False]

@@ -29,7 +29,7 @@ def store(tmp_path):
     store = EpisodeStore(tmp_path / "store")
     write_recording(store, "take", seconds=10.0, lost=(("wrist_left", 300, 400),))
     write_recording(store, "other")
-    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    write_recording(store, "handless", streams=("head",))
     return store
 
 
@@ -52,11 +52,11 @@ def test_progress_is_told_where_no_terminal_is(store, capsys, monkeypatch):
 
 
 def test_a_failure_is_told_and_the_others_are_aligned(store, capsys):
-    arguments = ["run", "headless", "take", "--workers", "2", "--store", str(store.root)]
+    arguments = ["run", "handless", "take", "--workers", "2", "--store", str(store.root)]
     assert main(["align", *arguments]) == 3
     told = capsys.readouterr()
     assert "take aligned" in told.out
-    assert "head" in told.err
+    assert "wrist_left" in told.err
 
 
 def test_all_aligns_what_has_no_episode(store, capsys):
@@ -66,8 +66,8 @@ def test_all_aligns_what_has_no_episode(store, capsys):
     told = capsys.readouterr()
     assert "take aligned" in told.out
     assert "other" not in told.out
-    assert "headless" in told.err
-    store.delete("headless", kind="recording")
+    assert "handless" in told.err
+    store.delete("handless", kind="recording")
     assert main(["align", "run", "--all", "--store", str(store.root)]) == 0
     assert "nothing to do" in capsys.readouterr().out
 

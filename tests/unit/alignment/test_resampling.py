@@ -6,7 +6,11 @@ import pytest
 from benchmarks.simulated.hand_motions import motion_of
 from dextouch.streams import StreamDescriptor
 from services.alignment.retargeting import RetargetStatus
-from services.alignment.synchronization.grid_actions import retarget_hands, status_on_grid
+from services.alignment.synchronization.grid_actions import (
+    GriddedStreams,
+    retarget_hands,
+    status_on_grid,
+)
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     longest_run,
@@ -102,7 +106,8 @@ def test_joints_beyond_the_last_sample_stay_in_their_limits(end):
         )
         at[name] = place_on_grid(t_ns, grid_ns, period_ns=16_666_667, max_gap_ns=50 * MS)
         assert at[name].valid.all()
-    found = retarget_hands(streams, at, {})[0].reshape(3, 2, 20)
+    hands = retarget_hands(GriddedStreams(grid_ns, streams, at), {})
+    found = np.stack([hands[side].joints_rad for side in ("left", "right")], axis=1)
     row = 2 if end == "last" else 0
     for side_index, side in enumerate(("left", "right")):
         assert (found[:, side_index] <= upper_rad[side]).all()

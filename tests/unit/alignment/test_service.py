@@ -62,7 +62,7 @@ def store(tmp_path):
     store = EpisodeStore(tmp_path / "store")
     write_recording(store, "take")
     write_recording(store, "other")
-    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    write_recording(store, "handless", streams=("head",))
     return store
 
 
@@ -120,10 +120,10 @@ async def test_alignment_runs_once_and_is_told(serve, store):
 
 async def test_many_recordings_are_all_taken_or_none(serve, store):
     async with serve(num_workers=2) as client:
-        body = {"recording_ids": ["take", "headless", "nothing"]}
+        body = {"recording_ids": ["take", "handless", "nothing"]}
         refused = await client.post("/v1/alignments", json=body)
         assert refused.status_code == 422
-        assert set(refused.json()["details"]["refused"]) == {"headless", "nothing"}
+        assert set(refused.json()["details"]["refused"]) == {"handless", "nothing"}
         assert (await client.get("/v1/alignments")).json()["num_matching"] == 0
         body = {"recording_ids": ["nothing", "nobody"]}
         assert (await client.post("/v1/alignments", json=body)).status_code == 404
@@ -149,7 +149,7 @@ async def test_other_options_are_another_episode(serve, store):
     ("body", "status", "word"),
     [
         ({"recording_id": "nothing"}, 404, "nothing"),
-        ({"recording_id": "headless"}, 422, "head"),
+        ({"recording_id": "handless"}, 422, "wrist_left"),
         ({"recording_id": "../etc"}, 422, "recording_id"),
         ({"recording_id": "take", "options": {"max_gap_ms": -1}}, 422, "max_gap_ms"),
         ({"recording_id": "take", "extra": 1}, 422, "extra"),

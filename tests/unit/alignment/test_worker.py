@@ -22,7 +22,7 @@ def store(tmp_path):
     store = EpisodeStore(tmp_path / "store")
     write_recording(store, "take")
     write_recording(store, "other")
-    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    write_recording(store, "handless", streams=("head",))
     return store
 
 
@@ -45,8 +45,8 @@ def test_one_process_aligns_refuses_dies_and_is_replaced(store):
         assert told
         assert told[0].stage == "dating"
         pid = worker._child.pid
-        with pytest.raises(InvalidInputError, match="head"):
-            worker.run("headless", OPTIONS, told.append)
+        with pytest.raises(InvalidInputError, match="wrist_left"):
+            worker.run("handless", OPTIONS, told.append)
         assert worker._child.pid == pid
 
         def kill_it(_):
@@ -93,18 +93,18 @@ def test_many_recordings_side_by_side(store):
     wanted, impossible = not_aligned(store, OPTIONS)
     assert (wanted, [recording_id for recording_id, _ in impossible]) == (
         ["other", "take"],
-        ["headless"],
+        ["handless"],
     )
     found = dict(
         align_batch(
             str(store.root),
-            [*wanted, "headless"],
+            [*wanted, "handless"],
             OPTIONS,
             num_workers=2,
             on_progress=lambda *_: None,
         )
     )
-    assert set(found) == {"take", "other", "headless"}
-    assert "head" in found["headless"].message
+    assert set(found) == {"take", "other", "handless"}
+    assert "wrist_left" in found["handless"].message
     assert found["take"].created
     assert not_aligned(store, OPTIONS)[0] == []

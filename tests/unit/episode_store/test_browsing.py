@@ -174,6 +174,27 @@ async def test_gaps_of_a_stream(http, store):
     assert (answer["start_ns"], answer["stop_ns"]) == (0, 75_000_000)
 
 
+async def test_what_was_not_measured_is_there_to_be_drawn(store, http):
+    states = np.zeros(320)
+    states[[3, 90]] = 1, 8
+    calibration = {
+        "interpolated_head_s": ((0.2, 0.4),),
+        "interpolated_fingers_left_s": ((0.1, 0.3, 3.0),),
+        "tactile_left_refused_taxels": (tuple(states.tolist()),),
+    }
+    write_episode(store, "e", num_steps=9, calibration=calibration, absent=("wrist_right",))
+    answer = (await http.get("/v1/playback/episode/e")).json()
+    assert answer["absent"] == ["wrist_right"]
+    streams = {stream["name"]: stream for stream in answer["streams"]}
+    ms = 1_000_000
+    assert streams["action"]["interpolated"] == [
+        {"part": "ring_left", "start_ns": 100 * ms, "stop_ns": 300 * ms},
+        {"part": "head", "start_ns": 200 * ms, "stop_ns": 400 * ms},
+    ]
+    assert streams["tactile_left"]["unmeasured_taxels"] == [3, 90]
+    assert streams["camera_head"]["interpolated"] == []
+
+
 def store_attributes(store):
     template = write_episode(store, "template", num_steps=1).attributes
     lineage = (LineageEntry(kind="recording", id="take-1"),)

@@ -60,6 +60,7 @@ def test_episodes_are_selected_by_what_they_are_in_the_order_of_their_ids(store)
 
 
 LACKING = {
+    "EVERY_PART": ({"absent": ("head",)}, "head camera .*track both hands"),
     "WHOLE": ({"recovered": True}, "cut short"),
     "OUTCOME": ({"success": None}, "1 of unknown outcome .*docs/dashboard.md"),
     "SUCCESS": ({"success": False}, "that failed"),

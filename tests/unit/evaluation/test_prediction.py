@@ -63,6 +63,26 @@ def scene(seed, depth_m):
     )
 
 
+def test_touch_that_was_not_measured_counts_in_no_figure():
+    world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    whole = scene(1, 0.2)
+    measured = np.ones(whole.truth.tactile_kpa.shape, dtype=bool)
+    measured[:20] = False
+    measured[:, 1, 7] = False
+    figures = []
+    for wrong_kpa in (0.0, 50.0):
+        touch_kpa = np.where(measured, whole.truth.tactile_kpa, np.float32(wrong_kpa))
+        truth = replace(whole.truth, tactile_kpa=touch_kpa, measured_taxels=measured)
+        found = measure_prediction(world, [replace(whole, truth=truth)])
+        figures.append(found.flat())
+    names = ("tactile_mse", "tactile_mae", "contact_iou", "contact_f1", "pad_contact_f1")
+    assert all(name in figures[0] for name in names)
+    for name in (*names, "contact_mae", "tactile_psnr", "tactile_ssim"):
+        assert figures[0][name] == figures[1][name]
+    # This world feels as the truth does, so nothing is wrong with what was measured.
+    assert figures[0]["contact_f1"] == 1.0
+
+
 def test_figures_of_a_world_that_feels_and_does_not_see():
     scenes = [scene(1, 0.2), scene(2, 0.1)]
     found = measure_prediction(

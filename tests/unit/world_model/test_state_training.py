@@ -383,6 +383,45 @@ def test_a_core_learns_nothing_at_interpolated_steps(config):
     assert late.starts_at(step).tolist() == [0]
 
 
+def test_a_core_learns_nothing_from_taxels_that_were_not_measured(config):
+    # A fingertip and half of another one of the left hand; of the right hand no sample late on.
+    states = np.zeros(320)
+    states[:24] = 2
+    calibration = {"tactile_left_refused_taxels": (tuple(states.tolist()),)}
+    settings = CoreSettings(batch=8, first_fraction=1.0)
+    scenes = [changed(episode(seed), calibration=calibration) for seed in (0, 1)]
+    tables = []
+    for wrong_kpa in (0.0, 30.0):
+        astray = []
+        for one in scenes:
+            touch_kpa = one.tactile_kpa.copy()
+            touch_kpa[:, 0, :24] = wrong_kpa
+            astray.append(dataclasses.replace(one, tactile_kpa=touch_kpa))
+        tables.append(scene_table(astray, config))
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(tables[0].tactile_kpa.float().flatten(0, 2))
+    losses = [_loss_of(core_data(dynamics, table), config, settings) for table in tables]
+    assert losses[0] == losses[1]
+    # The nearest taxel of the pad that was measured stands for one that was not.
+    tips = scenes[0].tactile_kpa[:, 0, :80].reshape(-1, 5, 4, 4)
+    filled = tables[1].tactile_kpa[0, :, 0, :80].reshape(-1, 5, 4, 4).numpy()
+    np.testing.assert_allclose(filled[:, 1, 0], tips[: len(filled), 1, 2].astype(np.float16))
+    assert (filled[:, 0] == 0.0).all()
+    # Nor does what stands for it: it is an input alone.
+    stood_in = dataclasses.replace(tables[0], tactile_kpa=tables[0].tactile_kpa.clone())
+    stood_in.tactile_kpa[:, 1:, 0, :24] = 30.0
+    latents = touch_latents(dynamics.codec, tables[0])
+    losses = [_loss_of(CoreData(t, latents, {}), config, settings) for t in (tables[0], stood_in)]
+    assert losses[0] == losses[1]
+    unfelt = dataclasses.replace(tables[0], felt=tables[0].felt.clone())
+    unfelt.felt[:, 9:, 1] = False
+    other = dataclasses.replace(unfelt, tactile_kpa=unfelt.tactile_kpa.clone())
+    other.tactile_kpa[:, 9:, 1] = 30.0
+    other.in_contact[:, 9:, 6:] = True
+    losses = [_loss_of(core_data(dynamics, table), config, settings) for table in (unfelt, other)]
+    assert losses[0] == losses[1]
+
+
 def _changed(values, steps, *, value):
     changed = values.clone()
     changed[1, steps] = value

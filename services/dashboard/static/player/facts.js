@@ -48,6 +48,7 @@ function about(item, trace_id) {
     ["Length", `${((item.stop_ns - item.start_ns) / 1e9).toFixed(3)} s`],
     ["Model steps", facts.num_steps ? `${facts.num_steps} at ${facts.model_rate_hz} Hz` : null],
     ["Trace", trace_id ? element("a", { class: "trace", href: `/episodes?text=${trace_id}` }, trace_id) : null],
+    ["Not recorded", facts.absent.join(", ")],
     ["Incomplete", facts.recovered ? "yes: its writer did not finish it" : null],
   ]));
 }

@@ -29,6 +29,7 @@ function playedStream(stream, zero) {
     first_ns: relative(stream.first_ns),
     last_ns: relative(stream.last_ns),
     gaps_ns: stream.gaps_ns.map((gap) => gap.map(relative)),
+    interpolated: stream.interpolated.map(({ part, start_ns, stop_ns }) => ({ part, span_ns: [relative(start_ns), relative(stop_ns)] })),
   };
 }
 

@@ -137,7 +137,8 @@ export class SpacePane {
       const sample = this.found(track, t_ns);
       if (!sample || this.hidden.has(track.action_kind)) continue;
       const colour = track.action_kind === "measured" ? "--accent" : "--commanded";
-      for (const side of SIDES) {
+      const absent = new Set(track.item.about.absent);
+      for (const side of SIDES.filter((one) => !absent.has(`wrist_${one}`))) {
         const { values } = sample.data.arrays[`${side}_points_world_m`];
         const wrist = frameOfMatrix(sample.data.arrays[`T_world_wrist_${side}`].values, 16 * sample.index).t;
         const at = sample.index * NUM_FINGERS * CHAIN_POINTS;

@@ -15,6 +15,7 @@ function place(node, from, to) {
 // "3 gaps, longest 1.20 s", or what else there is to say about a stream.
 function gapText(stream) {
   if (!stream.num_samples) return "no samples";
+  if (stream.interpolated.length) return `${stream.interpolated.length} interpolated`;
   if (!stream.num_gaps) return `${stream.num_samples} samples`;
   const longest_s = Math.max(...stream.gaps_ns.map(([from_ns, to_ns]) => to_ns - from_ns)) / 1e9;
   return `${stream.num_gaps} gap${stream.num_gaps > 1 ? "s" : ""} ≤ ${longest_s.toFixed(2)} s`;
@@ -43,6 +44,10 @@ export class Timeline {
       gap_ns,
       node: element("i", { class: "gap", title: `${stream.name}: no sample from ${secondsText(gap_ns[0])} to ${secondsText(gap_ns[1])} s` }),
     }));
+    for (const { part, span_ns } of stream.interpolated) {
+      const title = `${part}: interpolated from ${secondsText(span_ns[0])} to ${secondsText(span_ns[1])} s`;
+      gaps.push({ gap_ns: span_ns, node: element("i", { class: "gap interpolated", title }) });
+    }
     const shown = stream.num_gaps > gaps.length ? `; the ${gaps.length} longest are marked` : "";
     const note = element("span", { class: "lane_note", title: `${stream.num_samples} samples, ${stream.num_gaps} gaps${shown}` }, gapText(stream));
     const row = element("div", { class: "lane", "data-stream": stream.name },

@@ -20,6 +20,7 @@ export class TouchPane {
       canvas, element("figcaption", {}, element("span", { class: "name" }, track.stream.name), this.time, this.text));
     // Raw counts have a text of their own.
     this.hand = new HandCanvas(canvas, this.isRaw ? {} : { summary: this.text }, side, { ...heatmap });
+    this.hand.mark({ unmeasured: track.stream.unmeasured_taxels });
     this.shown_ns = null;
     if (this.isRaw) this.scaleRaw();
   }

@@ -348,13 +348,6 @@ def _foreign_attributes(
     features: Mapping[str, str],
     options: ImportOptions,
 ) -> dict[str, object]:
-    if options.K_head is None:
-        raise InvalidInputError(
-            f"{source.folder}: has no information about its head camera "
-            f"({features[HEAD]!r}), which data sets of other origin lack; import it in Python: "
-            "dextouch.bridges.lerobot.import_lerobot(folder, store, "
-            "options=ImportOptions(K_head=…)), in pixels"
-        )
     name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
     data_file = source.data_file(entry)
     with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
