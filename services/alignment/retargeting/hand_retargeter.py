@@ -231,6 +231,7 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
+    smoothed(keypoints, 0.0)
 
 
 def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:

@@ -293,3 +293,12 @@ def test_broken_nodes_never_leave_the_limits(seed, kind):
     assert (result.joints_rad >= HAND.lower_rad).all()
     assert (result.joints_rad <= HAND.upper_rad).all()
     assert np.isfinite(result.tip_error_m).all()
+
+
+def test_trackers_without_metacarpals_are_followed_alike():
+    keypoints = keypoints_of(bending(40))
+    whole = HandRetargeter("right").retarget(keypoints)
+    for chain in CHAINS[1:]:
+        keypoints[:, NODE_INDEX[chain, "metacarpal"]] = np.nan
+    lacking = HandRetargeter("right").retarget(keypoints)
+    np.testing.assert_array_equal(lacking.joints_rad, whole.joints_rad)
