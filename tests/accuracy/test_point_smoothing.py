@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from services.alignment.retargeting.solver.smoothing import smooth_forward, smoothed
+from services.alignment.retargeting.solver.smoothing import noise_of_bones, smooth_forward, smoothed
 
 SIGMA_M = 1.5e-3
 
@@ -52,6 +52,21 @@ def test_noise_at_rest_is_reduced(capsys):
     assert live.std() <= 0.75 * SIGMA_M
     assert both.std() <= 0.75 * SIGMA_M
     assert max(steps[1:]) <= 0.6 * steps[0]
+
+
+@pytest.mark.parametrize("fault", [1.0, 1000.0, np.nan])
+def test_noise_is_found_from_bones(fault, capsys):
+    """Bones of 30 mm with noise at both ends; one sample in thirty is in millimetres, or lost."""
+    rng, nodes = np.random.default_rng(4), np.arange(20).reshape(5, 4)
+    places = np.zeros((20, 3))
+    places[:, 0] = 0.03 * np.arange(20)
+    bones = np.zeros((5, 3, 3))
+    for index in range(600):
+        sample = places + rng.normal(scale=SIGMA_M, size=places.shape)
+        found = noise_of_bones(bones, sample * (fault if index % 30 == 29 else 1.0), nodes)
+    with capsys.disabled():
+        sys.stdout.write(f"\nnoise found, faults x {fault:g}: {np.sqrt(found / 3) * 1e3:.2f} mm")
+    assert np.sqrt(found / 3) == pytest.approx(SIGMA_M, rel=0.1)
 
 
 def test_without_noise_nothing_changes():

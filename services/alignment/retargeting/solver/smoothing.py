@@ -17,6 +17,8 @@ from services.alignment.retargeting.solver import compiled, compiled_once
 NUM_RECENT = 240
 # What one wrong point may add to that noise: bones that are further off are errors of the tracker.
 MAX_DEVIATION_M = 0.008
+# Other lengths are no finger's bones in metres (BONE_RANGE_M of the profile).
+MIN_LENGTH_M, MAX_LENGTH_M = 0.003, 0.150
 # Mean of |x| of a normal distribution is 0.798 sigma; a bone's length has the noise of two points,
 # and a point has it along three axes: v = 3 (mean / 0.798)² / 2.
 VARIANCE_OF_DEVIATION = 3.0 * (np.pi / 2.0) / 2.0
@@ -59,11 +61,15 @@ def noise_of_bones(bones_m, keypoints, nodes):
                 squared = 0.0
                 for k in range(3):
                     squared += (keypoints[a, k] - keypoints[b, k]) ** 2
-            if np.isfinite(squared):
+            length = np.sqrt(squared)
+            # False for NaN, too.
+            if MIN_LENGTH_M <= length <= MAX_LENGTH_M:
                 one[0] = min(one[0] + 1.0, NUM_RECENT)
-                one[1] += (np.sqrt(squared) - one[1]) / one[0]
-                off = min(abs(np.sqrt(squared) - one[1]), MAX_DEVIATION_M)
-                one[2] += (off - one[2]) / one[0]
+                if one[0] == 1.0:
+                    one[1] = length
+                off = min(max(length - one[1], -MAX_DEVIATION_M), MAX_DEVIATION_M)
+                one[1] += off / one[0]
+                one[2] += (abs(off) - one[2]) / one[0]
             if one[0] > 0.0:
                 total += one[2]
                 count += 1
