@@ -25,9 +25,8 @@ DAMPING_RANGE = (1e-12, 1e3)
 RIDGE_M2 = 1e-12
 # Directions count as points at this distance. Chosen: the longest bone of the mean hand's fingers.
 BONE_M = 0.04
-# Beyond, a bone's direction counts in proportion to its angle. Chosen: the mean angle over a real
-# hand's thumb is 8.2 degrees with squares alone, 7.4 from 3 degrees on and 7.2 from 1.7 (this one);
-# the best possible is 7.0.
+# Beyond 1.7 degrees a bone's direction counts in proportion to its angle. Chosen: the mean angle of
+# a real hand's thumb is 7.4 degrees, 8.4 with squares alone; the best possible is 7.0.
 BONE_BEND_RAD = 0.03
 # Keeps the weight of a bone of no length finite.
 LEAST_LENGTH_M2 = 1e-12
