@@ -241,11 +241,12 @@ def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
     for finger in range(NUM_FINGERS):
         kept = usable[:, finger]
+        seen_m, with_it_m = points_m[rows][kept, finger, 0], moved_m[kept, finger]
         if not kept.any():
-            kept = whole[rows, finger]
-        knuckle_m[finger], travel[finger], left_m = _fit_knuckle(
-            points_m[rows][kept, finger, 0], moved_m[kept, finger]
-        )
+            # Seen in few samples, of which none may be among the rows.
+            seen_m = points_m[whole[:, finger], finger, 0]
+            with_it_m = np.full_like(seen_m, np.nan)
+        knuckle_m[finger], travel[finger], left_m = _fit_knuckle(seen_m, with_it_m)
         least_m = max(LEAST_KNUCKLE_SIGMA_M, LEAST_SIGMA_SHARE * point_sigma_m)
         sigma_m[finger] = max(np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0)), least_m)
     return HandProfile(bone_m, knuckle_m, travel, sigma_m, point_sigma_m)

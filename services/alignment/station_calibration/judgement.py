@@ -11,7 +11,7 @@ from dextouch.episodes.spool import read_attributes
 from dextouch.schemas import Matrix
 from services.alignment.station_calibration.record import read_matrices
 
-# Alignment refuses takes without these, or without those of the recorded gloves.
+# Learners need these, and alignment those of the recorded gloves.
 NEEDED = ("K_head",)
 LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red"}
 MAX_AGE_S = 7 * 86_400.0

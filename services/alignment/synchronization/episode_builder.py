@@ -1,9 +1,10 @@
 """Builds an episode on one reference clock from a recording, reading samples lazily."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
@@ -14,10 +15,10 @@ from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.grid_actions import (
     ACTION_STREAMS,
-    COMMANDED_STREAMS,
     TOUCH_STREAMS,
     GridActions,
     GriddedStreams,
+    commanded_streams,
     make_actions,
     place_streams,
 )
@@ -50,6 +51,9 @@ from services.alignment.synchronization.resampling import (
     with_causes,
 )
 
+# Samples without which a stream is as if it were not there.
+MIN_USABLE = 2
+
 
 @dataclass(frozen=True)
 class BuiltEpisode:
@@ -74,7 +78,7 @@ class _Stretch:
     gridded: GriddedStreams
     origin_ns: int
     num_refused: int
-    num_interpolated: int
+    interpolated: Bool[np.ndarray, " n"]
     matrices: dict[str, Matrix]
 
 
@@ -101,7 +105,10 @@ def build_episode(
     streams = {}
     for number, name in enumerate(recording.streams):
         on_progress(progress_within("dating", number / len(recording.streams), name))
-        streams[name] = date_stream(recording, name)
+        # One sample is not in motion, and has no clock.
+        if recording.num_samples(name) >= MIN_USABLE:
+            streams[name] = date_stream(recording, name)
+    _check_hands(recording, streams)
     streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
     checked = {
         name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
@@ -137,7 +144,7 @@ def build_episode(
     ]
     quality = {
         "num_steps_refused": float(stretch.num_refused),
-        "num_steps_interpolated": float(stretch.num_interpolated),
+        "num_steps_interpolated": float(_num_interpolated(stretch, actions)),
         "origin_after_start_ns": float(stretch.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
@@ -155,6 +162,14 @@ def build_episode(
     return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
 
 
+def _num_interpolated(stretch: _Stretch, actions: GridActions) -> int:
+    """Steps in gaps of a stream, or of a finger that other steps have."""
+    found = stretch.interpolated.copy()
+    for unseen in actions.unseen_fingers.values():
+        found |= unseen[:, ~unseen.all(axis=0)].any(axis=1)
+    return int(np.count_nonzero(found))
+
+
 def _find_stretch(
     recording: RecordingReader,
     checked: Mapping[str, CheckedStream],
@@ -164,7 +179,7 @@ def _find_stretch(
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes, streams = recording.attributes, {n: one.stream for n, one in checked.items()}
     where = f"recording {attributes.recording_id!r}"
-    wanted = [*ACTION_STREAMS[attributes.domain], *COMMANDED_STREAMS]
+    wanted = [*ACTION_STREAMS[attributes.domain], *commanded_streams(streams)]
     if attributes.domain == "human" and options.wrist == "touch":
         wanted += TOUCH_STREAMS
     names = [name for name in wanted if name in streams]
@@ -174,11 +189,12 @@ def _find_stretch(
         # Pressures of an hour do not fit in memory, the forces of its pads do.
         of = pad_forces_n if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
+        if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
+            # Such as a hand that was never seen.
+            del parts[name]
+    _check_hands(recording, parts)
     # Touch may be missing for a while.
     needed = [name for name in parts if name not in TOUCH_STREAMS]
-    empty = [name for name in needed if len(parts[name].t_ns) < 2]
-    if empty:
-        raise InvalidInputError(f"{where}: streams {empty} hold fewer than two usable samples")
     first_ns = {name: int(parts[name].t_ns[0]) for name in needed}
     last_ns = {name: int(parts[name].t_ns[-1]) for name in needed}
     origin_ns = max(first_ns.values())
@@ -195,6 +211,11 @@ def _find_stretch(
     if np.count_nonzero(gridded.valid[first:stop]) < options.min_num_steps:
         bad = {name: int((~mine).sum()) for name, mine in valid.items()}
         worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
+        latest, earliest = (
+            max(first_ns, key=first_ns.__getitem__),
+            min(last_ns, key=last_ns.__getitem__),
+        )
+        worst += f"; {latest} begins last and {earliest} ends first"
         raise InvalidInputError(
             f"{where}: the longest stretch without a gap has {stop - first} of {num_steps} steps, "
             f"expected at least {options.min_num_steps}; steps lost to gaps above "
@@ -211,7 +232,7 @@ def _find_stretch(
         place_streams(moved, grid_ns[first:stop], max_gap_ns=options.longest_bridge_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),
-        int((~gridded.valid[first:stop]).sum()),
+        ~gridded.valid[first:stop],
         refused_matrices(with_causes(refused, causes_ns, start_ns))
         | interpolated_matrices(grid_ns[first:stop] - grid_ns[first], inside),
     )
@@ -258,16 +279,21 @@ def check_complete(recording: RecordingReader) -> None:
     Raises:
         InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
+    _check_hands(recording, recording.streams)
+    _check_lenses(recording)
+
+
+def _check_hands(recording: RecordingReader, streams: Collection[str]) -> None:
+    """Refuse a recording of which no stream of a hand can be used; `streams` are those that can."""
     attributes = recording.attributes
     of_hands = [name for name in ACTION_STREAMS[attributes.domain] if name != "head"]
-    if not any(name in recording.streams for name in of_hands):
+    if not any(name in streams for name in of_hands):
         raise InvalidInputError(
-            f"recording {attributes.recording_id!r}: streams {of_hands} are missing, of which an "
-            f"episode of domain {attributes.domain!r} needs one at least; it has "
-            f"{sorted(recording.streams)}",
+            f"recording {attributes.recording_id!r}: streams {of_hands} are missing or hold fewer "
+            f"than {MIN_USABLE} usable samples; an episode of domain {attributes.domain!r} needs "
+            f"one of them at least; it has {sorted(recording.streams)}",
             missing=of_hands,
         )
-    _check_lenses(recording)
 
 
 def _check_lenses(recording: RecordingReader) -> None:

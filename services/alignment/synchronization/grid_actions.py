@@ -1,12 +1,13 @@
 """Hand trajectories, 67-D actions and figures of motion at the steps of the model's grid."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
+from dextouch.episodes import JOINTS, columns_of
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
@@ -29,7 +30,6 @@ NS_PER_S = 1e9
 # Samples of a recording from which a hand's axes, side and unit are checked.
 MAX_CHECKED = 2000
 POSE_STREAMS = ("wrist_left", "wrist_right", "head")
-COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
 TOUCH_STREAMS = ("tactile_left", "tactile_right")
 # The influence of touch on wrists and fingertips lasts as long.
 TOUCH_GAP_NS = 300_000_000
@@ -97,6 +97,17 @@ class RetargetedHand:
     quality: dict[str, float]
 
 
+def commanded_streams(names: Collection[str]) -> tuple[str, ...]:
+    """The streams that commanded actions are made of, among those of a recording; () if none are.
+
+    Joints, and each wrist that is tracked or commanded.
+    """
+    wrists = [f"wrist_{side}" for side in SIDES]
+    wrists = [f"{one}_commanded" for one in wrists if {one, f"{one}_commanded"} & set(names)]
+    needed = ("joints_commanded", *wrists)
+    return needed if wrists and set(needed) <= set(names) else ()
+
+
 def place_streams(
     streams: Mapping[str, LoadedStream], grid_ns: np.ndarray, *, max_gap_ns: int
 ) -> GriddedStreams:
@@ -142,6 +153,8 @@ def make_actions(
             quality |= hand.quality
             never = np.flatnonzero(hand.unseen.all(axis=0)).tolist()
             absent += [f"{FINGERS[finger]}_{side}" for finger in never]
+            for finger in never:
+                joints_rad[:, columns_of((f"{FINGERS[finger]}_{side}",))[JOINTS]] = 0.0
     elif "joints_measured" in gridded.streams:
         joints_rad = gridded.vectors("joints_measured")
     by_side = np.split(joints_rad, 2, axis=1)
@@ -151,15 +164,18 @@ def make_actions(
         quality |= offsets
     if len(gridded.grid_ns) > 1:
         rate_hz = NS_PER_S / float(np.diff(gridded.grid_ns).mean())
-        quality = {**quality, **motion_figures(trajectory, rate_hz=rate_hz)}
+        tracked = [side for side in SIDES if f"wrist_{side}" in gridded.streams]
+        quality = {**quality, **motion_figures(trajectory, rate_hz=rate_hz, sides=tracked)}
     anchor = trajectory.anchor(0)
     commanded = None
-    if all(name in gridded.streams for name in COMMANDED_STREAMS):
+    if commanded_streams(gridded.streams):
         left, right = (gridded.poses(f"wrist_{side}_commanded") for side in SIDES)
         by_side = np.split(gridded.vectors("joints_commanded"), 2, axis=1)
         # Nobody commands the head: where it was is where it should have been.
         wanted = HandTrajectory(left, right, by_side[0], by_side[1], head)
         commanded = actions_from_poses(wanted, anchor)
+        wrists = [f"wrist_{side}_commanded" for side in SIDES]
+        absent += [name for name in wrists if name not in gridded.streams]
     return GridActions(
         anchor,
         actions_from_poses(trajectory, anchor),
@@ -274,14 +290,16 @@ def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, "
     return np.maximum(status[left], status[right]).astype(np.uint8)
 
 
-def motion_figures(trajectory: HandTrajectory, *, rate_hz: float) -> Mapping[str, float]:
-    """Peak speed and jerk of each wrist, and the share of steps in which both hands are at rest.
+def motion_figures(
+    trajectory: HandTrajectory, *, rate_hz: float, sides: Sequence[Side] = SIDES
+) -> Mapping[str, float]:
+    """Peak speed and jerk of each wrist, and the share of steps in which these hands are at rest.
 
     The jerk is the 95th percentile of third differences, which a few outliers do not decide.
     """
     figures: dict[str, float] = {}
     moves = np.zeros(max(len(trajectory.joints_left_rad) - 1, 0), dtype=bool)
-    for side in SIDES:
+    for side in sides:
         points_m = getattr(trajectory, f"Ts_world_wrist_{side}")[:, :3, 3]
         joints_rad = getattr(trajectory, f"joints_{side}_rad")
         speeds_m_s = np.linalg.norm(np.diff(points_m, axis=0), axis=1) * rate_hz
@@ -292,6 +310,6 @@ def motion_figures(trajectory: HandTrajectory, *, rate_hz: float) -> Mapping[str
         if len(points_m) > 3:
             jerks_m_s3 = np.linalg.norm(np.diff(points_m, n=3, axis=0), axis=1) * rate_hz**3
             figures[f"wrist_{side}_jerk_p95_m_s3"] = float(np.percentile(jerks_m_s3, 95))
-    if moves.size:
+    if moves.size and sides:
         figures["static_share"] = float(1 - moves.mean())
     return figures

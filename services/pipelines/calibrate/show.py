@@ -23,7 +23,7 @@ def show(options: argparse.Namespace, *, now: datetime | None = None) -> dict[st
     missing = missing_names(matrices)
     _print(findings)
     for name in missing:
-        print(f"missing: {name}; alignment refuses takes that need it")
+        print(f"missing: {name}; takes without it are not learned from")
     levels = [finding.level for finding in findings] + ["ERROR"] * bool(missing)
     return {
         "folder": str(options.folder),

@@ -62,6 +62,8 @@ from .table import is_rejected as is_rejected
 from .table import select_episodes as select_episodes
 from .trash import TRASH_KINDS as TRASH_KINDS
 from .trash import TrashKind as TrashKind
+from .validity import JOINTS as JOINTS
+from .validity import columns_of as columns_of
 from .validity import interpolated_actions as interpolated_actions
 from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions

@@ -362,7 +362,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             t_ref_ns=steps_ns.copy(),
             anchor=self.anchor(start),
             K_head=self._K_head(),
-            actions_measured=measured_actions(self.attributes, steps_ns),
+            actions_measured=measured_actions(self.attributes, steps_ns, action_kind),
             taxels_measured=measured_taxels(self.attributes.calibration),
         )
 

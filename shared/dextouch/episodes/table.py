@@ -256,8 +256,9 @@ class EpisodeGrid:
         """Steps of which alignment interpolated some part of the action across a gap."""
         if not any(name.startswith("interpolated_") for name in self.about.calibration):
             return np.zeros(len(self), dtype=np.bool_)
-        columns = interpolated_actions(self.about.calibration, self.t_ref_ns)
-        return np.asarray(columns.any(axis=1))
+        kinds: set[ActionKind] = {"measured", self.action_kind}
+        columns = [interpolated_actions(self.about.calibration, self.t_ref_ns, k) for k in kinds]
+        return np.asarray(np.any(columns, axis=(0, 2)))
 
     def is_measured(self, first: int, stop: int) -> bool:
         """Whether no action of the steps first … stop − 1 is interpolated."""

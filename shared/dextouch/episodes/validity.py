@@ -20,34 +20,42 @@ from dextouch.hands.actions import (
     WRIST_LEFT,
     WRIST_RIGHT,
 )
-from dextouch.schemas import EpisodeAttributes, Matrix
+from dextouch.schemas import ActionKind, EpisodeAttributes, Matrix
 from dextouch.tactile.layout import FINGERS, NUM_TAXELS, SIDES
 
 JOINTS: Final = slice(JOINTS_LEFT.start, JOINTS_RIGHT.stop)
-# Columns of actions that come from a stream; a commanded one has those of its measured one.
-COLUMNS: Final[Mapping[str, slice]] = {
-    "wrist_left": WRIST_LEFT,
-    "wrist_right": WRIST_RIGHT,
-    "head": CAMERA_HEAD,
-    "keypoints_left": JOINTS_LEFT,
-    "keypoints_right": JOINTS_RIGHT,
-    "joints_measured": JOINTS,
-    "wrist_left_commanded": WRIST_LEFT,
-    "wrist_right_commanded": WRIST_RIGHT,
-    "joints_commanded": JOINTS,
+# Columns of measured and of commanded actions that come from a stream. Nobody commands the head.
+COLUMNS: Final[Mapping[ActionKind, Mapping[str, slice]]] = {
+    "measured": {
+        "wrist_left": WRIST_LEFT,
+        "wrist_right": WRIST_RIGHT,
+        "head": CAMERA_HEAD,
+        "keypoints_left": JOINTS_LEFT,
+        "keypoints_right": JOINTS_RIGHT,
+        "joints_measured": JOINTS,
+    },
+    "commanded": {
+        "wrist_left_commanded": WRIST_LEFT,
+        "wrist_right_commanded": WRIST_RIGHT,
+        "head": CAMERA_HEAD,
+        "joints_commanded": JOINTS,
+    },
 }
+_PARTS: Final = tuple(dict.fromkeys(part for kind in COLUMNS.values() for part in kind))
 _JOINTS_OF_FINGER: Final = (JOINTS_LEFT.stop - JOINTS_LEFT.start) // len(FINGERS)
 
 
-def columns_of(parts: tuple[str, ...]) -> Bool[np.ndarray, "67"]:
+def columns_of(parts: tuple[str, ...], kind: ActionKind = "measured") -> Bool[np.ndarray, "67"]:
     """Columns of actions that belong to some parts: streams, or fingers such as `thumb_left`."""
     found = np.zeros(ACTION_DIM, dtype=np.bool_)
     for part in parts:
         finger, _, side = part.partition("_")
-        if part in COLUMNS:
-            found[COLUMNS[part]] = True
-        elif finger in FINGERS and side in SIDES:
-            first = COLUMNS[f"keypoints_{side}"].start + _JOINTS_OF_FINGER * FINGERS.index(finger)
+        if part in COLUMNS[kind]:
+            found[COLUMNS[kind][part]] = True
+        elif kind == "measured" and finger in FINGERS and side in SIDES:
+            first = COLUMNS[kind][f"keypoints_{side}"].start + _JOINTS_OF_FINGER * FINGERS.index(
+                finger
+            )
             found[first : first + _JOINTS_OF_FINGER] = True
     return found
 
@@ -59,7 +67,7 @@ def interpolated_spans(calibration: Mapping[str, Matrix]) -> list[tuple[str, int
     """
     spans = [
         (stream, start_s, stop_s)
-        for stream in COLUMNS
+        for stream in _PARTS
         for start_s, stop_s in calibration.get(f"interpolated_{stream}_s", ())
     ]
     spans += [
@@ -72,22 +80,28 @@ def interpolated_spans(calibration: Mapping[str, Matrix]) -> list[tuple[str, int
 
 
 def interpolated_actions(
-    calibration: Mapping[str, Matrix], t_ref_ns: Int64[np.ndarray, " steps"]
+    calibration: Mapping[str, Matrix],
+    t_ref_ns: Int64[np.ndarray, " steps"],
+    kind: ActionKind = "measured",
 ) -> Bool[np.ndarray, "steps 67"]:
-    """Columns of actions that were interpolated, by step."""
+    """Columns of measured or commanded actions that were interpolated, by step."""
     found = np.zeros((len(t_ref_ns), ACTION_DIM), dtype=np.bool_)
     for part, start_ns, stop_ns in interpolated_spans(calibration):
         # Seconds in floats may be a nanosecond off the stamps.
         inside = (t_ref_ns >= start_ns - 1) & (t_ref_ns < stop_ns - 1)
-        found[np.ix_(inside, columns_of((part,)))] = True
+        found[np.ix_(inside, columns_of((part,), kind))] = True
     return found
 
 
 def measured_actions(
-    about: EpisodeAttributes, t_ref_ns: Int64[np.ndarray, " steps"]
+    about: EpisodeAttributes,
+    t_ref_ns: Int64[np.ndarray, " steps"],
+    kind: ActionKind = "measured",
 ) -> Bool[np.ndarray, "steps 67"]:
     """Columns of actions that were measured (or commanded), neither interpolated nor absent."""
-    return ~(interpolated_actions(about.calibration, t_ref_ns) | columns_of(about.absent))
+    return ~(
+        interpolated_actions(about.calibration, t_ref_ns, kind) | columns_of(about.absent, kind)
+    )
 
 
 def measured_taxels(calibration: Mapping[str, Matrix]) -> Bool[np.ndarray, "2 320"]:

@@ -39,7 +39,7 @@ def write_recording(
     t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000
     with store.writer(kind="recording", attributes=attributes) as writer:
         for name in streams:
-            row = POSE if name != "joints_measured" else np.full(40, 0.25)
+            row = np.full(40, 0.25) if name.startswith("joints") else POSE
             stream = StreamDescriptor(
                 name=name,
                 kind="pose" if len(row) == 7 else "robot_state",

@@ -125,7 +125,7 @@ def test_a_robot_may_have_one_wrist(tmp_path):
 
 
 def test_a_take_without_any_hand_is_refused_by_what_it_lacks(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"'wrist_left'.*'keypoints_right'.*one at least"):
+    with pytest.raises(InvalidInputError, match=r"'wrist_left'.*'keypoints_right'.*at least"):
         aligned(tmp_path, streams=("head",))
 
 
@@ -212,3 +212,79 @@ def test_refused_taxels_are_not_measured():
     found = measured_taxels({"tactile_right_refused_taxels": (tuple(states),)})
     assert found[0].all()
     assert np.flatnonzero(~found[1]).tolist() == [5, 300]
+
+
+COMMANDED = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
+
+
+def robot(folder, streams, *, lost=()):
+    """A robot whose commands are recorded beside what it did; all stand still."""
+    store = EpisodeStore(folder)
+    recordings.write_recording(store, "take", streams=streams, seconds=6.0, lost=lost)
+    report = align_recording(store, "take", AlignmentOptions())
+    return report, EpisodeGrid(store.open(report.episode_id))
+
+
+def test_gaps_of_commands_and_of_measurements_are_told_apart(tmp_path):
+    names = ("wrist_left", "wrist_right", "head", "joints_measured", *COMMANDED)
+    lost = [("wrist_left_commanded", 200, 220), ("wrist_right", 400, 420)]
+    _, grid = robot(tmp_path, names, lost=lost)
+    windows = {
+        kind: grid.reader.window(0, len(grid), cameras=(), action_kind=kind).actions_measured
+        for kind in ("measured", "commanded")
+    }
+    unmeasured = {kind: np.unique(np.nonzero(~one)[1]).tolist() for kind, one in windows.items()}
+    assert unmeasured == {"measured": list(range(9, 18)), "commanded": list(range(9))}
+    assert grid.interpolated.sum() == sum((~one).any(axis=1).sum() for one in windows.values())
+
+
+def test_an_arm_alone_has_its_commands(tmp_path):
+    names = ("wrist_right", "head", "joints_measured", "joints_commanded", "wrist_right_commanded")
+    _, grid = robot(tmp_path, names)
+    assert grid.action_kind == "commanded"
+    window = grid.reader.window(0, len(grid), cameras=(), action_kind="commanded")
+    expected = np.ones(67, dtype=bool)
+    expected[:9] = False
+    np.testing.assert_array_equal(window.actions_measured, np.tile(expected, (len(grid), 1)))
+
+
+def test_commands_that_make_no_action_cut_nothing(tmp_path):
+    names = ("wrist_left", "wrist_right", "head", "joints_measured", "wrist_left_commanded")
+    _, grid = robot(tmp_path, names, lost=[("wrist_left_commanded", 150, 600)])
+    assert grid.action_kind == "measured"
+    assert grid.measured_columns.all()
+    assert len(grid) >= 88
+
+
+def test_a_stream_with_a_sample_or_a_hand_that_is_never_seen_is_absent(tmp_path, whole):
+    def unseen(name, values):
+        return np.full_like(values, np.nan) if name == "keypoints_left" else values
+
+    _, grid = aligned(tmp_path / "hand", edit=unseen)
+    assert grid.about.absent == ("keypoints_left",)
+    assert len(grid) == len(whole)
+    store = EpisodeStore(tmp_path / "head")
+    lost = [("head", 1, 600)]
+    recordings.write_recording(store, "take", seconds=6.0, lost=lost)
+    grid = EpisodeGrid(store.open(align_recording(store, "take", AlignmentOptions()).episode_id))
+    assert grid.about.absent == ("head",)
+    assert len(grid) >= 88
+
+
+def test_figures_are_of_what_is_there(tmp_path):
+    report = EpisodeStore(tmp_path)
+    write_person(report, streams=("keypoints_right", "wrist_right"))
+    quality = align_recording(report, "take", AlignmentOptions()).quality
+    assert "wrist_right_peak_speed_m_s" in quality
+    assert not [name for name in quality if name.startswith(("wrist_left", "retargeting_left"))]
+
+
+def test_steps_without_a_finger_are_counted(tmp_path):
+    _, grid = aligned(tmp_path, edit=lost_fingers([("left", 0, 90, 120)]))
+    assert grid.about.quality["num_steps_interpolated"] == grid.interpolated.sum() > 5
+
+
+def test_a_finger_that_is_seen_once_is_at_rest(tmp_path):
+    _, grid = aligned(tmp_path, edit=lost_fingers([("left", 0, 0, 40), ("left", 0, 41, 10_000)]))
+    assert grid.about.absent == ("thumb_left",)
+    assert np.abs(grid.measured[:, 18:22]).max() == 0
