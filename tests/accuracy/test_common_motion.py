@@ -181,6 +181,36 @@ def test_a_clock_that_is_set_within_the_take_is_refused():
         shared_times(turnings, "head")
 
 
+@pytest.mark.parametrize(("share", "late_s"), [(0.1, 0.015), (0.9, 0.015), (0.5, 0.01)])
+def test_a_clock_that_is_set_near_an_end_is_refused(share, late_s):
+    turnings, _ = shaken(7)
+    late = turnings["wrist_right"]
+    is_late = np.arange(len(late.t_ns)) >= share * len(late.t_ns)
+    moved = Turning(late.t_ns + np.rint(is_late * late_s * 1e9).astype(int), late.velocity_rad_s)
+    with pytest.raises(DegenerateMotionError, match=r"a clock stopped or was set|known only to"):
+        shared_times(turnings | {"wrist_right": moved}, "head")
+
+
+@pytest.mark.parametrize("noise_deg", [0.1, 0.3])
+def test_where_circling_makes_up_for_time_the_offset_is_right_or_refused(noise_deg):
+    """A turn about the axis of the circle and a shift in time are nearly the same."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        t_s = np.arange(0, SECONDS + 2, 0.05)
+        phase = 2 * np.pi * np.cumsum(1 + 0.2 * rng.normal(size=len(t_s)).clip(-2, 2)) * 0.05
+        swing = 0.4 * np.column_stack([np.cos(phase), np.sin(phase), 0.05 * np.sin(0.7 * phase)])
+        truth = RotationSpline(t_s, Rotation.from_rotvec(swing))
+        turnings = {
+            name: tracked(truth, rng, rate_hz, noise_deg, 0.0, delay_s)
+            for name, rate_hz, delay_s in (("head", 90, 0.0), ("wrist_left", 60, 0.03))
+        }
+        try:
+            found = shared_times(turnings, "head").delays["wrist_left"]
+        except DegenerateMotionError:
+            continue
+        assert abs(found.offset_ns - 30e6) <= 3 * found.sigma_ns
+
+
 def test_too_few_streams_and_an_unknown_reference():
     turnings, _ = shaken(0)
     with pytest.raises(InvalidInputError, match="two streams at least"):

@@ -13,14 +13,22 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DexTouchError, InvalidInputError
-from services.alignment.calibration.motion import DegenerateMotionError
-from services.alignment.calibration.time_offset import TimeOffset, estimate_time_offset
+from services.alignment.calibration.motion import DegenerateMotionError, hat
+from services.alignment.calibration.time_offset import (
+    CUTOFF_HZ,
+    SIGMA_FACTOR,
+    TimeOffset,
+    checked_signal,
+    estimate_time_offset,
+    low_passed,
+)
 
 # A loop of three offsets that misses zero by more standard deviations has a wrong one among them;
-# so has a pair whose offsets in either half are as far apart.
+# so has a pair whose offset in a part of the take is as far off.
 MAX_SIGMAS: Final = 4.0
 # Chosen: corners that are followed from image to image, their least distance and quality, in images
 # of at most this width; twice as many in larger ones gave no smaller error.
@@ -35,6 +43,14 @@ _RETURN_PX: Final = 1.0
 # Bearings that are off the fitted rotation by more than this many times the median are not counted.
 _OUTLIER_RATIO: Final = 3.0
 _FITS: Final = 4
+# Of a take in which the offset must be the same; two seconds of ten show it.
+_NUM_PARTS: Final = 5
+_MAX_ITERATIONS: Final = 30
+# Brisk irregular motion gives 0.1 … 0.4 ms. Where it is much more, offset and turn can hardly be
+# told apart, and noise in the streams biases both: circling with 0.3° of noise was off by 9 ms.
+_MAX_SIGMA_S: Final = 1.5e-3
+# Splines through samples of exact streams are no better.
+_LEAST_SIGMA_S: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -89,7 +105,7 @@ def turning_of_points(
 
 def turning_of_images(
     t_ns: Int64[np.ndarray, " n"],
-    images: Iterable[UInt8[np.ndarray, "h w 3"]],
+    images: Iterable[UInt8[np.ndarray, "h w channels"]],
     K: Float64[np.ndarray, "3 3"],
     distortion: Float64[np.ndarray, "5"],
 ) -> Turning:
@@ -121,7 +137,8 @@ def turning_of_images(
 
 def _small_gray(image: np.ndarray) -> tuple[UInt8[np.ndarray, "h w"], float]:
     """A gray image of at most `_MAX_WIDTH_PX`, and its width over that of the image."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    is_gray = image.shape[-1] == 1
+    gray = image[..., 0] if is_gray else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, _MAX_WIDTH_PX / gray.shape[1])
     if scale == 1.0:
         return gray, scale
@@ -162,34 +179,80 @@ def _turn_between(
 def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     """Offset to be added to b's times to align it with a, of streams that turn together.
 
+    Offset and turn between their axes are fitted together (Gauss–Newton): where a hand circles, one
+    makes up for the other, and the offset is known the less.
+
     Raises:
-        DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or it is another one in
-            each half of the time.
+        DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or the offset is not
+            the same throughout.
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])
-    t_b_ns = b.t_ns + rough.offset_ns
-    inside = (a.t_ns >= t_b_ns[0]) & (a.t_ns <= t_b_ns[-1])
-    mine = a.velocity_rad_s[inside]
-    other = np.stack(
-        [np.interp(a.t_ns[inside], t_b_ns, column) for column in b.velocity_rad_s.T], axis=1
-    )
-    turn, _ = Rotation.align_vectors(mine, other)
-    turned_rad_s = np.asarray(turn.apply(b.velocity_rad_s))
-    middle_ns = int(a.t_ns[inside][len(mine) // 2])
-
-    def offset(taken: slice | np.ndarray) -> TimeOffset:
-        return estimate_time_offset(a.t_ns[taken], a.velocity_rad_s[taken], b.t_ns, turned_rad_s)
-
-    halves = offset(a.t_ns < middle_ns), offset(a.t_ns >= middle_ns)
-    apart_ns = abs(halves[0].offset_ns - halves[1].offset_ns)
-    if apart_ns > MAX_SIGMAS * np.hypot(halves[0].sigma_ns, halves[1].sigma_ns):
+    first_ns = int(a.t_ns[0])
+    t_a, mine = checked_signal("times: stream a", a.t_ns, a.velocity_rad_s, first_ns)
+    t_b, other = checked_signal("times: stream b", b.t_ns, b.velocity_rad_s, first_ns)
+    step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
+    grid, smooth_a = low_passed(t_a, mine, step_s)
+    grid_b, smooth_b = low_passed(t_b, other, step_s)
+    spline = CubicSpline(grid_b, smooth_b)
+    slope, offset_s, turn = spline.derivative(), rough.offset_ns * 1e-9, None
+    for _ in range(_MAX_ITERATIONS):
+        inside = (grid - offset_s >= grid_b[0]) & (grid - offset_s <= grid_b[-1])
+        at_s, seen = grid[inside] - offset_s, smooth_a[inside]
+        if turn is None:
+            turn, _ = Rotation.align_vectors(seen, spline(at_s))
+        turned = turn.apply(spline(at_s))
+        left = seen - turned
+        # By the offset, and by a small turn w: w × turned.
+        J = np.empty((*turned.shape, 4))
+        J[..., 0] = -turn.apply(slope(at_s))
+        J[..., 1:] = -hat(turned)
+        normal = np.einsum("nij,nik->jk", J, J)
+        change = np.linalg.lstsq(normal, np.einsum("nij,ni->j", J, left), rcond=None)[0]
+        offset_s, turn = offset_s + float(change[0]), Rotation.from_rotvec(change[1:]) * turn
+        if abs(change[0]) < 1e-7:
+            break
+    # As many numbers as `estimate_time_offset` counts as independent, and its factor.
+    per_number = max(1.0, 1 / (2 * CUTOFF_HZ * step_s))
+    _check_constant(J[..., 0], left, per_number)
+    variance = float(np.square(left).mean()) * per_number * SIGMA_FACTOR**2
+    sigma_s = float(np.sqrt(variance * np.linalg.pinv(normal)[0, 0]))
+    if not sigma_s <= _MAX_SIGMA_S:
         raise DegenerateMotionError(
-            f"times: the offset is {halves[0].offset_ns * 1e-6:.1f} ms in the first half of the "
-            f"take and {halves[1].offset_ns * 1e-6:.1f} ms in the second; a clock stopped or was "
-            "set, or the path became slower: record the take again"
+            f"times: the offset is known only to {sigma_s * 1e3:.1f} ms, expected at most "
+            f"{_MAX_SIGMA_S * 1e3:g}; shake more briskly and irregularly, about all axes"
         )
-    return offset(slice(None))
+    return TimeOffset(round(offset_s * 1e9), max(1, round(sigma_s * 1e9)))
+
+
+def _check_constant(
+    by_offset: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"], per_number: float
+) -> None:
+    """Refuse an offset that is another one in some part of the take."""
+    parts = [
+        (moved, rest)
+        for moved, rest in zip(
+            np.array_split(by_offset, _NUM_PARTS), np.array_split(left, _NUM_PARTS), strict=True
+        )
+    ]
+    energies = np.array([float(np.square(moved).sum()) for moved, _ in parts])
+    offs_s = np.array([float((moved * rest).sum()) for moved, rest in parts]) / energies
+    noise = np.array(
+        [
+            float(np.square(rest - off * moved).mean())
+            for (moved, rest), off in zip(parts, offs_s, strict=True)
+        ]
+    )
+    # Where an offset has changed, a line no longer describes it, and its part has larger errors.
+    sigmas_s = SIGMA_FACTOR * np.sqrt(np.median(noise) * per_number / energies)
+    sigmas_s = np.maximum(sigmas_s, _LEAST_SIGMA_S)
+    worst = int(np.argmax(np.abs(offs_s) / sigmas_s))
+    if abs(offs_s[worst]) > MAX_SIGMAS * sigmas_s[worst]:
+        raise DegenerateMotionError(
+            f"times: in part {worst + 1} of {_NUM_PARTS} of the take the offset is another one, by "
+            f"about {abs(offs_s[worst]) * 1e3:.1f} ms; a clock stopped or was set, or something "
+            "slipped: record the take again"
+        )
 
 
 def shared_times(turnings: Mapping[str, Turning], reference: str) -> SharedTimes:

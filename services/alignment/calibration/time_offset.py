@@ -74,8 +74,8 @@ def estimate_time_offset(
     if a.shape[1] != b.shape[1]:
         raise ShapeError(f"time offset: got {a.shape[1]} and {b.shape[1]} components")
     step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
-    grid_a, smooth_a = _low_passed(t_a, a, step_s)
-    grid_b, smooth_b = _low_passed(t_b, b, step_s)
+    grid_a, smooth_a = low_passed(t_a, a, step_s)
+    grid_b, smooth_b = low_passed(t_b, b, step_s)
     spline_b = CubicSpline(grid_b, smooth_b)
     coarse_s = _coarse(grid_a, smooth_a, (grid_b, smooth_b), step_s)
     offset_s, sigma_s = _refined(grid_a, smooth_a, spline_b, coarse_s)
@@ -154,7 +154,7 @@ def checked_signal(
     return (t_ns - reference_ns) * 1e-9, values
 
 
-def _low_passed(
+def low_passed(
     t_s: np.ndarray, values: np.ndarray, step_s: float
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
     """The signal on a uniform grid, low-pass filtered without phase."""

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,7 @@ from dextouch.geometry import transform_from_pose
 from dextouch.hands import PALM_NODES
 from dextouch.images import decode_jpeg
 from dextouch.schemas import Matrix
-from dextouch.streams import JPEG_UNIT, StreamDescriptor
+from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor, check_camera_matrix
 from services.alignment.calibration.common_motion import (
     SharedTimes,
     Turning,
@@ -51,7 +52,9 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
     cameras = dict(reader.attributes.calibration)
     if (options.to / MATRICES_FILE).exists():
         cameras |= read_matrices(options.to)
-    wanted = None if options.streams is None else options.streams.split(",")
+    wanted = None
+    if options.streams is not None:
+        wanted = [name.strip() for name in options.streams.split(",")]
     unknown = sorted(set(wanted or ()) - set(reader.streams))
     if unknown:
         raise NotFoundError(f"{where}: has no {', '.join(unknown)}, only {sorted(reader.streams)}")
@@ -60,7 +63,7 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
     for name, descriptor in reader.streams.items():
         if wanted is not None and name not in wanted:
             continue
-        reason = _unfit(descriptor, cameras)
+        reason = _unfit(descriptor, cameras, in_spool=isinstance(reader, SpoolReader))
         if reason is None:
             turnings[name] = _turning(options, reader, name, cameras)
         else:
@@ -68,12 +71,13 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
     if len(turnings) < 2:
         raise InvalidInputError(
             f"{where}: {len(turnings)} of its streams show how they turned, expected two; "
-            + "; ".join(f"{name} {reason}" for name, reason in left_out.items())
+            + "; ".join([*(f"{name} {reason}" for name, reason in left_out.items()), "no other"])
         )
-    # Delays of the take were subtracted from its times; those of --to were not.
-    taken = dict(reader.attributes.calibration)
-    reference = options.reference or _best_known(turnings, taken)
-    return _written(options, shared_times(turnings, reference), taken, left_out)
+    if options.reference in left_out:
+        raise InvalidInputError(f"{options.reference} {left_out[options.reference]}")
+    reference = options.reference or _best_known(turnings, cameras)
+    known = _Known(dict(reader.attributes.calibration), cameras)
+    return _written(options, shared_times(turnings, reference), known, left_out)
 
 
 def _reader(take: str, store: str | None) -> SpoolReader | RecordingReader:
@@ -87,17 +91,36 @@ def _reader(take: str, store: str | None) -> SpoolReader | RecordingReader:
     )
 
 
-def _unfit(descriptor: StreamDescriptor, cameras: dict[str, Matrix]) -> str | None:
-    """Why a stream does not show how something turned; None if it does."""
+def _unfit(
+    descriptor: StreamDescriptor, cameras: dict[str, Matrix], *, in_spool: bool
+) -> str | None:
+    """Why a stream does not show how something turned; None if it does.
+
+    Raises:
+        InvalidInputError: a camera's matrix is none, or of images of another size.
+    """
     name, kind = descriptor.name, descriptor.kind
     if kind == "pose" and not name.endswith(_COMMANDED):
-        return None
+        return None if descriptor.shape == (7,) else f"has poses of shape {descriptor.shape}"
     if kind == "keypoints":
         in_world = descriptor.frame in ("world", "tracker")
         return None if in_world else "has keypoints in wrist axes, which do not turn with the hand"
     if kind == "image":
-        K = f"K_{name.removeprefix('camera_')}"
-        return None if K in cameras else f"needs {K}: calibrate the camera first"
+        camera = name.removeprefix("camera_")
+        if f"K_{camera}" not in cameras:
+            return f"needs K_{camera}: calibrate the camera first"
+        if in_spool and descriptor.unit == H264_UNIT:
+            return "is h264, which only a store decodes: give the uploaded recording with --store"
+        height_px, width_px = descriptor.shape[:2]
+        size_px = cameras.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
+        if tuple(size_px) != (width_px, height_px):
+            raise InvalidInputError(
+                f"K_{camera}: was measured on images of {size_px[0]:g} by {size_px[1]:g} px, but "
+                f"{name!r} holds {width_px} by {height_px}; calibrate the camera in this mode"
+            )
+        K = np.array(cameras[f"K_{camera}"])
+        check_camera_matrix(K, (width_px, height_px), where=f"K_{camera}")
+        return None
     return "shows no turning; for gloves use `latency` with taps"
 
 
@@ -158,28 +181,41 @@ def _best_known(turnings: dict[str, Turning], calibration: dict[str, Matrix]) ->
     return min(turnings, key=sigma_ns)
 
 
-def _written(
-    options: argparse.Namespace,
-    found: SharedTimes,
-    calibration: dict[str, Matrix],
-    left_out: dict[str, str],
-) -> dict[str, object]:
-    def known(name: str) -> float:
-        return float(calibration.get(name, ((0.0,),))[0][0])
+@dataclass(frozen=True)
+class _Known:
+    """Delays that were subtracted from the take's times, and those that are known by now."""
 
+    subtracted: dict[str, Matrix]
+    best: dict[str, Matrix]
+
+    def subtracted_ns(self, stream: str) -> float:
+        return float(self.subtracted.get(f"{stream}_latency_ns", ((0.0,),))[0][0])
+
+    def best_ns(self, stream: str) -> float:
+        return float(self.best.get(f"{stream}_latency_ns", ((0.0,),))[0][0])
+
+    def sigma_ns(self, stream: str) -> float:
+        return float(self.best.get(f"{stream}_latency_sigma_ns", ((0.0,),))[0][0])
+
+
+def _written(
+    options: argparse.Namespace, found: SharedTimes, known: _Known, left_out: dict[str, str]
+) -> dict[str, object]:
     reference = found.reference
-    sigma_ref_ns = known(f"{reference}_latency_sigma_ns")
+    reference_ms, sigma_ref_ns = known.best_ns(reference) * 1e-6, known.sigma_ns(reference)
+    # Of the reference, another delay may be known by now than was subtracted.
+    correction_ns = known.best_ns(reference) - known.subtracted_ns(reference)
     rows: dict[str, dict[str, float]] = {}
     for name, delay in found.delays.items():
         if name == reference:
             continue
         # Times are without the delays that were known before: what is found comes on top.
-        latency_ns = known(f"{name}_latency_ns") + delay.offset_ns
+        latency_ns = known.subtracted_ns(name) + delay.offset_ns + correction_ns
         sigma_ns = float(np.hypot(delay.sigma_ns, sigma_ref_ns))
         facts: dict[str, object] = {
             "stream": name,
             "reference": reference,
-            "reference_latency_ms": known(f"{reference}_latency_ns") * 1e-6,
+            "reference_latency_ms": reference_ms,
             "method": "common turning",
             "take": options.take,
             "latency_ms": latency_ns * 1e-6,
@@ -192,7 +228,7 @@ def _written(
         rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
         print(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
     print(
-        f"relative to {reference}, which has {known(f'{reference}_latency_ns') * 1e-6:.2f} ms; "
+        f"relative to {reference}, which has {reference_ms:.2f} ms; "
         f"{len(found.pairs)} pairs of streams, loops close within {found.loop_sigmas:.1f} standard "
         "deviations"
     )

@@ -237,8 +237,17 @@ def test_times_of_all_that_was_shaken_together(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "3 pairs of streams" in said
     assert "left out: keypoints_left has keypoints in wrist axes" in said
+    # What is known by now of the reference counts, though the take does not have it.
+    _, matrices = run(
+        "time", "--take", take, "--reference", "wrist_left", to=tmp_path / "to"
+    )  # fmt: skip
+    for name, late in late_ms.items():
+        assert matrices[f"{name}_latency_ns"][0][0] * 1e-6 == pytest.approx(late, abs=0.7)
+    with pytest.raises(InvalidInputError, match="keypoints_left has keypoints in wrist axes"):
+        main(["time", "--take", str(take), "--to", str(tmp_path / "no"),
+              "--reference", "keypoints_left"])  # fmt: skip
     only, _ = run(
-        "time", "--take", take, "--streams", "head,wrist_left", "--reference", "wrist_left",
+        "time", "--take", take, "--streams", "head, wrist_left", "--reference", "wrist_left",
         to=tmp_path / "two",
     )  # fmt: skip
     assert list(only["streams"]) == ["head"]
