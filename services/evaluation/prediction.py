@@ -53,12 +53,14 @@ def _of_images(function: Callable[..., float], pairs: Pairs) -> float:
 
 def _of_touch(function: Callable[..., float], pairs: Pairs) -> float:
     """Over all measured steps, hands and taxels together; NaN if nothing was measured."""
-    hands = tactile_metrics.measured_hands(
+    measured = np.concatenate([scene.truth.is_measured() for scene, _ in pairs])
+    if not measured.any():
+        return float("nan")
+    return function(
         predicted_kpa=np.concatenate([future.tactile_kpa for _, future in pairs]),
         true_kpa=np.concatenate([scene.truth.tactile_kpa for scene, _ in pairs]),
-        measured=np.concatenate([scene.truth.is_measured() for scene, _ in pairs]),
+        measured=measured,
     )
-    return function(**hands) if len(hands["true_kpa"]) else float("nan")
 
 
 def _of_geometry(function: Callable[..., float], pairs: Pairs) -> float:

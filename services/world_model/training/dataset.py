@@ -7,7 +7,7 @@ through the store's reader, which decodes one camera and only the span of the wi
 
 import hashlib
 from collections.abc import Collection, Generator, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final, TypeAlias, TypeVar
 
@@ -29,6 +29,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # What an episode must have for windows to be cut from it.
@@ -71,6 +72,9 @@ class EpisodeArrays:
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
+    measured_taxels: Bool[np.ndarray, "2 320"] = field(
+        default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
+    )
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -122,7 +126,11 @@ class EpisodeArrays:
             objects=self.objects_at(place.start),
         )
         return Window(
-            request, self.images[steps], self.tactile_kpa[steps], self.tactile_valid[steps]
+            request,
+            self.images[steps],
+            self.tactile_kpa[steps],
+            self.tactile_valid[steps],
+            self.measured_taxels,
         )
 
 
@@ -134,6 +142,7 @@ class Window:
     images: UInt8[np.ndarray, "time h w 3"]
     tactile_kpa: Float32[np.ndarray, "time 2 320"]
     tactile_valid: Bool[np.ndarray, "time 2"]
+    measured_taxels: Bool[np.ndarray, "2 320"]
 
 
 @dataclass(frozen=True)
@@ -189,6 +198,7 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         object_poses=poses,
         boxes_m=boxes_m,
         interpolated=grid.interpolated if grid.interpolated.any() else None,
+        measured_taxels=grid.measured_taxels,
     )
 
 
@@ -256,7 +266,7 @@ class StoredEpisode:
             K_head=grid.K_head,
             objects=objects,
         )
-        return Window(request, images, read.tactile_kpa, read.tactile_valid)
+        return Window(request, images, read.tactile_kpa, read.tactile_valid, read.taxels_measured)
 
 
 # An episode that windows are cut from.

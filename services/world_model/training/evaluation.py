@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
@@ -36,6 +36,7 @@ class Futures:
 
     images: UInt8[np.ndarray, "n steps h w 3"]
     tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
+    measured: Bool[np.ndarray, "n steps 2 320"] | None = None
 
 
 def evaluate_prediction(
@@ -82,7 +83,9 @@ def evaluate_prediction(
         _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
     ]
     truth = Futures(
-        np.stack([w.images[1:] for w in windows]), np.stack([w.tactile_kpa[1:] for w in windows])
+        np.stack([w.images[1:] for w in windows]),
+        np.stack([w.tactile_kpa[1:] for w in windows]),
+        np.stack([w.tactile_valid[1:, :, None] & w.measured_taxels for w in windows]),
     )
     first = Futures(
         np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
@@ -93,13 +96,16 @@ def evaluate_prediction(
     figures |= _figures(first, truth, "_copy")
     figures |= _figures(_through_codec(model, windows), truth, "_codec")
     figures["tactile_mse_zero"] = tactile_metrics.mse(
-        predicted_kpa=np.zeros_like(truth.tactile_kpa), true_kpa=truth.tactile_kpa
+        predicted_kpa=np.zeros_like(truth.tactile_kpa),
+        true_kpa=truth.tactile_kpa,
+        measured=truth.measured,
     )
     others = _actions_of_other_takes(places, requests, action_kind)
     if others:
         kept = [index for index, _ in others]
         wrong = predict_all(model, [request for _, request in others])
-        right = Futures(truth.images[kept], truth.tactile_kpa[kept])
+        measured = None if truth.measured is None else truth.measured[kept]
+        right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured)
         figures |= _figures(wrong, right, "_other_take")
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
         still = [_standing_still(request, head_moves=head_moves) for request in requests]
@@ -202,7 +208,11 @@ def _standing_still(request: PredictionRequest, *, head_moves: bool) -> Predicti
 
 
 def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:
-    touch = {"predicted_kpa": predicted.tactile_kpa, "true_kpa": true.tactile_kpa}
+    touch: dict[str, Any] = {
+        "predicted_kpa": predicted.tactile_kpa,
+        "true_kpa": true.tactile_kpa,
+        "measured": true.measured,
+    }
     return {
         f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),
         f"tactile_mse{suffix}": tactile_metrics.mse(**touch),

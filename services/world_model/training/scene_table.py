@@ -340,15 +340,26 @@ def _touch(
     """Pressures (kPa) at every step, those of unmeasured taxels filled, and which hands count."""
     tactile, felt = [], []
     for one in episodes:
-        touch_kpa, is_sampled = one.touch()
+        touch_kpa, is_sampled = filled_touch(one)
         measured = one.measured_taxels
-        nearest = np.stack([_nearest_measured(hand) for hand in measured])
-        is_known = np.take_along_axis(measured, nearest, axis=-1)
-        touch_kpa = np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known
         tactile.append(_filled(touch_kpa.astype(np.float16), one, num_steps))
         is_felt = is_sampled & (measured.mean(axis=-1) >= LEAST_MEASURED)
         felt.append(_filled(is_felt, one, num_steps))
     return np.stack(tactile), np.stack(felt)
+
+
+def filled_touch(
+    episode: EpisodeGrid,
+) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+    """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
+
+    They have the pressure of the nearest one of their pad that was measured, or none.
+    """
+    touch_kpa, is_sampled = episode.touch()
+    measured = episode.measured_taxels
+    nearest = np.stack([_nearest_measured(hand) for hand in measured])
+    is_known = np.take_along_axis(measured, nearest, axis=-1)
+    return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known, is_sampled
 
 
 def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:

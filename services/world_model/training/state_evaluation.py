@@ -95,11 +95,9 @@ def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> di
             guesses["_of_copy"] = np.broadcast_to(before, true.shape)
         for name, guess in guesses.items():
             chunk = f"{place}chunk_{index + 1}{name}"
-            pair = tactile_metrics.measured_hands(
-                predicted_kpa=guess, true_kpa=true, measured=measured.numpy()
-            )
-            if not len(pair["true_kpa"]):
+            if not measured.any():
                 continue
+            pair = {"predicted_kpa": guess, "true_kpa": true, "measured": measured.numpy()}
             figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
             figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
         off_mm, there = _object_errors(

@@ -303,7 +303,7 @@ def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> Touc
     """The base's touch codec, or one fitted to the training episodes."""
     codec = TouchCodec(config.touch_channels)
     if base is None:
-        touch_kpa = table.tactile_kpa[:, ::4].float().flatten(0, 2)
+        touch_kpa = table.tactile_kpa[:, ::4][table.felt[:, ::4]].float()
         codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
     else:
         codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())

@@ -42,6 +42,7 @@ from services.world_model.checkpoints import (
 from services.world_model.network.tactile import LearnedTokenizer, TactileTokenizer, build_tokenizer
 from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
+from services.world_model.training.scene_table import filled_touch
 
 _EVALUATION_BATCH = 1000
 _TIMING_ROUNDS = 5
@@ -67,7 +68,8 @@ def load_hands(
 ) -> tuple[TactileHands, TactileHands]:
     """Training and held-out hands of all people and robots; a scene is on one side only.
 
-    Hands of steps without a measurement and imagined episodes are left out.
+    Hands of steps without a measurement and imagined episodes are left out; single taxels that were
+    not measured are filled.
 
     Raises:
         InvalidInputError: either side has no scene.
@@ -76,7 +78,7 @@ def load_hands(
     sides: tuple[_Side, _Side] = ({}, {})
     for reader in select_episodes([EpisodeStore(url) for url in urls], splits=splits):
         grid = EpisodeGrid(reader)
-        touch_kpa, is_measured = grid.touch()
+        touch_kpa, is_measured = filled_touch(grid)
         side = sides[scene_fraction(grid.scene) < heldout_share]
         side.setdefault(grid.scene, []).append((touch_kpa[is_measured], grid.content_sha256))
     if not all(sides):

@@ -1,7 +1,8 @@
 """Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., 320].
 
 Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.layout`). NaN is refused: take `measured_hands` before calling.
+at least 2 kPa (`dextouch.tactile.layout`). NaN is refused, but where `measured` is false: what was
+not measured counts nowhere, or, in SSIM, as right; None: all was.
 """
 
 import numpy as np
@@ -16,54 +17,65 @@ PEAK_KPA = 40.0
 SSIM_WINDOW_TAXELS = 4
 
 
-def _pair(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+Measured = Bool[np.ndarray, "*batch 320"] | None
+
+
+def _pair(
+    predicted: np.ndarray, true: np.ndarray, what: str, measured: Measured
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both as float64, 0 where nothing was measured: no contact, and no error."""
+    if measured is not None:
+        predicted, true = (np.where(measured, one, 0.0) for one in (predicted, true))
     return checked_pair(predicted, true, what=f"{what} of taxels", tail=(NUM_TAXELS,))
 
 
-def measured_hands(
-    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Bool[np.ndarray, "*batch 320"]
-) -> dict[str, np.ndarray]:
-    """Arguments of the metrics here: hands of which some taxel was measured, others left out.
-
-    Unmeasured taxels of these are 0 in both: no contact, and no error. All are [..., 320].
-    """
-    hands = measured.any(axis=-1)
-    known = measured[hands]
-    return {
-        "predicted_kpa": np.where(known, predicted_kpa[hands], 0.0),
-        "true_kpa": np.where(known, true_kpa[hands], 0.0),
-    }
+def _mean(errors: np.ndarray, measured: Measured) -> float:
+    if measured is None:
+        return float(np.mean(errors))
+    return float(np.mean(errors[measured])) if measured.any() else float("nan")
 
 
-def mse(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
-    """Mean squared error in kPa²."""
-    a, b = _pair(predicted_kpa, true_kpa, "MSE")
-    return float(np.mean((a - b) ** 2))
+def mse(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None) -> float:
+    """Mean squared error in kPa²; NaN if nothing was measured."""
+    a, b = _pair(predicted_kpa, true_kpa, "MSE", measured)
+    return _mean((a - b) ** 2, measured)
 
 
-def mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
-    """Mean absolute error in kPa."""
-    a, b = _pair(predicted_kpa, true_kpa, "MAE")
-    return float(np.mean(np.abs(a - b)))
+def mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None) -> float:
+    """Mean absolute error in kPa; NaN if nothing was measured."""
+    a, b = _pair(predicted_kpa, true_kpa, "MAE", measured)
+    return _mean(np.abs(a - b), measured)
 
 
-def psnr(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
+def psnr(
+    *,
+    predicted_kpa: np.ndarray,
+    true_kpa: np.ndarray,
+    measured: Measured = None,
+    peak_kpa: float = PEAK_KPA,
+) -> float:
     """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
 
     Pooled, since samples of an untouched hand are mostly exact: the cap would dominate a mean.
     """
-    a, b = _pair(predicted_kpa, true_kpa, "PSNR")
-    return float(decibels(np.mean((a - b) ** 2), peak=peak_kpa))
+    a, b = _pair(predicted_kpa, true_kpa, "PSNR", measured)
+    return float(decibels(np.float64(_mean((a - b) ** 2, measured)), peak=peak_kpa))
 
 
-def ssim(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
+def ssim(
+    *,
+    predicted_kpa: np.ndarray,
+    true_kpa: np.ndarray,
+    measured: Measured = None,
+    peak_kpa: float = PEAK_KPA,
+) -> float:
     """Mean structural similarity of the six pads of a hand, 1 for equal pads.
 
     Computed within pads only: uniform windows of 4×4 taxels (one fingertip) inside each pad, K1 =
     0.01, K2 = 0.03, range 0 … `peak_kpa`; each of the five fingertips and the palm has the same
     weight. An untouched pad predicted as untouched scores 1.
     """
-    a, b = _pair(predicted_kpa, true_kpa, "SSIM")
+    a, b = _pair(predicted_kpa, true_kpa, "SSIM", measured)
     tips_a, palm_a = split_pads(a)
     tips_b, palm_b = split_pads(b)
     tips = _pad_similarity(tips_a, tips_b, peak_kpa)
@@ -82,34 +94,42 @@ def _pad_similarity(a: np.ndarray, b: np.ndarray, peak: float) -> np.ndarray:
     return similarity((mean_a, mean_b), variances, covariance, peak=peak)
 
 
-def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+def contact_mae(
+    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None
+) -> float:
     """Mean absolute error in kPa over the taxels in true contact.
 
     NaN when no taxel is in true contact.
     """
-    a, b = _pair(predicted_kpa, true_kpa, "contact MAE")
+    a, b = _pair(predicted_kpa, true_kpa, "contact MAE", measured)
     touched = in_contact(b)
     return float(np.mean(np.abs(a - b)[touched])) if touched.any() else float("nan")
 
 
-def contact_iou(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+def contact_iou(
+    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None
+) -> float:
     """Intersection over union of contact taxels; 1 when neither side has contact."""
-    both, either = _overlap(predicted_kpa, true_kpa, "contact IoU")
+    both, either = _overlap(predicted_kpa, true_kpa, "contact IoU", measured)
     return both / either if either else 1.0
 
 
-def contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+def contact_f1(
+    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None
+) -> float:
     """2 TP / (2 TP + FP + FN) of contact taxels; 1 when neither side has contact."""
-    return _f1(*_overlap(predicted_kpa, true_kpa, "contact F1"))
+    return _f1(*_overlap(predicted_kpa, true_kpa, "contact F1", measured))
 
 
-def pad_contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+def pad_contact_f1(
+    *, predicted_kpa: np.ndarray, true_kpa: np.ndarray, measured: Measured = None
+) -> float:
     """F1 of pads in contact, six of each hand; 1 when neither side has contact.
 
     A fingertip or palm is in contact if one of its taxels is. Where exactly skin is pressed does
     not matter, which differs between people and robots.
     """
-    a, b = _pair(predicted_kpa, true_kpa, "contact F1 of pads")
+    a, b = _pair(predicted_kpa, true_kpa, "contact F1 of pads", measured)
     return _f1(*_counted(_pads_in_contact(a), _pads_in_contact(b)))
 
 
@@ -122,8 +142,10 @@ def _f1(both: int, either: int) -> float:
     return 2 * both / (both + either) if either else 1.0
 
 
-def _overlap(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[int, int]:
-    a, b = (in_contact(kpa) for kpa in _pair(predicted, true, what))
+def _overlap(
+    predicted: np.ndarray, true: np.ndarray, what: str, measured: Measured
+) -> tuple[int, int]:
+    a, b = (in_contact(kpa) for kpa in _pair(predicted, true, what, measured))
     return _counted(a, b)
 
 

@@ -8,6 +8,7 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.metrics import tactile
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
 from services.evaluation.prediction import (
@@ -81,6 +82,20 @@ def test_touch_that_was_not_measured_counts_in_no_figure():
         assert figures[0][name] == figures[1][name]
     # This world feels as the truth does, so nothing is wrong with what was measured.
     assert figures[0]["contact_f1"] == 1.0
+    # An error counts as much however many taxels were measured.
+    rng, one_off = np.random.default_rng(0), rng_pressures()
+    for share in (1.0, 0.5, 0.25):
+        mask = rng.random(one_off.shape) < share
+        found = tactile.mse(predicted_kpa=one_off + 1, true_kpa=one_off, measured=mask)
+        assert found == pytest.approx(1.0)
+        assert tactile.psnr(
+            predicted_kpa=one_off + 1, true_kpa=one_off, measured=mask
+        ) == pytest.approx(20 * np.log10(40.0))
+    assert np.isnan(tactile.mae(predicted_kpa=one_off, true_kpa=one_off, measured=mask & False))
+
+
+def rng_pressures():
+    return np.random.default_rng(1).uniform(0, 20, (5, 2, 320))
 
 
 def test_figures_of_a_world_that_feels_and_does_not_see():
