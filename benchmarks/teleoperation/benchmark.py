@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -38,7 +39,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         urls = child.receive()
         names = [*RATES_HZ, NAIVE]
 
-        def once(name: str) -> tuple[Played, float]:
+        def once(name: str, round_index: int) -> tuple[Played, float]:
+            del round_index
             child.send({"cpu": True})
             before_s = child.receive()["cpu_s"]
             found = played(urls[name], performance)
@@ -47,7 +49,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
         with bar("plays", plan["rounds"] * len(names)) as step:
             results = interleaved(
-                {name: lambda _, name=name: once(name) for name in names},
+                {name: partial(once, name) for name in names},
                 plan["rounds"],
                 on_step=step,
             )
@@ -73,8 +75,10 @@ def _report(
             cpu_ms[name],
         ]
         rows.append((name, *cells(*figures)))
-    columns = ("method", "latency p50 ms", "p99 ms", "error deg", "speed rad/s")
-    columns += ("fingers overlap %", "longest silence ms", "CPU ms a sample")
+    columns = (
+        *("method", "latency p50 ms", "p99 ms", "error deg", "speed rad/s"),
+        *("fingers overlap %", "longest silence ms", "CPU ms a sample"),
+    )
     points = [
         Point.of(name, cpu_ms[name], errors[name].median, is_ours=name != NAIVE) for name in plays
     ]

@@ -1,4 +1,4 @@
-"""Service of teleoperation: samples of a tracked hand in, commands at a fixed rate out.
+"""Service that sends commands to robot hands, which follow tracked hands live.
 
 Each hand has one WebSocket, and one controller at a time (docs/teleoperation.md). Commands come
 from a loop of their own, whether samples come or not.
