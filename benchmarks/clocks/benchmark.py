@@ -6,7 +6,13 @@ from pathlib import Path
 
 from benchmarks.clocks.compare import STAMPLESS, compare
 from benchmarks.clocks.rivals import OFFLINE, ONLINE
-from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STAMPLESS_SCENES, STOP_SCENES
+from benchmarks.clocks.scenes import (
+    MORE_SCENES,
+    SCENES,
+    SLEW_SCENES,
+    STAMPLESS_SCENES,
+    STOP_SCENES,
+)
 from benchmarks.clocks.scores import WARM_UP_S
 from benchmarks.clocks.tables import panels, requirements, tables
 from benchmarks.report import StageReport
@@ -21,14 +27,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     AMOUNTS.add_options(parser, seconds="length of a take", rounds="takes per scene")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first round (%(default)s)")
-    names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES]).replace("%", "%%")
+    names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES, *SLEW_SCENES]).replace("%", "%%")
     parser.add_argument("--scenes", metavar="A,B", help=f"comma-separated scenes (all: {names})")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Run every method on every scene."""
     plan = AMOUNTS.of(options, seconds=MIN_SECONDS)
-    scenes = SCENES | MORE_SCENES | STOP_SCENES
+    scenes = SCENES | MORE_SCENES | STOP_SCENES | SLEW_SCENES
     if options.scenes is not None:
         scenes = named("scene", scenes | STAMPLESS_SCENES, options.scenes)
     seconds, seeds = plan["seconds"], range(options.seed, options.seed + plan["rounds"])

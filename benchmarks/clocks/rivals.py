@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from benchmarks.clocks.scenes import Scene, Take
-from dextouch.clocks import OnlineClock, fit_clock
+from dextouch.clocks import OnlineClock, corrected_stamps, fit_clock
 from dextouch.streams import ClockCapabilities, StreamDescriptor
 
 # Half-life of the forgetting regression.
@@ -42,9 +42,9 @@ def ours_online(take: Take) -> Int64[np.ndarray, " n"]:
 
 
 def ours_offline(take: Take) -> Int64[np.ndarray, " n"]:
-    """`fit_clock` on the whole take."""
-    fitted = fit_clock(take.t_device_ns, take.t_host_ns)
-    times_ns = fitted.to_host_ns(take.t_device_ns, take.t_host_ns)
+    """`corrected_stamps` and `fit_clock` on the whole take."""
+    stamps_ns = corrected_stamps(take.t_device_ns, take.t_host_ns)
+    times_ns = fit_clock(stamps_ns, take.t_host_ns).to_host_ns(stamps_ns, take.t_host_ns)
     return times_ns + half_tick_ns(take.scene)
 
 

@@ -15,6 +15,8 @@ BASE_DELAY_NS = 2_000_000
 WANDER_PERIOD_S = 120.0
 WRONG_S = 0.02
 LATE_PATH_S = 60.0
+# chrony slews 50 ms in so long: its highest rate is 83 333 ppm.
+SLEW_S = 0.6
 HOST_ORIGIN_NS = 1_700_000_000_000_000_000
 DEVICE_ORIGIN_NS = 987_654_321_000
 
@@ -36,6 +38,8 @@ class Scene:
         num_stops: number of stops, evenly spread.
         late_path_ms: additional path delay from the middle on, for a quarter of the take, a minute
             at most.
+        slew_ms: what NTP adds to the clock that stamps arrivals, within 0.6 s in the middle. Times
+            are wanted on this clock.
         wrong_stamps: share of timestamps that are wrong by +20 ms.
         tick_ns: resolution of the device's timestamps.
     """
@@ -52,6 +56,7 @@ class Scene:
     stop_ms: float = 0.0
     num_stops: int = 1
     late_path_ms: float = 0.0
+    slew_ms: float = 0.0
     wrong_stamps: float = 0.0
     tick_ns: int = 1
 
@@ -100,6 +105,11 @@ STOP_SCENES = {
     "path +20 ms for a minute": Scene(late_path_ms=20.0),
     "0.2 % of stamps +20 ms": Scene(wrong_stamps=0.002),
 }
+# Stations stamp with CLOCK_MONOTONIC_RAW, which no daemon slews; CLOCK_BOOTTIME is slewed.
+SLEW_SCENES = {
+    "NTP +50 ms: raw clock": Scene(),
+    "NTP +50 ms: boot clock": Scene(slew_ms=50.0),
+}
 # For streams without timestamps, whose only difficulty is the number of lost samples.
 STAMPLESS_SCENES = {
     "0 % lost": Scene(drops=0.0),
@@ -119,6 +129,11 @@ def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:
         parts = len(true_s) * np.arange(1, scene.num_stops + 1) // (scene.num_stops + 1)
         true_s += np.searchsorted(parts, np.arange(len(true_s)), "right") * scene.stop_ms * 1e-3
     arrival_s = _arrivals(scene, true_s, rng)
+    middle_s = true_s[len(true_s) // 2]
+    arrival_s, true_s = (
+        t_s + np.clip((t_s - middle_s) / SLEW_S, 0, 1) * scene.slew_ms * 1e-3
+        for t_s in (arrival_s, true_s)
+    )
     step_s = true_s[len(true_s) // 2] if scene.step_ms else np.inf
     device_s = device_s + (true_s >= step_s) * scene.step_ms * 1e-3
     if scene.wrong_stamps:

@@ -8,6 +8,7 @@ from pathlib import Path
 from benchmarks.report import StageReport
 from benchmarks.retargeting.compare import (
     Effort,
+    compare_axes,
     compare_pinches,
     compare_robot,
     compare_speed,
@@ -18,7 +19,7 @@ from benchmarks.retargeting.ours import OURS_EXACT, cold_start
 from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
 from benchmarks.retargeting.rivals import INSTALL, RIVALS, Rival, missing_modules
 from benchmarks.retargeting.robustness import try_faults
-from benchmarks.retargeting.tables import panels, requirements, tables
+from benchmarks.retargeting.tables import axes_tables, panels, requirements, tables
 from benchmarks.stages import Amounts, Bar, named
 from dextouch.errors import InvalidInputError
 
@@ -43,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Run every method on robot motions and on pinching people."""
+    """Run every method on robot motions, on pinching people and on those of other axes."""
     if options.seed < 0:
         raise InvalidInputError(f"--seed: got {options.seed}, expected at least 0")
     plan = AMOUNTS.of(options, samples=30)
@@ -54,13 +55,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         speeds = compare_speed(effort, rivals, bar)
         robot = compare_robot(robot_sets(effort), rivals, bar)
         pinches = compare_pinches(pinch_set(effort), rivals, bar)
+        axes = compare_axes(effort, rivals, bar)
         outcomes = try_faults(effort.seed, rivals, bar)
     cold = cold_start(effort.num_postures, effort.seed)
     return StageReport(
         stage="retargeting",
         packages=("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs"),
         options={**asdict(effort), "rivals": list(rivals)},
-        tables=tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
+        tables=[
+            *tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
+            *axes_tables(axes, list(rivals)),
+        ],
         panels=panels(speeds, robot, pinches),
         requirements=requirements(speeds, robot, pinches, cold),
         data={
@@ -70,6 +75,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 for name, scores in robot.items()
             },
             "pinches": {method: asdict(score) for method, score in pinches.items()},
+            "oblique_axes": {
+                f"{oblique_deg:g}": {method: asdict(score) for method, score in scores.items()}
+                for oblique_deg, scores in axes.items()
+            },
             "cold_start": cold._asdict(),
             "faults": [asdict(outcome) for outcome in outcomes],
         },

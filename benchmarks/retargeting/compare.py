@@ -16,9 +16,17 @@ from benchmarks.retargeting import ours
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, Timed
 from benchmarks.retargeting.pinches import PinchMotion, pinch_motions
 from benchmarks.retargeting.rival_process import RivalProcess
-from benchmarks.retargeting.scores import PinchScore, RobotScore, score_pinches, score_robot
+from benchmarks.retargeting.scores import (
+    BoneScore,
+    PinchScore,
+    RobotScore,
+    score_bones,
+    score_pinches,
+    score_robot,
+)
 from benchmarks.rounds import interleaved
 from benchmarks.simulated.hand_motions import Motion, robot_motion, with_noise
+from benchmarks.simulated.oblique_people import oblique_motion
 from benchmarks.stages import Bar
 from dextouch.errors import LimitExceededError
 from dextouch.hands.robot_hand import RobotHand
@@ -32,6 +40,8 @@ NATURAL_NOISE, FULL_NOISE = "natural, 1 mm noise", "full, 1 mm noise"
 ROBOT_INPUT, PINCH_INPUT = "robot motion", "human pinches"
 NOISE_M = 1e-3
 _NOISE_STREAM = 7
+# Degrees between axes of people and of the mean hand.
+OBLIQUE_DEG = (5.0, 10.0, 15.0)
 
 
 @dataclass(frozen=True)
@@ -115,6 +125,26 @@ def compare_pinches(
             with suppress(LimitExceededError):
                 answers = [_answer(name, motion, rivals) for motion in motions]
                 scores[name] = score_pinches(motions, answers)
+    return scores
+
+
+def compare_axes(effort: Effort, rivals: Rivals, bar: Bar) -> dict[float, dict[str, BoneScore]]:
+    """Every method on gestures of people with other axes than the robot's: degrees → method."""
+    names = [OURS, *rivals]
+    scores: dict[float, dict[str, BoneScore]] = {}
+    with bar("oblique axes", len(names) * len(OBLIQUE_DEG)) as step:
+        for oblique_deg in OBLIQUE_DEG:
+            motions: list[Motion] = [
+                oblique_motion(side, oblique_deg, effort.num_samples, effort.seed + index)
+                for side in SIDES
+                for index in range(effort.num_people)
+            ]
+            scores[oblique_deg] = {}
+            for name in names:
+                step(f"{oblique_deg:g} degrees, {name}")
+                with suppress(LimitExceededError):
+                    answers = [_answer(name, motion, rivals) for motion in motions]
+                    scores[oblique_deg][name] = score_bones(motions, answers)
     return scores
 
 

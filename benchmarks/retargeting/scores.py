@@ -5,11 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from benchmarks.retargeting.pinches import PinchMotion
 from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.hands import CHAINS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
+from dextouch.tactile.layout import Side
 
 # Other libraries return float32, which may exceed a limit by rounding.
 LIMIT_TOLERANCE_RAD = 1e-6
@@ -47,6 +50,54 @@ class PinchScore:
     max_step_deg: float
     num_outside: int
     num_pinched: int
+
+
+@dataclass(frozen=True)
+class BoneScore:
+    """Angles between bones of people and of the robot, pooled over motions, mean and p95."""
+
+    thumb_mean_deg: float
+    thumb_p95_deg: float
+    fingers_mean_deg: float
+    fingers_p95_deg: float
+
+
+def bone_angles_deg(
+    keypoints_m: np.ndarray, side: Side, joints_rad: np.ndarray
+) -> Float64[np.ndarray, "time 5 3"]:
+    """Angle between each bone of tracked keypoints [T, 25, 3] and the robot's at angles [T, 20]."""
+    points_m = np.asarray(keypoints_m)[:, [solver_indices(chain) for chain in CHAINS]]
+    tracked, robot = (
+        bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+        for bones in (
+            np.diff(points_m, axis=2),
+            np.diff(RobotHand(side).chain_points_m(joints_rad), axis=2),
+        )
+    )
+    cosines = np.clip((tracked * robot).sum(axis=-1), -1.0, 1.0)
+    return np.asarray(np.rad2deg(np.arccos(cosines)))
+
+
+def score_bones(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> BoneScore:
+    """Score the directions of bones of the answers [T, 20].
+
+    Raises:
+        InvalidInputError: no motion, or answers of another length.
+        NonFiniteError: an answer holds NaN or infinity.
+    """
+    _check(motions, answers)
+    angles_deg = np.concatenate(
+        [
+            bone_angles_deg(motion.keypoints_m, motion.side, answer)
+            for motion, answer in zip(motions, answers, strict=True)
+        ]
+    )
+    parts = angles_deg[:, 0], angles_deg[:, 1:]
+    return BoneScore(*(float(of(part)) for part in parts for of in (np.mean, _p95)))
+
+
+def _p95(values: np.ndarray) -> float:
+    return float(np.percentile(values, 95))
 
 
 def score_robot(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> RobotScore:

@@ -21,7 +21,7 @@ from benchmarks.retargeting.compare import (
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from benchmarks.retargeting.robustness import HAND_LOST, NODE_LOST, NODES_LOST, Outcome
-from benchmarks.retargeting.scores import PinchScore, RobotScore
+from benchmarks.retargeting.scores import BoneScore, PinchScore, RobotScore
 from benchmarks.simulated.hand_motions import RATE_HZ
 from services.alignment.retargeting import RetargetOptions
 
@@ -73,6 +73,22 @@ def tables(
                 for method in dict.fromkeys(one.method for one in outcomes)
             ],
         ),
+    ]
+
+
+def axes_tables(
+    axes: Mapping[float, Mapping[str, BoneScore]], rivals: Sequence[str]
+) -> list[ResultTable]:
+    """Tables of people with other axes than the robot's."""
+    return [
+        ResultTable(
+            f"People whose axes are {oblique_deg:g} degrees off: angles between their bones and "
+            "the robot's (deg)",
+            ("method", "thumb", "p95", "fingers", "p95"),
+            [(method, *cells(*astuple(score))) for method, score in scores.items()]
+            + _unfinished(rivals, scores, 5),
+        )
+        for oblique_deg, scores in axes.items()
     ]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.stress.cells import Check, StageCells
-from dextouch.clocks import OnlineClock, TickCounter, count_lost_samples, fit_clock, unwrap_counter
+from dextouch.clocks import OnlineClock, count_lost_samples, fit_clock, unwrap_counter
 from dextouch.errors import ClockFitError, ShapeError
 from dextouch.streams import ClockCapabilities, StreamDescriptor
 
@@ -15,7 +15,7 @@ _PAUSES = (0.3, 0.5, 0.9, 1.0, 1.5, 3.7, 1000.25)
 
 @STAGE.cell("clock", "16- and 32-bit counters silent for 0.3 … 1000 wraps; a clock that is stepped")
 def _clock(check: Check) -> None:
-    worst = {"tick counter": 0, "stamps offline": 0, "stamps online": 0}
+    worst = {"stamps offline": 0, "stamps online": 0}
     for bits, tick_ns in ((16, 1_000), (32, 1_000)):
         turn_ns = 2**bits * tick_ns
         for share in _PAUSES:
@@ -24,14 +24,11 @@ def _clock(check: Check) -> None:
             device_ns -= device_ns % tick_ns
             host_ns = device_ns + 5_000_000 + 300_000 * (np.arange(40) % 3)
             counts = device_ns // tick_ns % 2**bits
-            counter = TickCounter(bits, 10**9 // tick_ns)
-            ticked = [counter.to_ns(int(c), int(t)) for c, t in zip(counts, host_ns, strict=True)]
-            worst["tick counter"] = max(worst["tick counter"], _off(np.array(ticked), device_ns))
             straight = unwrap_counter(counts, modulus=2**bits, hint=host_ns // tick_ns) * tick_ns
             worst["stamps offline"] = max(worst["stamps offline"], _off(straight, device_ns))
             late = _live(counts * tick_ns, host_ns, _descriptor(bits, tick_ns)) - device_ns
             worst["stamps online"] = max(worst["stamps online"], _off(late, late * 0 + 5_000_000))
-    for what, bound in (("tick counter", 0), ("stamps offline", 0), ("stamps online", 700_000)):
+    for what, bound in (("stamps offline", 0), ("stamps online", 700_000)):
         check.at_most(f"{what} off after a pause", worst[what], bound, "ns")
     num_lost = count_lost_samples(np.array([65534, 65535, 0, 3]), bits=16)
     check.true("a wrap of numbers is no loss, 2 lost after it", num_lost == 2)
@@ -59,7 +56,6 @@ def _non_finite(check: Check) -> None:
     check.refused("NaN stamps", fit_clock, broken, host, kind=ClockFitError)
     check.refused("NaN counts", unwrap_counter, broken, kind=ShapeError, modulus=2**32)
     check.refused("count past the modulus", unwrap_counter, np.array([70_000]), modulus=2**16)
-    check.refused("count past the counter", TickCounter(16, 1000).to_ns, 65_536, 0)
     check.refused("arrivals go back", fit_clock, device, host[::-1], kind=ClockFitError)
     check.refused("a clock that stands", fit_clock, device * 0, host, kind=ClockFitError)
     clock = OnlineClock(None)

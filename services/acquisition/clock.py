@@ -12,33 +12,42 @@ MIN_NOTICED_NS = 100_000_000
 class StationClock:
     """Monotonic clock of the station's host, in nanoseconds.
 
-    It continues while the host is suspended, unlike `time.monotonic_ns`, and cannot be set.
+    It runs at the rate of the host's crystal: CLOCK_MONOTONIC and CLOCK_BOOTTIME follow NTP, which
+    changes their rate by up to 8 % (chrony's `maxslewrate`), CLOCK_MONOTONIC_RAW does not
+    (clock_gettime(2)). That one stands while the host is suspended; the time in suspend, which
+    CLOCK_BOOTTIME has beyond CLOCK_MONOTONIC, is added, so that this clock continues.
     """
 
     def __init__(self) -> None:
-        self._suspended_before_ns = _suspended_ns()
+        self._sleep_lock = threading.Lock()
+        self._asleep_ns = self._boot_over_monotonic_ns()
+
+    def read_ns(self, clock_id: int) -> int:
+        """Time of one of the operating system's clocks, such as `time.CLOCK_BOOTTIME`."""
+        return time.clock_gettime_ns(clock_id)
 
     def now_ns(self) -> int:
-        """Nanoseconds since the origin of `time.monotonic_ns`, including time in suspend."""
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._suspended_before_ns
+        """Nanoseconds since the boot of the host, including time in suspend."""
+        return self.read_ns(time.CLOCK_MONOTONIC_RAW) + self.suspended_ns()
 
     def waiter(self, *, drives_time: bool = False) -> "Waiter":
         """A new waiter. `drives_time` only matters to a virtual clock."""
         return Waiter(self)
 
     def suspended_ns(self) -> int:
-        """How long the host has slept since the clock was made."""
-        return _suspended_ns() - self._suspended_before_ns
+        """How long the host has slept since its boot."""
+        with self._sleep_lock:
+            # Both clocks are slewed alike. Time passes between reading the two, which can only
+            # reduce the difference: the largest one is right, and `now_ns` never goes back.
+            self._asleep_ns = max(self._asleep_ns, self._boot_over_monotonic_ns())
+            return self._asleep_ns
 
     def wall_offset_ns(self) -> int:
         """Wall clock minus the time since boot; a jump means that the wall clock was set."""
-        return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        return self.read_ns(time.CLOCK_REALTIME) - self.read_ns(time.CLOCK_BOOTTIME)
 
-
-def _suspended_ns() -> int:
-    """How long this host has slept since it was booted; less than a millisecond is noise."""
-    asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
-    return asleep_ns if asleep_ns >= 1_000_000 else 0
+    def _boot_over_monotonic_ns(self) -> int:
+        return self.read_ns(time.CLOCK_BOOTTIME) - self.read_ns(time.CLOCK_MONOTONIC)
 
 
 class Waiter:
@@ -74,8 +83,13 @@ class VirtualClock(StationClock):
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
+        super().__init__()
         self.lock = threading.Lock()
         self.open_waiters: set[_VirtualWaiter] = set()
+
+    def read_ns(self, clock_id: int) -> int:
+        """The virtual time: all clocks of a simulated host agree."""
+        return self._now_ns
 
     def now_ns(self) -> int:
         """The virtual time."""

@@ -67,6 +67,9 @@ class _StreamPath:
 
     def follow(self) -> None:
         """Estimate the times of the samples since the last call."""
+        if self._queue:
+            # Samples of uncertain time show no delay.
+            self._newest = None
         for _ in range(len(self._queue)):
             t_host_ns, t_device_ns = self._queue.popleft()
             try:
@@ -75,7 +78,8 @@ class _StreamPath:
                 # The device left its stamp out; health says so.
                 self._restart()
                 continue
-            self._newest = (t_device_ns, estimate_ns)
+            if self._clock.uncertainty_ns == 0.0:
+                self._newest = (t_device_ns, estimate_ns)
             self._num_samples += 1
             if self._clock.num_steps > self._num_steps:
                 self._num_steps, self._num_samples = self._clock.num_steps, 0

@@ -295,9 +295,9 @@ def _doubts(report: AlignmentReport) -> list[str]:
     for clock in report.clocks:
         whys = {
             "skew": f"its clock is skewed by {_number(clock.skew_ppm, 0)} ppm",
-            "residual": "even the earliest samples arrive later than fitted by more than a "
-            f"sample period ({_number(clock.residual_rms_ms, 1)} ms RMS of all)",
-            "stop": "the device clock stopped or the path delay increased",
+            "residual": "even the earliest samples of five seconds arrive later than fitted "
+            f"({_number(clock.residual_rms_ms, 1)} ms RMS of all)",
+            "stop": "the device clock stopped or was slewed, or the path delay increased",
         }
         if clock.warnings:
             reasons = " and ".join(whys[warning] for warning in clock.warnings)

@@ -1,4 +1,4 @@
-"""A real tracked hand of `../shared/data`, in wrist axes, and how far a robot's bones point off."""
+"""A real tracked hand of `../shared/data`, in wrist axes."""
 
 from pathlib import Path
 
@@ -11,9 +11,7 @@ from dextouch.hands import (
     FINGER_METACARPALS,
     WRIST,
     node_order,
-    solver_indices,
 )
-from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import THUMB_JOINTS
 from services.alignment.retargeting.wrist_frame import to_wrist_axes, wrist_frame
 
@@ -33,16 +31,3 @@ def recorded_keypoints_m():
     order = node_order(nodes, may_lack=FINGER_METACARPALS)
     keypoints = order.keypoints(np.load(RECORDING, allow_pickle=False))
     return to_wrist_axes(keypoints, wrist_frame(keypoints, "right").T_tracker_wrist)
-
-
-def bone_angles_deg(keypoints_m, joints_rad):
-    """[T, 5, 3]: angle between each tracked bone and the robot's, by forward kinematics."""
-    tracked = np.stack([keypoints_m[:, solver_indices(chain)] for chain in CHAINS], axis=1)
-    ours, theirs = (
-        bones / np.linalg.norm(bones, axis=-1, keepdims=True)
-        for bones in (
-            np.diff(RobotHand("right").chain_points_m(joints_rad), axis=2),
-            np.diff(tracked, axis=2),
-        )
-    )
-    return np.rad2deg(np.arccos(np.clip((ours * theirs).sum(axis=-1), -1.0, 1.0)))

@@ -121,7 +121,7 @@ def test_real_photos_agree_with_themselves(capsys):
         )
     assert len(whole.used_images) == 13
     assert whole.rms_px <= 0.20
-    assert whole.rms_by_photo_px.shape == (13,)
+    assert whole.rms_by_place_px.shape == (13,)
     assert sigmas.max() <= 5
 
 

@@ -98,4 +98,4 @@ def test_masks_beat_silence_with_every_seed(tmp_path):
 
 
 def figure(result, metric):
-    return result["figures"]["all"][metric]
+    return result["rollouts"]["all"]["model"][metric]

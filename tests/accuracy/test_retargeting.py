@@ -6,6 +6,9 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.retargeting.pinches import pinch_motions
+from benchmarks.retargeting.scores import score_pinches
+from benchmarks.simulated.hand_motions import with_noise
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
@@ -125,3 +128,32 @@ def test_human_hand_keeps_its_angles(side, capsys):
     assert (result.joints_rad >= robot.lower_rad).all()
     assert (result.joints_rad <= robot.upper_rad).all()
     assert angle_deg.mean() <= 5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("noise_m", "gap_mm"), [(0.0, 0.6), (1e-3, 2.0)])
+@pytest.mark.parametrize("is_live", [False, True])
+def test_pinches_close(noise_m, gap_mm, is_live, capsys):
+    """Gap of the robot's tips where a person's are within 3 mm; with noise 2.3 mm unsmoothed."""
+    rng = np.random.default_rng(5)
+    people = [with_noise(one, noise_m, rng) for one in pinch_motions("right", 0)]
+    answers = []
+    for one in people:
+        retargeter = HandRetargeter("right")
+        if is_live:
+            steps = [retargeter.step(sample).joints_rad for sample in one.keypoints_m]
+            answers.append(np.concatenate(steps))
+        else:
+            answers.append(retargeter.retarget(one.keypoints_m).joints_rad)
+    score = score_pinches(people, answers)
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\npinches, {'live' if is_live else 'batch'}, {noise_m * 1e3:g} mm of noise: gap mean "
+            f"{score.gap_mean_mm:.2f} mm, bound {gap_mm} | off the person's joints "
+            f"{score.same_angle_deg:.2f} deg, bound 3 | step {score.max_step_deg:.2f} deg"
+        )
+    assert score.gap_mean_mm <= gap_mm
+    assert score.same_angle_deg <= 3
+    assert score.num_outside == 0
+    # 9.6 rad/s at 60 Hz.
+    assert score.max_step_deg <= np.rad2deg(0.16) + 1e-6

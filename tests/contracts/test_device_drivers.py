@@ -113,7 +113,7 @@ def robot_streams():
 
 
 class CameraSubject(Subject):
-    """A camera on the station: its images are stamped with the station's own clock."""
+    """A camera on the station: its images are stamped with a clock of its host."""
 
     def __init__(self, pair, clock):
         super().__init__(pair.driver, pair.device.port, pair.device.source, None)
@@ -124,7 +124,9 @@ class CameraSubject(Subject):
         """The next image, when it is due."""
         sequence, self.next_sequence = self.next_sequence, self.next_sequence + 1
         due_ns = self.start_ns + sequence * self.driver.descriptors[0].period_ns()
-        self.clock.suspend(due_ns - self.clock.now_ns())
+        with self.clock.lock:
+            self.clock._now_ns = due_ns
+            self.clock.advance()
         return self.source.units(sequence % len(self.source.t_ns), sequence, due_ns)
 
 

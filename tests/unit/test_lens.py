@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.geometry import box_pixels, lens_pixels, points_on_level, project, undistorted
+from dextouch.geometry import box_pixels, points_on_level, project, undistorted
 
 K = np.array([[560.0, 0.0, 322.0], [0.0, 555.0, 238.0], [0.0, 0.0, 1.0]])
 STRAIGHT = np.zeros(5)
@@ -66,11 +66,11 @@ def test_rays_are_those_of_opencvs_undistorted_points(distortion):
 def test_points_are_seen_where_opencv_sees_them():
     points = np.random.default_rng(0).uniform([-0.3, -0.2, 0.5], [0.3, 0.2, 1.5], size=(50, 3))
     for distortion in LENSES:
-        pixels, in_front = lens_pixels(K, distortion, points)
+        pixels, in_front = project(K, points, distortion)
         assert in_front.all()
         expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)
         np.testing.assert_allclose(pixels, expected.reshape(-1, 2), atol=1e-9)
-    np.testing.assert_allclose(lens_pixels(K, STRAIGHT, points)[0], project(K, points)[0])
+    np.testing.assert_allclose(project(K, points, STRAIGHT)[0], project(K, points)[0])
 
 
 def test_rays_that_miss_the_plane_have_no_point():

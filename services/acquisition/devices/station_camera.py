@@ -1,14 +1,17 @@
 """Driver of a camera on the station itself, whose images are stamped, checked and encoded here.
 
-Stamps of the driver are on this host's monotonic clock; an image carries the middle of its
-exposure. A camera whose stamps are on another clock gives arrival stamps only, and says so.
+Stamps of the driver are on CLOCK_MONOTONIC and converted to the clock of the station; an image
+carries the middle of its exposure. A camera whose stamps are on another clock gives arrival stamps
+only, and says so.
 """
 
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -339,6 +342,8 @@ class DriverStamps(Decoder):
     def accept(self, t_driver_ns: int | None, t_host_ns: int) -> tuple[int, int] | None:
         """Stamp and number of an image; without a usable clock the values for "none".
 
+        Both times are on CLOCK_MONOTONIC.
+
         Returns:
             None if the image must be dropped: repeated, or with a stamp that cannot be.
 
@@ -410,6 +415,8 @@ class StationCamera(Driver):
         max_encode_wait_s: float | None = None,
     ) -> None:
         self._stamps = DriverStamps(settings)
+        # CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the last image but one and at the last.
+        self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
         encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
@@ -463,6 +470,8 @@ class StationCamera(Driver):
         """
         if self._link.wait(READ_TIMEOUT_S):
             t_host_ns = self._clock.now_ns()
+            pair = [self._clock.read_ns(which) for which in (CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW)]
+            self._clock_pairs.append((pair[0], pair[1]))
             self._heard_ns = t_host_ns
             self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._settings.period_ns)
             self._take(self._link.retrieve(), t_host_ns)
@@ -487,15 +496,25 @@ class StationCamera(Driver):
                 f"{self.name}: sends images {image.shape}, expected {expected}; plug it in again"
             )
         statistics.packets += 1
-        stamp = self._stamps.accept(captured.t_driver_ns, t_host_ns)
+        stamp = self._stamps.accept(captured.t_driver_ns, self._clock_pairs[-1][0])
         if stamp is None:
             return
         t_driver_ns, number = stamp
         has_time = t_driver_ns != NO_DEVICE_TIME
         self._checker.check(image, t_driver_ns if has_time else None)
-        t_device_ns = self._middle_of_exposure_ns(t_driver_ns) if has_time else NO_DEVICE_TIME
+        t_device_ns = NO_DEVICE_TIME
+        if has_time:
+            t_device_ns = self._middle_of_exposure_ns(self._on_station_clock(t_driver_ns))
         if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
+
+    def _on_station_clock(self, t_driver_ns: int) -> int:
+        """A stamp on CLOCK_MONOTONIC, whose rate NTP changes, on the station's clock."""
+        # A stamp lies between the readings at its image and at the one before.
+        since_ns = [monotonic_ns - t_driver_ns for monotonic_ns, _ in self._clock_pairs]
+        ahead_ns = [raw_ns - monotonic_ns for monotonic_ns, raw_ns in self._clock_pairs]
+        rest_ns = np.interp(0, since_ns, [ahead - ahead_ns[-1] for ahead in ahead_ns])
+        return t_driver_ns + ahead_ns[-1] + round(float(rest_ns)) + self._clock.suspended_ns()
 
     def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
         half_ns = (self._exposure_ns or 0) // 2

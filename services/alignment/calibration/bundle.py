@@ -14,7 +14,7 @@ covariance.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform
 from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
+from services.alignment.calibration.places import excess_over_time
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30
@@ -129,37 +130,42 @@ def weighted_bundle(
     own: dict[str, Component],
     *,
     scale_sigma: float = 0.0,
-    corners: Callable[[float], Measurement] | None = None,
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
     The second series has the sources of noise `own`, and a scale of one within `scale_sigma` (one
-    sigma; exactly one if 0). With `corners`, the measurement of a board's corners by the noise of
-    their pixels, those are weighted instead of its poses.
+    sigma; exactly one if 0). Its covariance holds for errors as large as those along changes from
+    place to place, where these are larger than at random.
+
+    Raises:
+        InvalidInputError: mount, target or clock changed along the views, or the steps do not
+            become small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
-    tracker_sigma = tracker.tracker_rotation_rad, tracker.tracker_translation_m
-    components = sensor_components("tracker", C, tracker_sigma) | own
+    declared = tracker.tracker_rotation_rad, tracker.tracker_translation_m
+    components = sensor_components("tracker", C, declared) | own
     left_over = twist(invert(series.Ts_mounted_target) @ Ts)
     free = free_unknowns(is_mount_known=agreed.is_mount_known, is_scale_known=scale_sigma == 0)
     found = estimate_sigmas(left_over, J[:, :, free], list(components.values()))
     sigmas = dict(zip(components, found.tolist(), strict=True))
-    if corners is None:
-        shares = [sigmas[name] ** 2 * own[name].shapes for name in own]
-        information = np.linalg.inv(np.sum(shares, axis=0))
-        measurement = pose_measurement(series.Ts_mounted_target, information)
-    else:
-        measurement = corners(sigmas["pixel_px"])
+    shares = [sigmas[name] ** 2 * own[name].shapes for name in own]
     bundle = solve_bundle(
         series.Ts_world_body,
-        measurement,
+        pose_measurement(series.Ts_mounted_target, np.linalg.inv(np.sum(shares, axis=0))),
         (sigmas["tracker_rotation_rad"], sigmas["tracker_translation_m"]),
         (agreed.X, agreed.Z),
         is_mount_known=agreed.is_mount_known,
         scale_sigma=scale_sigma,
     )
-    return bundle, sigmas
+    all_shares = [sigmas[name] ** 2 * component.shapes for name, component in components.items()]
+    whiten = np.linalg.inv(np.linalg.cholesky(np.sum(all_shares, axis=0)))
+    Ts = agreed._replace(X=bundle.X, Z=bundle.Z).predicted
+    J, C = predicted_jacobians(Ts, bundle.X @ Ts, bundle.scale)
+    Ts[:, :3, 3] /= bundle.scale
+    left_over = (whiten @ twist(invert(series.Ts_mounted_target) @ Ts)[..., None])[..., 0]
+    excess = excess_over_time(series, left_over, whiten @ J, whiten @ C, free, declared)
+    return replace(bundle, covariance=excess * bundle.covariance), sigmas
 
 
 def sensor_components(

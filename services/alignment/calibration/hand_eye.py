@@ -40,6 +40,7 @@ from services.alignment.calibration.motion import (
     view_errors,
     wrong_scale,
 )
+from services.alignment.calibration.places import mean_series, place_labels
 
 TASK = "hand-eye"
 BASE_TASK = "robot base"
@@ -187,19 +188,18 @@ def solve_hand_eye(
     series = Series(TASK, "tracker", tracker, board, names)
     agreed = agreeing_views(series)
     if views is None:
-        own = board_components(agreed.predicted, noise)
-        bundle, sigmas = weighted_bundle(agreed, noise, own, scale_sigma=noise.board_scale)
+        placed = agreed._replace(series=mean_series(agreed.series, place_labels(agreed.series)))
+        own = board_components(placed.predicted, noise)
     else:
-        corners = views.only(agreed.views).measurement
-        one_pixel = corners(1.0)
+        one_pixel = views.only(agreed.views).measurement(1.0)
         polished = polish(one_pixel, agreed.series.Ts_mounted_target)
         agreed = agreed._replace(series=agreed.series._replace(Ts_mounted_target=polished))
-        own = {
-            "pixel_px": Component(noise.pixel_px, np.linalg.inv(one_pixel(polished).information))
-        }
-        bundle, sigmas = weighted_bundle(
-            agreed, noise, own, scale_sigma=noise.board_scale, corners=corners
-        )
+        labels = place_labels(agreed.series)
+        placed = agreed._replace(series=mean_series(agreed.series, labels))
+        information = np.zeros((labels.max() + 1, 6, 6))
+        np.add.at(information, labels, one_pixel(polished).information)
+        own = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
+    bundle, sigmas = weighted_bundle(placed, noise, own, scale_sigma=noise.board_scale)
     _check_scale(bundle, noise.board_scale, names)
     result = HandEyeResult(
         covariance=bundle.covariance[:6, :6],
@@ -338,6 +338,7 @@ def solve_robot_base(
         (given,) = checked_poses(f"{BASE_TASK}, T_effector_tracker", T_effector_tracker=repeated)
         mount = invert(given[0])
     agreed = agreeing_views(series, mount)
+    agreed = agreed._replace(series=mean_series(agreed.series, place_labels(agreed.series)))
     # The robot errs in the effector's axes.
     own = sensor_components("robot", adjoint(invert(agreed.predicted)), ROBOT_SIGMA)
     bundle, sigmas = weighted_bundle(agreed, TrackerNoise(), own)

@@ -6,14 +6,17 @@ squares do show it, those across the motion more than those along it.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
-from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.motion import DegenerateMotionError
+
+if TYPE_CHECKING:
+    from services.alignment.calibration.lens_fit import LensFit
 
 MIN_CORNERS = 8
 DICTIONARIES = ("DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_36h11")
@@ -32,6 +35,19 @@ MAX_CORNER_SHIFT = 0.4
 # which move the focal length by more than its reported sigma: 0.5 % by one corner of 25 views.
 MAX_RESIDUAL_RATIO, MIN_WRONG_PX = 3.0, 0.2
 MAX_SHARE_LEFT_OUT = 0.2
+# Photos whose corners differ by less than this share of the diagonal (RMS; 7 px of 1280 by 720)
+# show one place: blur, light and the detector's errors are common to them. Their mean is exact to
+# 0.02 px.
+MAX_SAME_PLACE = 0.005
+# A lens is none of the model's where structure over the image is more than noise, with this
+# probability of a mistake, and this large (px RMS). What is smaller is part of the sigmas.
+MAX_CHANCE = 1e-6
+MIN_MISFIT_SHARE, MIN_MISFIT_PX = 0.5, 0.3
+# Change of the focal length along the photos; a smaller one is part of the sigmas. That of 13
+# photos of a real camera is 0.1 %.
+MAX_FOCAL_DRIFT = 0.01
+# The fisheye model is named where it leaves less than this of the residual.
+FISHEYE_SHARE = 0.7
 # Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
 # 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1; on photos of a
 # real camera of 640 by 480 px 2.0 to 3.1.
@@ -42,6 +58,10 @@ USUAL_DIAGONAL_PX = 1469.0
 REACH = 0.12
 MIN_REACH_PX = 2.0
 STEP_PX = 0.5
+
+
+class LensModelError(InvalidInputError):
+    """The camera is none that the model describes, or changed while it was photographed."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +107,12 @@ class CameraCalibration:
 
     Attributes:
         sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
-            is. `rms_px` does not: it is as small for 8 views as for 40.
+            is. `rms_px` does not: it is as small for 8 views as for 40. Photos of one place count
+            once, and errors that follow the place in the image or time count as they are.
         rms_px: of the residuals between corners and model, both axes together.
-        rms_by_photo_px: the same by photo; a much larger one means that the photo is blurred or the
-            board was bent.
+        rms_by_place_px: the same by place of the board; a much larger one means that its photo is
+            blurred.
+        board_bend_m: height of the board's bend, which is estimated where the corners show it.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
         used_images: indices of the photos on which the board was found and fits the others.
     """
@@ -100,7 +122,8 @@ class CameraCalibration:
     sigma_fxfycxcy_px: Float64[np.ndarray, "4"]
     sigma_distortion: Float64[np.ndarray, "5"]
     rms_px: float
-    rms_by_photo_px: Float64[np.ndarray, " n"]
+    rms_by_place_px: Float64[np.ndarray, " n"]
+    board_bend_m: float
     coverage: float
     used_images: tuple[int, ...]
 
@@ -170,27 +193,39 @@ def calibrate_camera(
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
     """`calibrate_camera` for corners that were detected before.
 
-    Views that do not fit the others are left out, at most a fifth of all.
+    Photos of one place count once. Places that do not fit the others are left out, at most a fifth.
 
     Raises:
         InvalidInputError: the board is found in too few photos.
         DegenerateMotionError: the views do not show the focal length; tilt the board.
+        LensModelError: the lens is none of the model's, such as a fisheye, or it changed.
     """
     if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
             f"photos: the board is found in {len(found.photos)} of {found.num_photos}, expected at "
             f"least {MIN_VIEWS}; check the board's size and kind, light and sharpness"
         )
-    result, spread_rad = _solved(found)
-    max_left_out = int(MAX_SHARE_LEFT_OUT * len(found.photos))
-    while len(result.used_images) > max(len(found.photos) - max_left_out, MIN_VIEWS):
-        by_photo_px = result.rms_by_photo_px
-        worst = int(np.argmax(by_photo_px))
-        limit_px = max(MAX_RESIDUAL_RATIO * float(np.median(by_photo_px)), MIN_WRONG_PX)
-        if by_photo_px[worst] <= limit_px:
+    places = _places(found)
+    if len(places) < MIN_VIEWS:
+        raise DegenerateMotionError(
+            f"intrinsics: {len(found.photos)} photos show the board in {len(places)} places, "
+            f"expected at least {MIN_VIEWS}: take photos with the board tilted by 20 to 45 degrees "
+            "about both its axes",
+            num_places=len(places),
+        )
+    max_left_out = int(MAX_SHARE_LEFT_OUT * len(places))
+    min_places = max(len(places) - max_left_out, MIN_VIEWS)
+    fit = _fitted(places, found.image_size_px)
+    while len(places) > min_places:
+        worst = int(np.argmax(fit.rms_by_photo_px))
+        limit_px = max(MAX_RESIDUAL_RATIO * float(np.median(fit.rms_by_photo_px)), MIN_WRONG_PX)
+        if fit.rms_by_photo_px[worst] <= limit_px:
             break
-        used = [at for at, photo in enumerate(found.photos) if photo in result.used_images]
-        result, spread_rad = _solved(_selected(found, used[:worst] + used[worst + 1 :]))
+        del places[worst]
+        fit = _fitted(places, found.image_size_px)
+    _check_lens(fit, places, found.image_size_px)
+    result = _calibration(fit, places, found.image_size_px)
+    spread_rad = float(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1)).max())
     relative = result.focal_sigma
     if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
         raise DegenerateMotionError(
@@ -204,36 +239,98 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
     return result
 
 
-def _selected(found: FoundBoards, places: Sequence[int]) -> FoundBoards:
-    """Some of the photos, by their places in `found`."""
-    points = tuple(found.points_board[at] for at in places)
-    pixels = tuple(found.pixels_px[at] for at in places)
-    photos = tuple(found.photos[at] for at in places)
-    return replace(found, points_board=points, pixels_px=pixels, photos=photos)
+class _Place(NamedTuple):
+    """Corners of the board in one place: the first photo's, averaged over photos of the same."""
+
+    points_board: np.ndarray
+    pixels_px: np.ndarray
+    photos: tuple[int, ...]
 
 
-def _solved(found: FoundBoards) -> tuple[CameraCalibration, float]:
-    """Least squares, and the largest angle between two directions of the board (rad)."""
-    import cv2
+def _places(found: FoundBoards) -> list[_Place]:
+    """Photos by place: each belongs to the first before it that shows common corners nearby."""
+    limit_px = MAX_SAME_PLACE * float(np.hypot(*found.image_size_px))
+    groups: list[list[int]] = []
+    for index in range(len(found.photos)):
+        for group in groups:
+            if _apart_px(found, group[0], index) < limit_px:
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    places = []
+    for group in groups:
+        points = found.points_board[group[0]]
+        same = [index for index in group if np.array_equal(found.points_board[index], points)]
+        mean = np.mean([found.pixels_px[index] for index in same], axis=0)
+        places.append(_Place(points, mean, tuple(found.photos[index] for index in group)))
+    return places
 
-    rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
-        list(found.points_board), list(found.pixels_px), found.image_size_px, np.eye(3), np.zeros(5)
-    )
-    sigma, K = np.asarray(sigma, dtype=np.float64).ravel(), np.asarray(K, dtype=np.float64)
-    normals = rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3))[:, :, 2]
-    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
-    cells = np.concatenate(found.pixels_px) / np.array(found.image_size_px) * 4
-    result = CameraCalibration(
-        K=K,
-        distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
+
+def _apart_px(found: FoundBoards, first: int, second: int) -> float:
+    """Distance between the corners that both photos show, RMS; infinite where these are few."""
+    is_same = (found.points_board[first][:, None] == found.points_board[second]).all(axis=-1)
+    rows, columns = np.nonzero(is_same)
+    if len(rows) < MIN_CORNERS:
+        return float("inf")
+    apart_px = found.pixels_px[first][rows] - found.pixels_px[second][columns]
+    return float(np.sqrt(np.square(apart_px).sum(axis=1).mean()))
+
+
+def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
+    # Here, since commands that measure nothing import this module on stations without OpenCV.
+    from services.alignment.calibration.lens_fit import fit_lens
+
+    points, pixels, _ = zip(*places, strict=True)
+    return fit_lens(points, pixels, size_px)
+
+
+def _check_lens(fit: "LensFit", places: list[_Place], size_px: tuple[int, int]) -> None:
+    """Refuse lenses that the model does not describe, and those that changed."""
+    from services.alignment.calibration.lens_fit import fisheye_rms_px
+
+    image = fit.image.p_value < MAX_CHANCE and fit.image_share > MIN_MISFIT_SHARE
+    if image and fit.misfit_px > MIN_MISFIT_PX:
+        points, pixels, _ = zip(*places, strict=True)
+        fisheye_px = fisheye_rms_px(points, pixels, size_px)
+        reason = (
+            f"an equidistant (fisheye) lens fits with {fisheye_px:.2f} px RMS, the pinhole model "
+            f"with {fit.rms_px:.2f} px; use a lens of less than 100 degrees, or undistort the "
+            "images to a pinhole camera with cv2.fisheye before recording"
+            if fisheye_px < FISHEYE_SHARE * fit.rms_px
+            else f"residuals follow the place in the image by {fit.misfit_px:.2f} px of "
+            f"{fit.rms_px:.2f} px RMS; check that the photos are whole images of one camera, "
+            "without stabilisation and with one size of the board"
+        )
+        raise LensModelError(
+            f"intrinsics: the camera is no pinhole with distortion k1 k2 p1 p2 k3: {reason}",
+            rms_px=fit.rms_px,
+            fisheye_rms_px=fisheye_px,
+        )
+    if fit.drift.p_value < MAX_CHANCE and fit.focal_drift > MAX_FOCAL_DRIFT:
+        raise LensModelError(
+            f"intrinsics: the focal length changed by {fit.focal_drift:.1%} from the first photo "
+            "to the last; switch autofocus, zoom and stabilisation off, and take all photos anew",
+            focal_drift=fit.focal_drift,
+        )
+
+
+def _calibration(
+    fit: "LensFit", places: list[_Place], size_px: tuple[int, int]
+) -> CameraCalibration:
+    cells = np.concatenate([place.pixels_px for place in places]) / np.array(size_px) * 4
+    sigma = np.sqrt(np.diag(fit.covariance))
+    return CameraCalibration(
+        K=fit.K,
+        distortion=fit.distortion,
         sigma_fxfycxcy_px=sigma[:4],
-        sigma_distortion=sigma[4:9],
-        rms_px=float(rms_px),
-        rms_by_photo_px=np.asarray(by_photo, dtype=np.float64).ravel(),
+        sigma_distortion=sigma[4:],
+        rms_px=fit.rms_px,
+        rms_by_place_px=fit.rms_by_photo_px,
+        board_bend_m=fit.board_bend_m,
         coverage=len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16,
-        used_images=found.photos,
+        used_images=tuple(sorted(photo for place in places for photo in place.photos)),
     )
-    return result, spread_rad
 
 
 def max_edge_width_px(photo: np.ndarray) -> float:

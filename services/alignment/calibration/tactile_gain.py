@@ -49,6 +49,12 @@ MAX_NONLINEARITY = 0.05
 MIN_NONLINEARITY_SIGMAS = 3.0
 MIN_POINTS_FOR_LINE = 3
 ROUNDS = 4
+# A trend of all taxels over pressure or time counts from so many standard deviations on; pressures
+# are trusted to a part in five hundred at best.
+MIN_TREND_SIGMAS = 2.0
+MIN_PRESSURE_SIGMA = 2e-3
+# A trend that differs by less from a straight line through zero cannot be told from a gain.
+MIN_TREND_SHARE = 0.05
 # Between the halves of a press the counts may creep by this part of the response.
 MAX_CREEP = 0.1
 MAX_CREEPING = 0.25
@@ -96,8 +102,10 @@ class TaxelGain:
 
     Attributes:
         gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
-        sigma_counts_per_kpa: of the gain, 0 where refused. It includes the errors of the pressures
-            themselves, which are common to all taxels.
+        sigma_counts_per_kpa: of the gain, 0 where refused. It includes what is common to all
+            taxels: errors of the pressures, creep while a press lies, and a bend over pressure or a
+            drift from press to press where the presses show one. A single pressure shows no bend;
+            then it includes the largest that is tolerated.
         state: index into `tactile_tare.STATES`.
         residual_kpa: [press, 320] what each press is off the line, 0 where not used.
     """
@@ -224,8 +232,9 @@ def fit_gain(
     pressures show a bent response.
 
     Raises:
-        InvalidInputError: no press, no taxel that answers, counts that fall under pressure, or
-            pressures that do not belong to the takes.
+        InvalidInputError: no press, no taxel that answers, counts that fall under pressure,
+            pressures that do not belong to the takes, or a glove whose response bends or drifts by
+            more than 10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")
@@ -240,6 +249,9 @@ def fit_gain(
     state[~pressed & (state == OK)] = UNPROVEN
     state[pressed & (state == UNPROVEN)] = OK
     gain, sigma, zero, excess = _lines(points)
+    # How long a touch lasts is not known, hence neither what it has crept: that is an error.
+    creep = float(np.median([abs(_creep(press, tare)) for press in presses]))
+    sigma = np.hypot(sigma, gain * np.hypot(creep, _trend(points, gain, state == OK)))
     state = _judge_lines(points, (gain, sigma, excess), state)
     good = state == OK
     line = zero + gain * points.pressure_kpa[:-1]
@@ -295,6 +307,66 @@ def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelT
             f"lay, expected at most {MAX_CREEPING:.0%}; use only the time in which the pressure "
             "holds (start_s and stop_s of the list of presses)"
         )
+
+
+def _creep(press: TaxelPress, tare: TaxelTare) -> float:
+    """Change of the response from the first half of a press to the second, as a share of it."""
+    first, second = (
+        select_taxels(np.median(part, axis=0) - tare.level.mean_counts, side=tare.side)
+        for part in np.array_split(np.asarray(press.counts, dtype=np.float64), 2)
+    )
+    answering = press.taxels & (first > MIN_MOVE_COUNTS)
+    return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
+
+
+def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, "320"]:
+    """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
+
+    Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
+
+    Raises:
+        InvalidInputError: it is too large; the trend is named.
+    """
+    used = points.used[:-1] & good & (gain > 0)
+    highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
+    has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
+    told = used.any(axis=1)
+    if not told.any():
+        return np.zeros(NUM_TAXELS)
+    P = points.pressure_kpa[:-1][told, 0]
+    response_kpa = (points.counts[:-1] - points.counts[-1]) / np.where(gain > 0, gain, 1.0)
+    seen_kpa = np.array(
+        [np.median(r[u]) for r, u in zip(response_kpa[told], used[told], strict=True)]
+    )
+    sigma_kpa = np.maximum(points.sigma_kpa[:-1][told, 0], MIN_PRESSURE_SIGMA * P)
+    time = np.flatnonzero(told) / max(len(told) - 1, 1)
+    # What each does to gains: a bend by its RMS about the line, a drift by its half, an offset by
+    # what it is of the highest pressure.
+    trends = {
+        "bends over pressure": (P * P / P.max(), 1 / np.sqrt(12)),
+        "drifts from press to press": (P * time, 0.5),
+        "zero drifts from press to press": (0.5 + 0.5 * time, 1 / P.max()),
+    }
+    found = {}
+    for name, (trend, effect) in trends.items():
+        line, own = P / sigma_kpa, trend / sigma_kpa
+        # What a line through zero leaves of a trend; of two pressures in turn maybe nothing.
+        own = own - line * (own @ line) / (line @ line)
+        length = np.linalg.norm(own)
+        sigmas = abs(own @ (seen_kpa / sigma_kpa)) / max(length, np.finfo(float).tiny)
+        if length > MIN_TREND_SHARE * np.linalg.norm(trend / sigma_kpa) and (
+            sigmas > MIN_TREND_SIGMAS
+        ):
+            found[name] = sigmas / length * effect
+    worst = max(found, key=lambda name: found[name], default="")
+    if found and found[worst] > MAX_RELATIVE_SIGMA:
+        raise InvalidInputError(
+            f"gain: the response of all taxels {worst}, which moves gains by {found[worst]:.0%}, "
+            f"expected at most {MAX_RELATIVE_SIGMA:.0%}; the pressures probably do not belong to "
+            "these takes, or the glove did not settle; check the list of presses, take the rest "
+            "take just before them, and press less where the response bends"
+        )
+    return np.where(has_one, MAX_NONLINEARITY / np.sqrt(3), found.get(worst, 0.0))
 
 
 def _check_direction(points: _Points) -> None:

@@ -177,7 +177,7 @@ def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
     if profile is None:
         person["bone_m"][:num], person["bone_scale"][:] = own_m, 1.0
         person["knuckle_m"][:num], person["travel"][:] = zero_points_m(hand)[:, 0], 1.0
-        person["freedom"][:] = UNKNOWN_FREEDOM
+        person["freedom"][:], person["noise_m2"] = UNKNOWN_FREEDOM, -1.0
         return record
     rows = [CHAINS.index(finger.chain) for finger in hand.fingers]
     bone_m, knuckle_sigma_m = profile.bone_m[rows].copy(), profile.knuckle_sigma_m[rows]
@@ -194,6 +194,8 @@ def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
     if profile.is_rigid:
         sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
         person["freedom"][:num] = (knuckle_sigma_m / sigma_m) ** 2
+    else:
+        person["noise_m2"] = 3.0 * profile.point_sigma_m**2
     noise_m = BONE_SIGMAS * np.sqrt(2) * profile.point_sigma_m
     least_m = max(BONE_TOLERANCE_M, noise_m)
     person["bone_tolerance_m"][:num] = np.maximum(BONE_TOLERANCE * bone_m, least_m)

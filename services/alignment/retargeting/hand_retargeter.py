@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands import CHAINS, NUM_KEYPOINTS, chain_indices, mean_hand_m
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, mean_hand_m, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting.hand_checks import checked_keypoints
 from services.alignment.retargeting.hand_profile import HandProfile, measure_profile, person_arrays
@@ -20,6 +20,7 @@ from services.alignment.retargeting.solver.arrays import (
     hand_arrays,
     joint_places,
 )
+from services.alignment.retargeting.solver.smoothing import smoothed
 from services.alignment.retargeting.solver.solve import retarget_samples
 
 
@@ -157,10 +158,13 @@ class HandRetargeter:
                 _checked_valid(valid, len(keypoints))[..., None], keypoints, np.nan
             )
         elapsed_s = _elapsed_s(len(keypoints), t_s)
-        person = self._person
-        if self.profile is None:
-            seen = _with_every_finger(keypoints, self.hand.side)
-            person = person_arrays(measure_profile(seen, self.hand), self.hand)
+        profile = self.profile or measure_profile(
+            _with_every_finger(keypoints, self.hand.side), self.hand
+        )
+        person = person_arrays(profile, self.hand)
+        if not profile.is_rigid:
+            keypoints = smoothed(keypoints, profile.point_sigma_m)
+            person["noise_m2"] = 0.0
         # Of slow trackers, not every sample is a loss.
         lost_s = max(self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
@@ -227,16 +231,18 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
+    smoothed(keypoints, 0.0)
 
 
 def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
     """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
 
-    So that a person whose finger is never seen, or missing, has a profile of the others.
+    So that a person whose finger is never seen, or missing, has a profile of the others. Trackers
+    may lack the metacarpals of all fingers, which no profile has.
     """
     filled = keypoints_m
     for chain in CHAINS:
-        nodes = chain_indices(chain)
+        nodes = solver_indices(chain)
         if not np.isfinite(keypoints_m[:, nodes]).all(axis=(-1, -2)).any():
             filled = filled.copy() if filled is keypoints_m else filled
             filled[:, nodes] = mean_hand_m(side)[nodes]

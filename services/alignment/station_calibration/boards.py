@@ -19,6 +19,7 @@ from services.alignment.calibration.intrinsics import (
     CharucoBoard,
     Chessboard,
     FoundBoards,
+    LensModelError,
     calibrate_found,
     edge_width_px,
     find_boards,
@@ -320,17 +321,22 @@ def camera_coverage(
     todo = [*_places(by_region, by_edge), *_poses(tilts_rad, sizes)]
     if not todo and len(views) < ENOUGH_VIEWS:
         todo = [f"take {ENOUGH_VIEWS - len(views)} more photos, each from another direction"]
-    focal_sigma = _focal_sigma(views, size_px)
+    focal_sigma, no_lens = _focal_sigma(views, size_px)
+    if no_lens:
+        todo = [no_lens]
     if not todo and focal_sigma > MAX_FOCAL_SIGMA:
         todo = [_surer(focal_sigma, tilts_rad)]
     return Coverage(by_region, tilts_rad, focal_sigma, tuple(todo))
 
 
-def _focal_sigma(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
+def _focal_sigma(views: Sequence[BoardView], size_px: tuple[int, int]) -> tuple[float, str]:
+    """Sigma of the focal length as a share of it, and why no camera of the model took the views."""
     try:
-        return calibrate_found(found_boards(views, size_px)).focal_sigma
+        return calibrate_found(found_boards(views, size_px)).focal_sigma, ""
+    except LensModelError as error:
+        return float("inf"), error.message
     except InvalidInputError:
-        return float("inf")
+        return float("inf"), ""
 
 
 def _surer(focal_sigma: float, tilts_rad: np.ndarray) -> str:

@@ -138,6 +138,7 @@ def keep_camera(
         "distortion_k1_k2_p1_p2_k3": result.distortion.tolist(),
         "sigma_distortion": result.sigma_distortion.tolist(),
         "rms_px": result.rms_px,
+        "board_bend_mm": result.board_bend_m * 1e3,
         "board_kind": photos.pattern,
         "image_size_px": list(photos.size_px),
         "views_by_region": coverage.views_by_region.tolist(),

@@ -81,7 +81,8 @@ KINDS: Final = (
     (
         r"([a-z0-9_]+)_latency_ns",
         "Latency of {0}",
-        "Record brisk motion or taps, then: {command} latency --stream {0} --reference STREAM "
+        "Shake trackers and cameras together for ten seconds, then: {command} time --take TAKE "
+        "{to}; gloves: tap a table, then: {command} latency --stream {0} --reference STREAM "
         "--take TAKE {to}",
         "",
     ),

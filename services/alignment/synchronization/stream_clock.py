@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.clocks import (
+    corrected_stamps,
     count_lost_samples,
     date_by_counting,
     fit_clock,
@@ -24,6 +25,9 @@ MAX_SKEW_PPM = 1000.0
 MAX_RATE_ERROR_PPM = 20_000.0
 # A path's ordinary scatter exceeds the period of a fast stream.
 MIN_LATENESS_NS = 5e6
+# Stamps are better: all samples of five seconds are later than a USB frame of 1 ms only with a
+# wrong fit or a delay that lasts.
+MAX_STAMPED_LATENESS_NS = 1e6
 
 
 # Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.
@@ -115,9 +119,12 @@ def time_stream(
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
     """Reasons to doubt the times, if any."""
     skew_limit_ppm = MAX_SKEW_PPM if dated.method == "device" else MAX_RATE_ERROR_PPM
+    lateness_limit_ns = max(period_ns, MIN_LATENESS_NS)
+    if dated.method == "device":
+        lateness_limit_ns = MAX_STAMPED_LATENESS_NS
     doubts: dict[ClockWarning, bool] = {
         "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
-        "residual": dated.lateness_ns > max(period_ns, MIN_LATENESS_NS),
+        "residual": dated.lateness_ns > lateness_limit_ns,
         "stop": dated.has_unsure_stops,
     }
     return tuple(name for name, is_so in doubts.items() if is_so)
@@ -196,6 +203,8 @@ def _shown_tick_ns(device_ns: np.ndarray, sequence: np.ndarray) -> int:
 def _fitted(
     device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: ClockMethod
 ) -> _Dated:
+    if method == "device":
+        device_ns = corrected_stamps(device_ns, batch.t_host_ns)
     model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
     if not (batch.sequence == NO_SEQUENCE).any():
         bits = descriptor.capabilities.sequence_bits

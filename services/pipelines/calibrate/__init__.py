@@ -36,7 +36,8 @@ If required:
   wrist        gloves whose keypoints are not in wrist axes: a take of the flat hand
   profile      once per person: a take in which the hand opens, closes and spreads
   robot-base   robots that report poses in their base frame: pose pairs of tracker and effector
-  latency      streams with unknown path delay: a take of brisk motion, or of taps
+  time         path delays of trackers and cameras: a take in which all are shaken together
+  latency      one stream with unknown path delay: a take of brisk motion, or of taps
 
 More: docs/calibration_guide.md"""
 
@@ -119,6 +120,18 @@ examples:
   dextouch station calibrate latency --stream wrist_left --reference tactile_left \\
     --take spool/taps --to calibration"""
 
+_TIME = """\
+Hold or strap trackers and cameras together rigidly, and turn them briskly and irregularly about all
+axes for ten seconds, cameras towards a room with edges (not a bare wall) and in good light.
+Trackers may be of several systems, whose worlds differ. Each camera needs its K (of --to or of the
+take). Gloves whose keypoints are in wrist axes do not show how the hand turns: use `latency` with
+taps.
+
+Delays are relative to --reference; by default to the stream whose latency is known best.
+
+example:
+  dextouch station calibrate time --take spool/shake --to calibration"""
+
 
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
@@ -151,6 +164,11 @@ _COMMANDS = {
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
         "pipelines.calibrate.cameras:calibrate_base",
+    ),
+    "time": (
+        "shaking everything together → all path delays",
+        _TIME,
+        "pipelines.calibrate.times:measure_times",
     ),
     "latency": (
         "common motion or taps → path delay",
@@ -196,9 +214,12 @@ def _parser() -> argparse.ArgumentParser:
     add("show", "folder", type=Path, metavar="PATH", help=shown)
     add("glove wrist profile", "--side", required=True, choices=("left", "right"), help="hand")
     take = "spool folder, or id of a recording"
-    add("wrist profile latency", "--take", required=True, metavar="TAKE", help=take)
+    add("wrist profile time latency", "--take", required=True, metavar="TAKE", help=take)
     store = "store of recordings given by id"
-    add("glove wrist profile latency", "--store", metavar="URL", help=store)
+    add("glove wrist profile time latency", "--store", metavar="URL", help=store)
+    some = "streams to calibrate (default: all that show how they turn)"
+    add("time", "--streams", metavar="A,B", help=some)
+    add("time", "--reference", metavar="STREAM", help="stream that the others are relative to")
     _add_cameras(add, folder)
     _add_glove(add, folder)
     add("robot-base", "--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs")

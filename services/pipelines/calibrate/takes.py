@@ -166,7 +166,7 @@ def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
         readings = known.to_kpa(readings)
     pressure_kpa = readings.astype(np.float64)
     whole = np.isfinite(pressure_kpa).all(axis=1)
-    t_pose_ns, poses = _poses(tracker)
+    t_pose_ns, poses = poses_of(tracker)
     peaks_kpa = pressure_kpa[whole].max(axis=1)
     return estimate_tap_offset(t_ns[whole], peaks_kpa, t_pose_ns, poses[:, HEIGHT])
 
@@ -175,15 +175,19 @@ def _angular_velocity(
     stream: TakeStream,
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Angular velocity in the world (rad/s), which is the same for all parts of a rigid body."""
-    t_ns, poses = _poses(stream)
+    t_ns, poses = poses_of(stream)
     Rs = transform_from_pose(poses)[:, :3, :3]
     turns_rad = vector_from_rotation(Rs[1:] @ np.swapaxes(Rs[:-1], -1, -2))
     steps_ns = np.diff(t_ns)
     return t_ns[:-1] + steps_ns // 2, turns_rad / (steps_ns[:, None] * 1e-9)
 
 
-def _poses(stream: TakeStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
-    """Times and poses of valid tracking."""
+def poses_of(stream: TakeStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
+    """Times and poses of valid tracking.
+
+    Raises:
+        InvalidInputError: fewer than two.
+    """
     t_ns, values = stream.timed()
     poses = values.astype(np.float64)
     seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)

@@ -1,12 +1,12 @@
 from .clock_model import ClockModel as ClockModel
 from .clock_model import ClockSegment as ClockSegment
+from .clock_model import corrected_stamps as corrected_stamps
 from .clock_model import fit_clock as fit_clock
 from .clock_model import lateness_ns as lateness_ns
 from .online_clocks import CountedSample as CountedSample
 from .online_clocks import CountedTake as CountedTake
 from .online_clocks import CountingClock as CountingClock
 from .online_clocks import OnlineClock as OnlineClock
-from .online_clocks import TickCounter as TickCounter
 from .online_clocks import count_lost_samples as count_lost_samples
 from .online_clocks import date_by_counting as date_by_counting
 from .online_clocks import prefers_sequence as prefers_sequence

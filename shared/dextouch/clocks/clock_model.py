@@ -18,7 +18,9 @@ MIN_SAMPLES = 10
 # Minimum number of samples of a second (or longer) for the lateness.
 MIN_PROMPT_SAMPLES = 10
 PROMPT_S = 1.0
-LATE_QUANTILE = 0.9
+# Chosen: longer than what hosts and paths hold back without pause, shorter than what a wrong fit
+# does between two events.
+PROMPT_SECONDS = 5
 # A straight line fits a minute of crystal drift; longer takes get a piecewise linear model.
 WINDOW_S = 60.0
 # Below this many samples or seconds a segment's own slope is mostly noise.
@@ -44,8 +46,9 @@ MATCH_SHARE = 0.2
 MATCH_CHANGE_SHARE = 0.5
 REGULAR_QUANTILE = 0.9
 # A clock that stood still shows in no distance of stamps, only in the arrivals: within a fifth of a
-# second they become late, and stay so. A rise of so much must last for so long, by both clocks.
-SUDDEN_RISES = ((25e6, 1_000_000_000), (5e6, 10_000_000_000))
+# second they become late, and stay so. A rise of so much must last for so long, by both clocks; the
+# smallest is above a USB frame of 1 ms, and a path may hold back all samples for some seconds.
+SUDDEN_RISES = ((25e6, 1_000_000_000), (1.5e6, 7_000_000_000))
 # The path may have become longer little by little and then stay so: the fit follows after a minute
 # anyway. A continuing rise is a change of rate.
 GRADUAL_RISE = (5e6, 60_000_000_000)
@@ -53,6 +56,8 @@ SUDDEN_S = 0.2
 # It was a delay if this many arrivals return within this time; single stamps may be wrong.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
+# So many samples in a row are hardly ever all late by chance.
+NUM_BETWEEN = 5
 # What rises so near to the end of a take, and stays, is more often a delay than a stop, unless it
 # rises by more than paths hold back without pause.
 END_NS = 5_000_000_000
@@ -101,11 +106,11 @@ class ClockModel:
         skew_ppm: how much faster the host's clock runs, mean over all segments.
         residual_rms_ns: RMS of arrival minus fitted time: queueing on the path, not the error of
             the fit (which is far smaller).
-        lateness_ns: minimum of arrival minus fitted time within a second (90 % quantile over all
-            seconds), excluding detected delays. Near zero for a good fit, even on paths with
-            queueing, bursts and stalls.
-        has_unsure_stops: whether a stop of the device's clock may have been a delay, or a delay at
-            the end of the take a stop.
+        lateness_ns: minimum of arrival minus fitted time within five seconds, the largest of the
+            take, excluding detected delays. Near zero for a good fit, even on paths with queueing,
+            bursts and stalls.
+        has_unsure_stops: whether a stop of the device's clock may have been a delay or a slew, or
+            a delay at the end of the take a stop.
     """
 
     segments: tuple[ClockSegment, ...]
@@ -177,8 +182,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
             clock steps explain) or "length" (unequal lengths).
     """
     device, host = _checked(t_device_ns, t_host_ns)
-    right = np.delete(np.arange(len(device)), find_wrong_stamps(device))
-    device, host = device[right], host[right]
+    device = corrected_stamps(device, host)
     cuts, waiting, has_unsure_stops = find_steps(device, host)
     bounds = list(zip([0, *cuts], [*cuts, len(device)], strict=True))
     fitted_to = [a + np.flatnonzero(~waiting[a:b]) for a, b in bounds]
@@ -206,7 +210,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
 
 
 def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
-    """Minimum of arrival minus fitted time within a second, 90 % quantile over all seconds.
+    """Minimum of arrival minus fitted time within five seconds, the largest of the take.
 
     Queueing, bursts and stalls let some samples through promptly; only with a wrong fit or a
     lasting delay are all of them late.
@@ -221,7 +225,9 @@ def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
     starts = np.unique((host - host[0]) // round(second_ns), return_index=True)[1]
     promptest_ns = np.minimum.reduceat(residual_ns, starts)
     is_full = np.diff(starts, append=len(host)) >= MIN_PROMPT_SAMPLES // 2
-    return float(np.quantile(promptest_ns[is_full], LATE_QUANTILE)) if is_full.any() else 0.0
+    full_ns = promptest_ns[is_full]
+    num = min(PROMPT_SECONDS, len(full_ns))
+    return float(sliding_window_view(full_ns, num).min(axis=1).max()) if num else 0.0
 
 
 def _checked(
@@ -383,22 +389,41 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
     return Steps(sorted(set(cuts)), waiting, is_unsure)
 
 
-def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
-    """Indices of single stamps that are not whole periods from their two neighbours.
+def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """Replace one or two wrong stamps in a row by whole periods from the right ones beside them.
 
-    Only for regular devices; for others none are found.
+    Stamps of a regular device are wrong if those beside them are whole periods apart and they are
+    not whole periods from these. The number of periods is that of the arrivals where samples are
+    missing. Stamps of irregular devices stay as they are.
+
+    Args:
+        t_device_ns: unwrapped device stamps [n].
+        t_host_ns: their arrivals [n].
     """
-    if len(device) < 3 or not (stamps := _Stamps(device)).is_regular:
-        return np.empty(0, dtype=np.int64)
+    device, host = np.array(t_device_ns, dtype=np.int64), np.asarray(t_host_ns)
+    if len(device) < MIN_SAMPLES or not (stamps := _Stamps(device)).is_regular:
+        return device
     period_ns = max(stamps.period_ns, 1.0)
-    both_ns = (device[2:] - device[:-2]).astype(np.float64)
-    first_ns = (device[1:-1] - device[:-2]).astype(np.float64)
-    num_both = np.rint(both_ns / period_ns)
-    num_first = np.clip(np.rint(first_ns / period_ns), 1, np.maximum(num_both - 1, 1))
     limit_ns = max(STEP_NS, WRONG_SCATTERS * stamps.scatter_ns)
-    neighbours_agree = (num_both >= 2) & (np.abs(both_ns - num_both * period_ns) < limit_ns)
-    is_off = np.abs(first_ns - num_first * period_ns) > limit_ns
-    return np.flatnonzero(neighbours_agree & is_off).astype(np.int64) + 1
+    # The last of several equal stamps is no right one.
+    rises = np.diff(device, prepend=device[0] - 1) > 0
+    for run in (1, 2):
+        span_ns = (device[run + 1 :] - device[: -run - 1]).astype(np.float64)
+        num = np.rint(span_ns / period_ns)
+        is_wrong = (num > run) & (np.abs(span_ns - num * period_ns) < limit_ns)
+        is_wrong &= rises[: -run - 1]
+        for k in range(1, run + 1):
+            since_ns = device[k : k - run - 1] - device[: -run - 1]
+            nearest = np.rint(since_ns / period_ns)
+            # Two that are whole periods away may have overtaken each other.
+            nearest = np.clip(nearest, 1, num - 1) if run == 1 else nearest
+            is_wrong &= np.abs(since_ns - nearest * period_ns) > limit_ns
+        before = np.flatnonzero(is_wrong)
+        for k in range(1, run + 1):
+            waited = np.rint((host[before + k] - host[before]) / period_ns)
+            share = np.clip(waited, k, num[before] - run - 1 + k) / num[before]
+            device[before + k] = device[before] + np.rint(span_ns[before] * share).astype(np.int64)
+    return device
 
 
 class _Levels:
@@ -476,14 +501,20 @@ class _Levels:
         first, index, last = around
         host = self._host[index:last]
         within = int(np.searchsorted(host, host[0] + RETURN_NS))
-        back = np.flatnonzero(self._straight_ns[index : index + within] < sum(levels_ns) / 2)
+        back = np.flatnonzero(self._straight_ns[start : index + within] < sum(levels_ns) / 2)
         if len(back) >= MIN_RETURNED:
-            return _Rise(start, index + int(back[0]), is_unsure=False)
+            stop = start + int(back[0])
+            # What comes back to another level may have been a stop and a slew.
+            back_ns = self._straight_ns[stop : stop + self._count].min() - levels_ns[0]
+            return _Rise(start, stop, bool(abs(back_ns) > self._threshold_ns))
         is_at_end = last == len(self._host) and host[-1] - host[0] < END_NS
         is_delay = is_at_end and levels_ns[1] - levels_ns[0] < MAX_END_DELAY_NS
         # Less than a second of samples is too short to judge the end of the take.
         is_delay = is_delay and index - first >= self._count
-        return _Rise(start, last if is_delay else None, is_unsure=within == len(host))
+        # A clock that stood has no samples between the levels; one that is slewed has.
+        newest_ns = self._straight_ns[max(first, start - NUM_BETWEEN) : start].min()
+        is_gradual = bool(newest_ns - levels_ns[0] > self._threshold_ns)
+        return _Rise(start, last if is_delay else None, is_gradual or within == len(host))
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:

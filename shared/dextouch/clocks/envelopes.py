@@ -22,6 +22,8 @@ MIN_SLOPE_SPAN_S = 3.0
 MIN_SLOPE_POINTS = 30
 # A slope fitted over this span is better than one of a shorter span after a step.
 GOOD_SLOPE_SPAN_S = 20.0
+# 100 ppm, the tolerance of crystals: a slope that differs by more was one of a slewed clock.
+MAX_KEPT_NS_PER_S = 1e5
 # In its first second the line may still rest on a single late sample, and cannot reveal a step.
 SETTLED_S = 1.0
 STEP_NS = 1_000_000.0
@@ -188,6 +190,7 @@ class RunningEnvelope:
         num_steps: restarts of the line so far.
         slope_ns_per_s: of the line.
         spread_ns: mean distance of the last few hundred points above the line.
+        uncertainty_ns: how far the last point lies above the line if that is no usual delay, or 0.
     """
 
     def __init__(
@@ -201,8 +204,9 @@ class RunningEnvelope:
         self._min_slope_span_s = min_slope_span_s
         self._is_counted = is_counted
         self.num_steps = 0
-        self._num_points = 0
-        self.spread_ns = 0.0
+        self._num_points = self._num_pending = 0
+        self.spread_ns = self._spread_before_ns = 0.0
+        self.uncertainty_ns = 0.0
         self.slope_ns_per_s = 0.0
         self._slope_span_s = 0.0
         self._last_x_s = 0.0
@@ -220,17 +224,25 @@ class RunningEnvelope:
             offset_ns = self._follow(x_s, y_ns)
         else:
             distance_s = x_s - self._last_x_s
-            if self._rhythm.is_odd(distance_s):
+            is_odd = self._rhythm.is_odd(distance_s)
+            if is_odd:
                 self._odd = x_s, distance_s
             if not self._rhythm.is_kept(distance_s):
                 self._broken_x_s = x_s
             self._rhythm.add(distance_s)
             is_pending = self._is_pending(self._line, x_s, y_ns, now_s)
-            offset_ns = self._line.at(x_s) if is_pending else self._follow(x_s, y_ns)
+            # A single wrong stamp would hold the line down for a minute.
+            is_left_out = is_pending or (is_odd and self._line is not None)
+            offset_ns = self._line.at(x_s) if is_left_out else self._follow(x_s, y_ns)
         self._last_x_s = x_s
+        above_ns = y_ns - offset_ns
+        self.uncertainty_ns = above_ns if above_ns > self._thresholds_ns()[1] else 0.0
         return offset_ns
 
     def _start(self, hull: LowerHull) -> None:
+        if self._num_pending:
+            # The pending points were not late.
+            self.spread_ns = self._spread_before_ns
         self._hull = hull
         self._line: Line | None = None
         self._num_followed = 0
@@ -267,6 +279,13 @@ class RunningEnvelope:
     def _confirm(self, line: Line) -> None:
         """Confirm that the pending points lie above the line because of a step."""
         (odd_x_s, distance_s), pending = self._odd, self._pending
+        if pending.span_s >= MIN_SLOPE_SPAN_S:
+            own = pending.supporting_line(self._last_x_s - pending.span_s / 2)
+            if abs(own.slope_ns_per_s - self.slope_ns_per_s) > MAX_KEPT_NS_PER_S:
+                self.slope_ns_per_s = own.slope_ns_per_s
+                self._slope_span_s = pending.span_s
+                self._start(pending)
+                return
         if odd_x_s < self._pending_since[0]:
             self._start(pending)
             return
@@ -302,6 +321,7 @@ class RunningEnvelope:
         """Add a point above the line; whether all have been above it long enough."""
         if self._num_pending == 0:
             self._pending_since = (x_s, now_s)
+            self._spread_before_ns = self.spread_ns
             self._pending = LowerHull()
         self._num_pending += 1
         lasted_s = min(x_s - self._pending_since[0], now_s - self._pending_since[1])
@@ -313,7 +333,8 @@ class RunningEnvelope:
 
     def _thresholds_ns(self) -> tuple[float, float]:
         """Detection thresholds below and above the line."""
-        spread_ns = self.spread_ns
+        # Points that may follow a step say nothing about delays.
+        spread_ns = self._spread_before_ns if self._num_pending else self.spread_ns
         late_ns = self._step_ns + LATE_SPREADS * spread_ns
         if self._slope_span_s < MIN_SLOPE_SPAN_S:
             unsure_ns = UNSURE_STEP_NS + UNSURE_SPREADS * spread_ns

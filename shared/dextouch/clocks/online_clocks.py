@@ -35,42 +35,6 @@ MAX_STEADY_LOSS = 0.1
 MAX_STEPS_PER_SAMPLE = 0.001
 
 
-class TickCounter:
-    """Unwraps a counter whose ticks are not whole nanoseconds (48 MHz).
-
-    Args:
-        bits: width of the counter.
-        ticks_per_s: its rate.
-    """
-
-    def __init__(self, bits: int, ticks_per_s: int) -> None:
-        if not 8 <= bits <= 62 or ticks_per_s < 1:
-            raise InvalidInputError(
-                f"tick counter: got {bits} bits at {ticks_per_s} ticks a second, expected 8 … 62 "
-                "bits and at least 1 tick a second"
-            )
-        self._modulus = 2**bits
-        self._ticks_per_s = ticks_per_s
-        self._last: tuple[int, int] | None = None
-
-    def to_ns(self, count: int, t_host_ns: int) -> int:
-        """Exact, unwrapped device time in ns of a count that arrived at a host time.
-
-        Raises:
-            InvalidInputError: a count outside the counter's range.
-        """
-        if not 0 <= count < self._modulus:
-            raise InvalidInputError(
-                f"tick counter: got a count of {count}, expected 0 … {self._modulus - 1}"
-            )
-        straight = count
-        if self._last is not None:
-            waited_ticks = (t_host_ns - self._last[1]) * self._ticks_per_s // 10**9
-            straight = nearest_congruent(count, self._last[0] + waited_ticks, self._modulus)
-        self._last = (straight, t_host_ns)
-        return straight * 10**9 // self._ticks_per_s
-
-
 def nearest_congruent(count: int, expected: int, modulus: int) -> int:
     """The number nearest to `expected` that is congruent to `count` modulo `modulus`."""
     half = modulus // 2
@@ -172,6 +136,15 @@ class OnlineClock:
         """Recent mean of the path delay above its minimum."""
         return self._envelope.spread_ns
 
+    @property
+    def uncertainty_ns(self) -> float:
+        """How much later than estimated the last sample may have been taken; 0 if it came promptly.
+
+        A sample that is late has been delayed, or the device's timer has stood still for so long.
+        `update` assumes a delay, for ten seconds; where times must be right, skip the sample.
+        """
+        return self._envelope.uncertainty_ns
+
     def update(
         self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None
     ) -> int:
@@ -208,7 +181,8 @@ class OnlineClock:
         offset_ns = self._envelope.add(since_ns * 1e-9, float(ahead_ns), now_s)
         # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
         # does not show it, since it is determined by the stamps with the smallest truncation.
-        return device_ns + reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
+        estimate_ns = min(device_ns + reference_ns + round(offset_ns), t_host_ns)
+        return estimate_ns + self._counter.resolution_ns // 2
 
 
 class DeviceCounter:

@@ -5,7 +5,6 @@ from .transforms import bracket as bracket
 from .transforms import interpolate_linear as interpolate_linear
 from .transforms import interpolate_poses as interpolate_poses
 from .transforms import invert as invert
-from .transforms import lens_pixels as lens_pixels
 from .transforms import nearest_index as nearest_index
 from .transforms import pinhole_matrix as pinhole_matrix
 from .transforms import points_on_level as points_on_level

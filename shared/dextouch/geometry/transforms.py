@@ -100,19 +100,22 @@ def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64
 
 
 def project(
-    K: np.ndarray, points_camera: np.ndarray
+    K: np.ndarray, points_camera: np.ndarray, distortion: np.ndarray | None = None
 ) -> tuple[Float64[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
     """Pixels [..., 2] of points [..., 3] in metres, and whether each lies in front of the camera.
 
-    Points nearer than 1 cm are projected as if at that depth and marked False. Lens
-    distortion is not modelled: in images of a real camera, points are off by its
-    `distortion_<camera>`.
+    Points nearer than 1 cm are projected as if at that depth and marked False.
+
+    Args:
+        K: camera matrix in pixels.
+        points_camera: points in the camera's frame.
+        distortion: k1 k2 p1 p2 k3 of the lens, for images as the camera took them; None for a
+            pinhole, as for undistorted images.
     """
     points = np.asarray(points_camera, dtype=np.float64)
-    in_front = points[..., 2] >= _LEAST_DEPTH_M
-    depth = np.maximum(points[..., 2:], _LEAST_DEPTH_M)
-    pixels = points[..., :2] / depth * np.array([K[0, 0], K[1, 1]]) + np.array([K[0, 2], K[1, 2]])
-    return pixels, in_front
+    flat = points[..., :2] / np.maximum(points[..., 2:], _LEAST_DEPTH_M)
+    seen = flat if distortion is None else _distorted(flat, distortion)[0]
+    return seen * K[[0, 1], [0, 1]] + K[:2, 2], points[..., 2] >= _LEAST_DEPTH_M
 
 
 def bracket(
@@ -175,19 +178,6 @@ def nearest_index(t_ns: np.ndarray, at_ns: np.ndarray) -> Int64[np.ndarray, " n"
     return np.where(at - t[left] <= t[right] - at, left, right).astype(np.int64)
 
 
-def lens_pixels(
-    K: np.ndarray, distortion: np.ndarray, points_camera: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Pixels [n, 2] of points [n, 3] in metres, and whether each lies in front of the camera.
-
-    Points nearer than 1 cm are projected as if at that depth and marked False.
-    """
-    points = np.asarray(points_camera, dtype=np.float64)
-    depth = np.maximum(points[..., 2:], _LEAST_DEPTH_M)
-    seen, _ = _distorted(points[..., :2] / depth, distortion)
-    return seen * K[[0, 1], [0, 1]] + K[:2, 2], points[..., 2] >= _LEAST_DEPTH_M
-
-
 def undistorted(
     images: UInt8[np.ndarray, "n h w 3"], K: np.ndarray, distortion: np.ndarray
 ) -> UInt8[np.ndarray, "n h w 3"]:
@@ -227,7 +217,7 @@ def _sources(
     rows, columns = np.mgrid[0:height_px, 0:width_px] + 0.5
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    seen, _ = lens_pixels(K, np.array(lens), rays)
+    seen, _ = project(K, rays, np.array(lens))
     maps = (seen - 0.5).astype(np.float32).reshape(height_px, width_px, 2)
     return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
 
@@ -276,13 +266,14 @@ def box_pixels(
     box = np.asarray(box_m, dtype=np.float64)
     signs = np.array([[1 if index >> axis & 1 else -1 for axis in range(3)] for index in range(8)])
     corners_m = apply(invert(T_world_camera) @ T_world_object, box[:3] + signs * box[3:])
-    pixels, in_front = lens_pixels(*camera, corners_m)
+    K, distortion = camera
+    pixels, in_front = project(K, corners_m, distortion)
     return np.where(in_front[:, None], pixels, np.nan)
 
 
 def _distorted(
-    flat: Float64[np.ndarray, "n 2"], distortion: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 2"]]:
+    flat: Float64[np.ndarray, "*batch 2"], distortion: np.ndarray
+) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 2"]]:
     """Where a lens shows points at depth 1, and the derivatives of that."""
     k1, k2, p1, p2, k3 = np.asarray(distortion, dtype=np.float64).ravel()
     x, y = flat[..., 0], flat[..., 1]

@@ -1,5 +1,7 @@
 """A virtual clock whose host can be put to sleep."""
 
+import time
+
 from services.acquisition.clock import VirtualClock
 
 
@@ -13,6 +15,10 @@ class SleepyClock(VirtualClock):
             self._now_ns += duration_ns
             self.slept_ns += duration_ns
             self.advance()
+
+    def read_ns(self, clock_id):
+        has_slept = clock_id in {time.CLOCK_MONOTONIC, time.CLOCK_MONOTONIC_RAW}
+        return self._now_ns - has_slept * self.slept_ns
 
     def suspended_ns(self):
         return self.slept_ns

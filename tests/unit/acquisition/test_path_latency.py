@@ -64,7 +64,7 @@ class SimulatedGlove(Driver):
         told_ns = self.device_ns(sent_ns + there_ns)
         return RoundTrip(sent_ns, told_ns, told_ns, sent_ns + there_ns + back_ns)
 
-    def live_a_second(self):
+    def live_a_second(self, *, first=0):
         true_ns = self.second * SECOND_NS + np.arange(60) * SECOND_NS // 60
         waits_ns = self.latency_ns + self.rng.exponential(0.8e6, 60)
         arrivals_ns = np.maximum.accumulate(true_ns + waits_ns.astype(int))
@@ -73,7 +73,7 @@ class SimulatedGlove(Driver):
             for n, (t_ns, taken_ns) in enumerate(
                 zip(arrivals_ns.tolist(), true_ns.tolist(), strict=True)
             )
-        ]
+        ][first:]
         self.watch.accept({"tactile_left": samples, "nobody": samples})
         self.second += 1
         self.watch.look()
@@ -162,6 +162,21 @@ def test_after_a_step_of_the_devices_clock_the_delay_is_the_same_or_not_told(ste
     told = [latency for latency in found if latency is not None]
     errors = [abs(each.latency_ns - glove.latency_ns) / each.sigma_ns for each in told]
     assert max(errors) <= 3.0
+
+
+def test_while_a_stop_of_the_devices_timer_may_be_a_delay_nothing_wrong_is_told():
+    """Its stamps go on as if nothing was; one sample is not taken, which is less than the delay."""
+    glove = SimulatedGlove(0)
+    watched(glove)
+    for _ in range(30):
+        glove.live_a_second()
+    glove.step_ns -= SECOND_NS // 60
+    assert glove.latency_ns > SECOND_NS // 60
+    found = [glove.live_a_second(first=1), *(glove.live_a_second() for _ in range(30))]
+    told = [latency for latency in found if latency is not None]
+    errors = [abs(each.latency_ns - glove.latency_ns) / each.sigma_ns for each in told]
+    assert max(errors) <= 3.0
+    assert found[-1] is not None
 
 
 def test_missing_stamps_do_not_end_the_watch():

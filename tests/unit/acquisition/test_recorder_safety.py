@@ -233,21 +233,31 @@ def test_a_step_of_the_wall_clock_moves_no_stamp(make_recorder, clock, monkeypat
 def test_the_real_clock_tells_of_sleep_and_settings(monkeypatch):
     import time
 
-    shown = {"boot": 50 * 10**9, "monotonic": 30 * 10**9, "wall": 10**18}
-    monkeypatch.setattr(time, "clock_gettime_ns", lambda _: shown["boot"])
-    monkeypatch.setattr(time, "monotonic_ns", lambda: shown["monotonic"])
-    monkeypatch.setattr(time, "time_ns", lambda: shown["wall"])
+    raw, boot, mono, wall = (
+        time.CLOCK_MONOTONIC_RAW,
+        time.CLOCK_BOOTTIME,
+        time.CLOCK_MONOTONIC,
+        time.CLOCK_REALTIME,
+    )
+    shown = {raw: 29 * 10**9, boot: 50 * 10**9, mono: 30 * 10**9, wall: 10**18}
+    monkeypatch.setattr(time, "clock_gettime_ns", shown.__getitem__)
     clock = StationClock()
     offset_ns = clock.wall_offset_ns()
-    assert (clock.now_ns(), clock.suspended_ns()) == (30 * 10**9, 0)
-    shown["boot"] += 7 * 10**9  # asleep for 6 s of 7
-    shown["monotonic"] += 10**9
-    shown["wall"] += 7 * 10**9
-    assert (clock.now_ns(), clock.suspended_ns()) == (37 * 10**9, 6 * 10**9)
+    assert (clock.now_ns(), clock.suspended_ns()) == (49 * 10**9, 20 * 10**9)
+    # Asleep for 6 s of 7.
+    for name, passed_s in {raw: 1, boot: 7, mono: 1, wall: 7}.items():
+        shown[name] += passed_s * 10**9
+    assert (clock.now_ns(), clock.suspended_ns()) == (56 * 10**9, 26 * 10**9)
     assert clock.wall_offset_ns() == offset_ns
-    shown["wall"] += 3 * 10**9
+    # NTP slews all but the raw clock; a reading between the two of a difference came late.
+    for name in (boot, mono, wall):
+        shown[name] += 50_000_000
+    shown[mono] += 3_000
+    assert (clock.now_ns(), clock.suspended_ns()) == (56 * 10**9, 26 * 10**9)
+    assert clock.wall_offset_ns() == offset_ns
+    shown[wall] += 3 * 10**9
     assert clock.wall_offset_ns() == offset_ns + 3 * 10**9
-    assert clock.now_ns() == 37 * 10**9
+    assert clock.now_ns() == 56 * 10**9
 
 
 @pytest.mark.parametrize("wrong", [{"flush_period_s": 0.0}, {"min_free_bytes": -1}])

@@ -130,9 +130,9 @@ def test_lost_fingers_hold_and_are_searched_again():
     np.testing.assert_array_equal(
         wrong.joints_rad[0, 4 * middle :][:4], before.joints_rad[0, 4 * middle :][:4]
     )
-    # 0.37 rad are three steps of at most 0.16 rad, however long it was lost.
-    on_the_way = [live.step(keypoints[39], elapsed_s=elapsed_s) for elapsed_s in (1.0, 1 / 60)]
-    assert {one.status[0] for one in on_the_way} == {RetargetStatus.REACQUIRED}
+    # 0.37 rad are two steps of at most 0.32 rad, however long it was lost.
+    on_the_way = live.step(keypoints[39], elapsed_s=1.0)
+    assert on_the_way.status[0] == RetargetStatus.REACQUIRED
     again = live.step(keypoints[39])
     assert again.status[0] == RetargetStatus.SOLVED
     np.testing.assert_allclose(again.joints_rad[0], bending(40)[39], atol=1e-6)
@@ -158,12 +158,13 @@ def test_the_sample_before_pulls_by_the_time_since(elapsed_s):
     live = HandRetargeter("right", options=options)
     found = [live.step(keypoints_of(before[None])[0]) for _ in range(3)][-1].joints_rad[0]
     moved = live.step(keypoints_of(wanted[None])[0], elapsed_s=elapsed_s).joints_rad[0] - found
-    # Slopes of the points by central differences; without a profile the knuckle is free.
+    # Slopes of the bones by central differences; without a profile they count as of 40 mm each.
     ahead, behind = (
-        HAND.chain_points_m(before + sign * 1e-5 * np.eye(20)[little])[:, 4] for sign in (1, -1)
+        np.diff(HAND.chain_points_m(before + sign * 1e-5 * np.eye(20)[little])[:, 4], axis=1)
+        for sign in (1, -1)
     )
-    slopes = (ahead - behind) / 2e-5
-    J = (slopes - slopes.mean(axis=1, keepdims=True)).reshape(4, -1).T
+    slopes = 0.04 * (ahead - behind) / 2e-5 / np.linalg.norm(ahead, axis=-1, keepdims=True)
+    J = slopes.reshape(4, -1).T
     # m²/rad² at 60 Hz; at twice the rate twice as much.
     pull = options.temporal_weight_m2 / 60 / elapsed_s
     expected = np.linalg.solve(J.T @ J + pull * np.eye(4), J.T @ J @ (wanted - before)[little])
@@ -292,3 +293,12 @@ def test_broken_nodes_never_leave_the_limits(seed, kind):
     assert (result.joints_rad >= HAND.lower_rad).all()
     assert (result.joints_rad <= HAND.upper_rad).all()
     assert np.isfinite(result.tip_error_m).all()
+
+
+def test_trackers_without_metacarpals_are_followed_alike():
+    keypoints = keypoints_of(bending(40))
+    whole = HandRetargeter("right").retarget(keypoints)
+    for chain in CHAINS[1:]:
+        keypoints[:, NODE_INDEX[chain, "metacarpal"]] = np.nan
+    lacking = HandRetargeter("right").retarget(keypoints)
+    np.testing.assert_array_equal(lacking.joints_rad, whole.joints_rad)

@@ -99,8 +99,8 @@ def test_clumps_are_no_warning():
     assert report.warnings == ()
 
 
-@pytest.mark.parametrize(("late_ms", "warnings"), [(8, ()), (30, ("residual",))])
-def test_samples_that_are_all_later_than_a_period_are_a_warning(late_ms, warnings):
+@pytest.mark.parametrize(("late_ms", "warnings"), [(1, ()), (8, ("residual",))])
+def test_samples_that_are_all_late_are_a_warning(late_ms, warnings):
     """A clock loses so much in ten seconds and gains it in ten: the line lies below its arcs."""
     index = np.arange(6000, dtype=np.int64)
     arc = 1 - np.abs(index / 1000 % 2 - 1)
@@ -142,9 +142,7 @@ def test_doubts_are_on_the_line_and_the_page_of_a_report():
     console.print(report_page(report))
     for text in (report_line(report), console.export_text()):
         assert "glove_right: unreliable times: its clock is skewed by -4200 ppm and even" in text
-        assert (
-            "(71.2 ms RMS of all) and the device clock stopped or the path delay increased" in text
-        )
+        assert "(71.2 ms RMS of all) and the device clock stopped or was slewed, or the" in text
         assert "glove_left: times" not in text
 
 

@@ -5,20 +5,24 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated.board_scenes import mount_difference
+from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
 from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.schemas import RecordingAttributes
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes, matrix_rows
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.station_calibration.judgement import load
 from services.cli import main as command_line
 from services.pipelines.calibrate import main
 from services.pipelines.calibrate.show import show
+from tests.accuracy.test_common_motion import K, room, shake
 from tests.accuracy.test_robot_base import pairs
 from tests.accuracy.test_time_offset import taps
 from tests.unit.alignment.tracked_hands import any_rotation, flat_hand, moving_hand
@@ -202,6 +206,93 @@ def test_streams_without_common_motion_are_refused(tmp_path):
 
 def load_or_none(folder):
     return load(folder) if (folder / "calibration.json").exists() else None
+
+
+def test_times_of_all_that_was_shaken_together(tmp_path, capsys):
+    truth, rng = shake(5), np.random.default_rng(5)
+    late_ms = {"wrist_left": 12.0, "wrist_right": 41.0, "head": 25.0}
+    streams = {}
+    for name, delay_ms in late_ms.items():
+        t_s = np.arange(0.5, 10.5, 1 / 90)
+        mount = Rotation.random(random_state=int(rng.integers(1 << 30)))
+        quaternions = (truth(t_s) * mount).as_quat(scalar_first=True)
+        poses = np.column_stack([np.tile([0.1, 0.2, 0.3], (len(t_s), 1)), quaternions])
+        t_ns = np.rint((t_s + delay_ms / 1e3) * 1e9).astype(np.int64)
+        streams[name] = ("pose", "pose_m_wxyz", t_ns, poses)
+    hands = keypoints_at_rest(901)
+    streams["keypoints_left"] = ("keypoints", "m", np.arange(901) * 11_111_111, hands)
+    # The delay of one is known; what is found comes on top of what others are said to have.
+    known = {
+        "head_latency_ns": ((25e6,),),
+        "head_latency_sigma_ns": ((0.2e6,),),
+        "wrist_right_latency_ns": ((30e6,),),
+    }
+    take = write_take(tmp_path / "shake", streams, known)
+    report, matrices = run("time", "--take", take, to=tmp_path / "to")
+    assert report["reference"] == "head"
+    for name in ("wrist_left", "wrist_right"):
+        assert matrices[f"{name}_latency_ns"][0][0] * 1e-6 == pytest.approx(late_ms[name], abs=0.5)
+        assert 0.2 <= matrices[f"{name}_latency_sigma_ns"][0][0] * 1e-6 <= 0.6
+    assert "head_latency_ns" not in matrices
+    said = capsys.readouterr().out
+    assert "3 pairs of streams" in said
+    assert "left out: keypoints_left has keypoints in wrist axes" in said
+    only, _ = run(
+        "time", "--take", take, "--streams", "head,wrist_left", "--reference", "wrist_left",
+        to=tmp_path / "two",
+    )  # fmt: skip
+    assert list(only["streams"]) == ["head"]
+    common = ["time", "--take", str(take), "--to", str(tmp_path / "no"), "--streams"]
+    with pytest.raises(NotFoundError, match="has no table"):
+        main([*common, "head,table"])
+    with pytest.raises(InvalidInputError, match=r"1 of its streams .* keypoints_left has"):
+        main([*common, "head,keypoints_left"])
+
+
+def keypoints_at_rest(count):
+    return np.repeat(flat_hand("left", np.random.default_rng(0), num_samples=1), count, axis=0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("unit", ["rgb8", "jpeg"])
+def test_times_of_a_camera(tmp_path, unit):
+    truth, seen = shake(6), room(6)
+    t_s = np.arange(0.5, 8.5, 1 / 30)
+    pictures = [seen(truth(t)) for t in t_s]
+    values = encoded_values([encode_jpeg(one) for one in pictures]) if unit == "jpeg" else None
+    values = np.stack(pictures) if values is None else values
+    quaternions = truth(np.arange(0.5, 8.5, 1 / 90)).as_quat(scalar_first=True)
+    poses = np.column_stack([np.zeros((len(quaternions), 3)), quaternions])
+    times_ns = {
+        "head": np.rint(np.arange(0.5, 8.5, 1 / 90) * 1e9).astype(np.int64),
+        "camera_head": np.rint((t_s + 0.033) * 1e9).astype(np.int64),
+    }
+    described = {
+        "head": ("pose", (7,), "float64", "pose_m_wxyz", 90, poses),
+        "camera_head": ("image", (240, 320, 3), "uint8", unit, 30, values),
+    }
+    attributes = RecordingAttributes(
+        recording_id="take",
+        task="calibrate-takes",
+        instruction="",
+        domain="human",
+        station="test",
+        calibration={"K_head": matrix_rows(K)},
+    )
+    store = EpisodeStore(tmp_path / "store")
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, (kind, shape, dtype, unit_of, rate_hz, samples) in described.items():
+            writer.add_stream(
+                StreamDescriptor(
+                    name=name, kind=kind, shape=shape, dtype=dtype, unit=unit_of,
+                    nominal_rate_hz=rate_hz,
+                )
+            )  # fmt: skip
+            t_ns = times_ns[name] + START_NS
+            writer.append(name, values=samples, t_host_ns=t_ns, t_device_ns=t_ns)
+    words = ("time", "--take", "take", "--store", str(tmp_path / "store"), "--reference", "head")
+    _, matrices = run(*words, to=tmp_path / "to")
+    assert matrices["camera_head_latency_ns"][0][0] * 1e-6 == pytest.approx(33.0, abs=0.6)
 
 
 @pytest.mark.parametrize("command", ["wrist", "profile", "robot-base", "latency"])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from dextouch.clocks import OnlineClock, fit_clock
-from dextouch.clocks.clock_model import ClockModel, ClockSegment, find_steps, find_wrong_stamps
+from dextouch.clocks.clock_model import ClockModel, ClockSegment, corrected_stamps, find_steps
 from dextouch.clocks.envelopes import LowerHull
 from dextouch.clocks.online_clocks import DeviceCounter
 from dextouch.errors import ClockFitError, InvalidInputError
@@ -137,20 +137,28 @@ def test_a_step_is_found_where_samples_were_lost_beside_another_odd_distance():
     assert find_steps(device_ns[arrived], host_ns).cuts == [500]
 
 
-def test_wrong_stamps_are_single_ones_between_two_that_agree():
-    stamps_ns = np.delete(np.arange(200, dtype=np.int64), [21, 60, 61]) * PERIOD_NS
-    assert find_wrong_stamps(stamps_ns).tolist() == []
-    for wrong, by_ns in ((20, 3_000_000), (100, 43_000_000), (150, -2_000_000)):
+def test_wrong_stamps_lie_alone_or_in_pairs_between_two_that_agree():
+    right_ns = np.delete(np.arange(200, dtype=np.int64), [21, 60, 61]) * PERIOD_NS
+    stamps_ns, host_ns = right_ns.copy(), right_ns + 5 * MS
+    for wrong, by_ns in ((20, 3 * MS), (100, 43 * MS), (150, -2 * MS), (151, 4 * MS)):
         stamps_ns[wrong] += by_ns
-    assert find_wrong_stamps(stamps_ns).tolist() == [20, 100, 150]
-    # Two in a row, a step, and the ends are something else; so is a device without a rhythm.
+    assert corrected_stamps(stamps_ns, host_ns).tolist() == right_ns.tolist()
+    # Beside three lost ones the arrival tells which of the four it is.
+    after_loss_ns = np.delete(np.arange(200, dtype=np.int64), [80, 81, 83]) * PERIOD_NS
+    wrong_ns = after_loss_ns + 4 * MS * (after_loss_ns == 82 * PERIOD_NS)
+    assert corrected_stamps(wrong_ns, after_loss_ns + MS).tolist() == after_loss_ns.tolist()
+
+
+def test_what_is_no_wrong_stamp_stays():
+    """Three in a row, a step, the ends, what overtook another, and devices without a rhythm."""
     stepped_ns = np.arange(200, dtype=np.int64) * PERIOD_NS
-    stepped_ns[[50, 51]] += 4_000_000
+    stepped_ns[50:53] += 4_000_000
     stepped_ns[120:] += 7_000_000
     stepped_ns[[0, -1]] += 2_000_000
-    assert find_wrong_stamps(stepped_ns).tolist() == []
-    irregular_ns = np.random.default_rng(0).uniform(0, 2e9, 200).astype(np.int64)
-    assert find_wrong_stamps(np.sort(irregular_ns)).tolist() == []
+    stepped_ns[[80, 81]] = stepped_ns[[81, 80]]
+    irregular_ns = np.sort(np.random.default_rng(0).uniform(0, 2e9, 200).astype(np.int64))
+    for stamps_ns in (stepped_ns, irregular_ns):
+        assert corrected_stamps(stamps_ns, stamps_ns + MS).tolist() == stamps_ns.tolist()
 
 
 def test_no_sample_is_dated_after_its_arrival():

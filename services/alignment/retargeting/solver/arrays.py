@@ -113,6 +113,9 @@ PERSON: Final = np.dtype(
         # Further off, bones and knuckles are not this person's.
         ("bone_tolerance_m", np.float64, (_F, 3)),
         ("knuckle_tolerance_m", np.float64, (_F,)),
+        # Mean square of the noise's length, which live points are smoothed by; negative where it
+        # is to be found from the samples.
+        ("noise_m2", np.float64),
     ]
 )
 
@@ -150,6 +153,7 @@ SCRATCH: Final = np.dtype(
         ("posture_weight_m2", np.float64, (_F,)),
         ("scale", np.float64, (_F, 3)),
         ("freedom", np.float64, (_F,)),
+        ("bone_weight", np.float64, (_F, 3)),
         # Vector from fingertip to thumb tip and its weight; the fingers that are solved together.
         ("pinch_m", np.float64, (_F, 3)),
         ("pinch_weight", np.float64, (_F,)),
@@ -171,12 +175,12 @@ class RetargetOptions:
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
-            weight; at other rates in proportion to the rate. 0 follows every sample exactly.
+            weight (directions of people's bones count as points at 40 mm); at other rates in
+            proportion to the rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
         max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
-            regardless of the elapsed time; the default is 9.6 rad/s at 60 Hz. Motors that are led
-            to their targets smoothly may be given the velocity limit times the period of a slower
-            tracker.
+            regardless of the elapsed time; the default is 9.6 rad/s at 30 Hz, the rate of the
+            slowest trackers.
         pinch_far_m: from this distance of thumb and fingertip on the vector between them has no
             weight, and they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
@@ -185,7 +189,7 @@ class RetargetOptions:
 
     temporal_weight_m2: float = 1e-4
     velocity_limit_rad_s: float = 9.6
-    max_step_rad: float = 0.16
+    max_step_rad: float = 0.32
     pinch_far_m: float = 0.060
     reacquire_after_s: float = 0.1
     num_starts: int = len(STARTS)
@@ -225,19 +229,27 @@ class Memory(NamedTuple):
         alone_rad: [F, 6], what fingers would do if there were no pinch.
         unsolved_s: [F] since a finger was solved; infinite if it never was.
         is_behind: [F] whether a finger that was lost is still on its way to where it is tracked.
+        points_m: [F, 4, 3], smoothed; NaN if never seen.
+        bones_m: [F, 3, 3], of `noise_of_bones`.
+        ease: [F, 3], of `ease_bones`.
     """
 
     joints_rad: np.ndarray
     alone_rad: np.ndarray
     unsolved_s: np.ndarray
     is_behind: np.ndarray
+    points_m: np.ndarray
+    bones_m: np.ndarray
+    ease: np.ndarray
 
     @staticmethod
     def starting_at(joints_rad: np.ndarray) -> "Memory":
         """Before the first sample."""
         num = len(joints_rad)
         unsolved_s, is_behind = np.full(num, np.inf), np.zeros(num, dtype=np.uint8)
-        return Memory(joints_rad, joints_rad.copy(), unsolved_s, is_behind)
+        points_m, bones_m = np.full((num, NUM_POINTS, 3), np.nan), np.zeros((num, 3, 3))
+        ease = np.ones((num, 3))
+        return Memory(joints_rad, joints_rad.copy(), unsolved_s, is_behind, points_m, bones_m, ease)
 
 
 class Output(NamedTuple):

@@ -1,0 +1,217 @@
+"""Command `dextouch station calibrate time`: path delays of everything that was shaken together."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from dextouch.episodes import EpisodeStore, RecordingReader
+from dextouch.episodes.spool import SpoolReader
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.geometry import transform_from_pose
+from dextouch.hands import PALM_NODES
+from dextouch.images import decode_jpeg
+from dextouch.schemas import Matrix
+from dextouch.streams import JPEG_UNIT, StreamDescriptor
+from services.alignment.calibration.common_motion import (
+    SharedTimes,
+    Turning,
+    shared_times,
+    turning_of_images,
+    turning_of_points,
+    turning_of_rotations,
+)
+from services.alignment.station_calibration.record import (
+    MATRICES_FILE,
+    TakeStream,
+    read_matrices,
+    read_stream,
+    write_entry,
+)
+from services.alignment.synchronization.stream_clock import time_stream
+from services.pipelines.calibrate.takes import poses_of
+
+# Images that are decoded at once, so that ten seconds of a camera need no gigabyte.
+_IMAGES_AT_ONCE: Final = 32
+_COMMANDED: Final = "_commanded"
+
+
+def measure_times(options: argparse.Namespace) -> dict[str, object]:
+    """Measure the delays of all streams of a take that turned together, after a reference.
+
+    Raises:
+        DegenerateMotionError: too little, too slow or too regular motion, or streams that did not
+            move together.
+        InvalidInputError: fewer than two streams show how they turned.
+    """
+    where = f"take {options.take!r}"
+    reader = _reader(options.take, options.store)
+    cameras = dict(reader.attributes.calibration)
+    if (options.to / MATRICES_FILE).exists():
+        cameras |= read_matrices(options.to)
+    wanted = None if options.streams is None else options.streams.split(",")
+    unknown = sorted(set(wanted or ()) - set(reader.streams))
+    if unknown:
+        raise NotFoundError(f"{where}: has no {', '.join(unknown)}, only {sorted(reader.streams)}")
+    turnings: dict[str, Turning] = {}
+    left_out: dict[str, str] = {}
+    for name, descriptor in reader.streams.items():
+        if wanted is not None and name not in wanted:
+            continue
+        reason = _unfit(descriptor, cameras)
+        if reason is None:
+            turnings[name] = _turning(options, reader, name, cameras)
+        else:
+            left_out[name] = reason
+    if len(turnings) < 2:
+        raise InvalidInputError(
+            f"{where}: {len(turnings)} of its streams show how they turned, expected two; "
+            + "; ".join(f"{name} {reason}" for name, reason in left_out.items())
+        )
+    # Delays of the take were subtracted from its times; those of --to were not.
+    taken = dict(reader.attributes.calibration)
+    reference = options.reference or _best_known(turnings, taken)
+    return _written(options, shared_times(turnings, reference), taken, left_out)
+
+
+def _reader(take: str, store: str | None) -> SpoolReader | RecordingReader:
+    if Path(take).is_dir():
+        return SpoolReader(Path(take))
+    if store:
+        return EpisodeStore(store).recording(take)
+    raise NotFoundError(
+        f"take {take!r}: no such folder; name a take of the station's spool, or add --store URL "
+        "for the id of a recording"
+    )
+
+
+def _unfit(descriptor: StreamDescriptor, cameras: dict[str, Matrix]) -> str | None:
+    """Why a stream does not show how something turned; None if it does."""
+    name, kind = descriptor.name, descriptor.kind
+    if kind == "pose" and not name.endswith(_COMMANDED):
+        return None
+    if kind == "keypoints":
+        in_world = descriptor.frame in ("world", "tracker")
+        return None if in_world else "has keypoints in wrist axes, which do not turn with the hand"
+    if kind == "image":
+        K = f"K_{name.removeprefix('camera_')}"
+        return None if K in cameras else f"needs {K}: calibrate the camera first"
+    return "shows no turning; for gloves use `latency` with taps"
+
+
+def _turning(
+    options: argparse.Namespace,
+    reader: SpoolReader | RecordingReader,
+    name: str,
+    cameras: dict[str, Matrix],
+) -> Turning:
+    descriptor = reader.streams[name]
+    if descriptor.kind == "image":
+        return _camera_turning(reader, name, cameras)
+    stream = read_stream(options.take, name, options.store)
+    if descriptor.kind == "pose":
+        t_ns, poses = poses_of(stream)
+        return turning_of_rotations(t_ns, transform_from_pose(poses)[:, :3, :3])
+    t_ns, points_m = stream.timed()
+    palm_m = points_m[:, PALM_NODES].astype(np.float64)
+    whole = np.isfinite(palm_m).all(axis=(1, 2))
+    return turning_of_points(t_ns[whole], palm_m[whole])
+
+
+def _camera_turning(
+    reader: SpoolReader | RecordingReader, name: str, cameras: dict[str, Matrix]
+) -> Turning:
+    camera, descriptor = name.removeprefix("camera_"), reader.streams[name]
+    if isinstance(reader, SpoolReader):
+        batch = reader.read(name)
+        images: Iterator[np.ndarray] = (
+            decode_jpeg(bytes(one)) if descriptor.unit == JPEG_UNIT else one for one in batch.values
+        )
+    else:
+        batch, images = reader.stamps(name), _images(reader, name)
+    timed = TakeStream(name, descriptor, batch, reader.attributes.calibration)
+    timing = time_stream(batch, descriptor, latency_ns=round(timed.number(f"{name}_latency_ns")))
+    is_kept = np.isin(np.arange(len(batch)), timing.kept)
+    distortion = cameras.get(f"distortion_{camera}", ((0.0,) * 5,))
+    return turning_of_images(
+        timing.t_host_ns,
+        (image for image, kept in zip(images, is_kept, strict=True) if kept),
+        np.array(cameras[f"K_{camera}"]),
+        np.array(distortion[0]),
+    )
+
+
+def _images(reader: RecordingReader, name: str) -> Iterator[np.ndarray]:
+    for first in range(0, reader.num_samples(name), _IMAGES_AT_ONCE):
+        stop = min(first + _IMAGES_AT_ONCE, reader.num_samples(name))
+        yield from reader.images_at(name, np.arange(first, stop))
+
+
+def _best_known(turnings: dict[str, Turning], calibration: dict[str, Matrix]) -> str:
+    """The stream whose delay is known best; without any the first one, whose delay counts as 0."""
+
+    def sigma_ns(name: str) -> float:
+        return float(calibration.get(f"{name}_latency_sigma_ns", ((np.inf,),))[0][0])
+
+    return min(turnings, key=sigma_ns)
+
+
+def _written(
+    options: argparse.Namespace,
+    found: SharedTimes,
+    calibration: dict[str, Matrix],
+    left_out: dict[str, str],
+) -> dict[str, object]:
+    def known(name: str) -> float:
+        return float(calibration.get(name, ((0.0,),))[0][0])
+
+    reference = found.reference
+    sigma_ref_ns = known(f"{reference}_latency_sigma_ns")
+    rows: dict[str, dict[str, float]] = {}
+    for name, delay in found.delays.items():
+        if name == reference:
+            continue
+        # Times are without the delays that were known before: what is found comes on top.
+        latency_ns = known(f"{name}_latency_ns") + delay.offset_ns
+        sigma_ns = float(np.hypot(delay.sigma_ns, sigma_ref_ns))
+        facts: dict[str, object] = {
+            "stream": name,
+            "reference": reference,
+            "reference_latency_ms": known(f"{reference}_latency_ns") * 1e-6,
+            "method": "common turning",
+            "take": options.take,
+            "latency_ms": latency_ns * 1e-6,
+            "sigma_ms": sigma_ns * 1e-6,
+            "loop_sigmas": found.loop_sigmas,
+        }
+        entry = f"{name}_latency"
+        matrices = {f"{entry}_ns": float(latency_ns), f"{entry}_sigma_ns": sigma_ns}
+        write_entry(options.to, entry, matrices, facts)
+        rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
+        print(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
+    print(
+        f"relative to {reference}, which has {known(f'{reference}_latency_ns') * 1e-6:.2f} ms; "
+        f"{len(found.pairs)} pairs of streams, loops close within {found.loop_sigmas:.1f} standard "
+        "deviations"
+    )
+    for name, reason in left_out.items():
+        print(f"left out: {name} {reason}")
+    for (a, b), reason in found.unusable.items():
+        print(f"not used: {a} and {b}: {reason}")
+    return {
+        "reference": reference,
+        "streams": rows,
+        "pairs": [
+            {
+                "a": pair.a,
+                "b": pair.b,
+                "offset_ms": pair.offset.offset_ns * 1e-6,
+                "sigma_ms": pair.offset.sigma_ns * 1e-6,
+            }
+            for pair in found.pairs
+        ],
+        "loop_sigmas": found.loop_sigmas,
+        "left_out": left_out,
+    }
