@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.streams import pack, unpack
-from services.alignment.retargeting import HandRetargeter
+from services.alignment.retargeting import HandRetargeter, warm_up
 from services.pipelines.servers import served
 from services.pipelines.teleoperation.app import create_app
 from services.pipelines.teleoperation.settings import TeleoperationSettings
@@ -69,6 +69,7 @@ def naive_server() -> Iterator[str]:
 def main() -> None:
     """Serve until standard input closes."""
     requests, answer = serve_parent(niceness=0)
+    warm_up()
     configure_logging(service="bench", log_format="json", level="warning")
     apps = {
         name: create_app(TeleoperationSettings(rate_hz=rate_hz))

@@ -15,7 +15,13 @@ from fastapi import APIRouter, Depends, FastAPI
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.errors import (
+    ConflictError,
+    DexTouchError,
+    InvalidInputError,
+    NotFoundError,
+    UnavailableError,
+)
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.serving import MAX_WEBSOCKET_BYTES, RequireScope, create_service_app, serve
 from dextouch.streams import pack, unpack
@@ -232,6 +238,8 @@ def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
     controlled: dict[Side, tuple[str, HandFollower]] = {}
 
     async def control_as(name: str, socket: WebSocket, side: Side) -> None:
+        if not socket.app.state.is_warm.is_set():
+            raise UnavailableError("the solver is being compiled; wait until /readyz says ready")
         if side in controlled:
             raise ConflictError(
                 f"the {side} hand is controlled by {controlled[side][0]!r}; close that "
@@ -270,19 +278,30 @@ def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
 
 
 def create_app(settings: TeleoperationSettings) -> FastAPI:
-    """Create the service; it accepts connections once the solver is compiled."""
+    """Create the service; it is ready once the solver is compiled."""
+    is_warm = asyncio.Event()
+
+    async def compile_solver() -> None:
+        await asyncio.to_thread(warm_up)
+        is_warm.set()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await asyncio.to_thread(warm_up)
-        yield
+        async with asyncio.TaskGroup() as group:
+            group.create_task(compile_solver())
+            yield
+
+    async def readiness() -> Sequence[str]:
+        return [] if is_warm.is_set() else ["solver"]
 
     app = create_service_app(
         name="teleoperation",
         settings=settings,
         routers=[teleoperation_router(settings)],
         lifespan=lifespan,
+        readiness=readiness,
     )
+    app.state.is_warm = is_warm
     app.state.teleoperation = TeleoperationMetrics(app.state.registry)
     return app
 

@@ -1,5 +1,6 @@
 """The WebSocket of teleoperation on a real server, by a client that knows msgpack alone."""
 
+import threading
 import time
 from contextlib import contextmanager
 
@@ -29,7 +30,17 @@ LIMITS = CommandLimits(hold_after_s=0.3, relax_after_s=0.6)
 def url():
     settings = TeleoperationSettings(rate_hz=100, limits=LIMITS)
     with served({"teleoperation": create_app(settings)}) as urls:
+        until_ready(urls["teleoperation"])
         yield urls["teleoperation"]
+
+
+def until_ready(url):
+    """Wait until the solver is compiled, a minute at most on a busy machine that never did."""
+    for _ in range(1000):
+        if httpx.get(f"{url}/readyz").status_code == 200:
+            return
+        time.sleep(0.2)
+    pytest.fail("the service is not ready")
 
 
 def message(fields, **arrays):
@@ -210,6 +221,19 @@ def test_another_hand_is_told_why_it_is_not_followed(url):
         assert told["status"] == "not_ready"
 
 
+def test_nobody_controls_a_hand_before_the_solver_is_compiled(monkeypatch):
+    compiled = threading.Event()
+    monkeypatch.setattr("services.pipelines.teleoperation.app.warm_up", compiled.wait)
+    with served({"teleoperation": create_app(TeleoperationSettings())}) as urls:
+        url = urls["teleoperation"]
+        assert httpx.get(f"{url}/readyz").json()["waiting_for"] == ["solver"]
+        with controller(url) as robot, pytest.raises(ConnectionClosed) as closed:
+            robot.receive()
+        assert "the solver is being compiled" in closed.value.rcvd.reason
+        compiled.set()
+        until_ready(url)
+
+
 def test_keys_need_the_scope_teleop():
     keys = (
         ApiKey(name="robot", key=KEY, scopes=("teleop",)),
@@ -218,6 +242,7 @@ def test_keys_need_the_scope_teleop():
     app = create_app(TeleoperationSettings(api_keys=keys))
     with served({"teleoperation": app}) as urls:
         url = urls["teleoperation"]
+        until_ready(url)
         with controller(url, key=KEY) as robot:
             assert robot.start()["name"] == "Wuji Hand 2 right"
         for key in (None, OTHER):
