@@ -38,6 +38,7 @@ SECTIONS: Final = {
     "world_model": "world_model.settings:WorldModelSettings",
     "rating": "evaluation.settings:RatingSettings",
     "studies": "evaluation.settings:StudyServiceSettings",
+    "teleoperation": "pipelines.teleoperation.settings:TeleoperationSettings",
     "rating_report": "evaluation.settings:RatingReportSettings",
     "evaluation_run": "evaluation.settings:RunSettings",
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
@@ -51,7 +52,7 @@ SECTIONS: Final = {
     "world_model_adapt_state": "world_model.settings:AdaptStateCommand",
 }
 # Those of `config example` unless others are named.
-SERVICES: Final = tuple(SECTIONS)[:9]
+SERVICES: Final = tuple(SECTIONS)[:10]
 MASK: Final = "***"
 DEFAULT: Final = "default"
 REQUIRED: Final = "required"

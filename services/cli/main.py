@@ -83,6 +83,12 @@ COMMANDS = {
         "alignment.settings:default_parser",
     ),
     "align serve": Command("serve alignment over HTTP", "alignment.app:main", "alignment"),
+    "teleop": Command("follow a tracked hand live with a robot hand"),
+    "teleop serve": Command(
+        "serve commands for a robot hand that follows a tracked one",
+        "pipelines.teleoperation.app:main",
+        "teleoperation",
+    ),
     "train": Command("train the world model, its judge of success, or a policy"),
     "train data": Command(
         "record training episodes in the twin",

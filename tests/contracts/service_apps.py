@@ -71,6 +71,13 @@ def rating(folder, **settings):
     return create_rating_app(RatingSettings(**paths, **settings))
 
 
+def teleoperation(_, **settings):
+    from services.pipelines.teleoperation.app import create_app
+    from services.pipelines.teleoperation.settings import TeleoperationSettings
+
+    return create_app(TeleoperationSettings(**settings))
+
+
 # The services of `dextouch up` by name.
 UP = {
     "acquisition": acquisition,
@@ -85,6 +92,7 @@ UP = {
 APPS = {name: make for name, make in UP.items() if make is not worlds} | {
     "worlds": worlds,
     "rating": rating,
+    "teleoperation": teleoperation,
 }
 
 

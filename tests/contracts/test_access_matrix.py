@@ -25,6 +25,7 @@ SCOPES = (
     "watch",
     "study_read",
     "rate",
+    "teleop",
     "operate",
     "enrol",
 )
@@ -129,11 +130,16 @@ TABLE = {
         "GET /v1/rating/rollouts/{token}/steps/{step}.jpg": "rate",
         "POST /v1/rating/marks": "rate",
     },
+    "teleoperation": {
+        "WEBSOCKET /v1/teleop/{side}": "teleop",
+        "POST /v1/teleop/{side}/stop": "teleop",
+    },
 }
 # The page where raters enter their key, and its files.
 RATING_PAGE = {"GET /", "GET /rate.js", "GET /rate.css", "GET /rate.svg"}
 SIGN_IN = {"POST /sign_in", "POST /sign_out"}
 PATH_VALUES = {"number": "0", "chunk": "0", "step": "0", "token": "0" * 20, "watch_id": "0" * 32}
+PATH_VALUES |= {"side": "right"}
 WRONG_KEY = "wrong-key-of-some-length"
 
 
@@ -188,7 +194,7 @@ async def ask(client, operation, **given):
     """Status, and reason if refused, of a request or WebSocket."""
     method, path = operation.split()
     if method == "WEBSOCKET":
-        return await ask_websocket(client._transport.app, path, given)
+        return await ask_websocket(client._transport.app, filled(path), given)
     if path.endswith("/batches/{number}"):
         octets = {"content-type": "application/octet-stream"}
         given |= {"content": b"x", "headers": octets | given.get("headers", {})}

@@ -11,7 +11,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files
 from typing import Any, Final, Literal, NamedTuple
 
@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import transform
-from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
+from dextouch.geometry.rotations import rotation_from_quaternion
 from dextouch.hands.skeleton import CHAINS
 
 NUM_JOINTS: Final = 20
@@ -87,11 +87,23 @@ class _Chains:
         tips_m = np.array([finger.tip_m for finger in fingers])
         return cls(is_joint, offsets, axes, tips_m, np.array([each.points for each in fingers]))
 
+    @cached_property
+    def _cross(self) -> Float64[np.ndarray, "*hands fingers hinges 3 3"]:
+        """Cross product matrices of the axes."""
+        return np.cross(np.eye(3), self.axes[..., None, :])
+
+    @cached_property
+    def _cross_squared(self) -> Float64[np.ndarray, "*hands fingers hinges 3 3"]:
+        return self._cross @ self._cross
+
     def frames(
         self, angles_rad: Float64[np.ndarray, "time *hands fingers hinges"]
     ) -> Float64[np.ndarray, "time *hands fingers hinges 4 4"]:
         """T_wrist_joint of every hinge after its rotation; padding repeats the last frame."""
-        turns = transform(rotation_from_vector(angles_rad[..., None] * self.axes), np.zeros(3))
+        angles = angles_rad[..., None, None]
+        # Rodrigues' formula; axes are unit vectors, of padding zero.
+        R = np.eye(3) + np.sin(angles) * self._cross + (1 - np.cos(angles)) * self._cross_squared
+        turns = transform(R, np.zeros(3))
         frames = np.empty(turns.shape)
         T_wrist_parent = np.broadcast_to(np.eye(4), frames[..., 0, :, :].shape)
         for hinge in range(self.axes.shape[-2]):

@@ -23,7 +23,7 @@ station calibrate show, station calibrate time, station calibrate wrist, station
 station serve,
 store clicks, store delete, store deletions, store enrol, store list, store purge,
 store repair, store restore, store revoke, store serve, store show, store stations, store verify,
-study report, study run, study serve,
+study report, study run, study serve, teleop serve,
 train adapt, train data, train distill, train imagined, train judge, train policy,
 train tokenizer, train world-model,
 twin record, twin serve, up
@@ -32,7 +32,7 @@ NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 # Services run until they are stopped and answer over HTTP: they have no result to write.
 WITHOUT_JSON = {
     "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve",
-    "study serve", "twin serve",
+    "study serve", "teleop serve", "twin serve",
     # These print a file.
     "align markers", "completion", "config example",
 }  # fmt: skip
@@ -41,6 +41,7 @@ GROUPS = {
     "train": tuple(main.commands_of("train")),
     "station": tuple(main.commands_of("station")),
     "rate": tuple(main.commands_of("rate")),
+    "teleop": tuple(main.commands_of("teleop")),
     "config": tuple(main.commands_of("config")),
 }
 EXAMPLE = re.compile(r"^examples?:\n((?:  .*(?:\n|$))+)", re.MULTILINE | re.IGNORECASE)

@@ -1,0 +1,1 @@
+"""Benchmark of teleoperation: the service, and a loop that answers every sample."""
