@@ -1,0 +1,37 @@
+"""A station that says while recording whether the robot's hand could follow the operator's."""
+
+import gc
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from dextouch.errors import UnavailableError
+from dextouch.schemas import Matrix
+from dextouch.tactile.layout import Side
+from services.acquisition import app
+
+if TYPE_CHECKING:
+    from services.pipelines.robot_following import RobotHandCheck
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run a station until SIGINT or SIGTERM."""
+    return app.main(argv, follow=load_robot_check)
+
+
+def load_robot_check(side: Side, calibration: Mapping[str, Matrix]) -> "RobotHandCheck":
+    """The check of one hand; loads the compiled solver, which takes seconds.
+
+    Raises:
+        UnavailableError: the packages of alignment are not installed.
+        InvalidInputError: the calibration has an invalid profile or wrist frame.
+    """
+    try:
+        from services.pipelines.robot_following import RobotHandCheck
+    except ModuleNotFoundError as error:
+        raise UnavailableError(
+            f"{error.name} is not installed; install it with pip install 'dextouch-wm[align]'"
+        ) from error
+    check = RobotHandCheck(side, calibration)
+    # Compiled code and its modules stay: collections that visit them would hold up the readers.
+    gc.freeze()
+    return check
