@@ -178,8 +178,8 @@ class FollowWatch:
             self._looks.start()
 
     def stop(self) -> None:
-        """End the thread, after the check that is under way."""
-        self._looks.stop()
+        """End the thread; what it loads or checks at this moment is not waited for."""
+        self._looks.cancel()
 
     def accept(self, readings: Readings) -> None:
         """Remember the newest sample of a hand (called by the reader threads)."""

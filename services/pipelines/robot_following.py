@@ -14,6 +14,7 @@ from services.alignment.retargeting import (
     RetargetOptions,
     RetargetResult,
     RetargetStatus,
+    warm_up,
 )
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.wrist_frame import (
@@ -149,3 +150,7 @@ class RobotHandCheck:
         tips_m = self._retargeter.hand.fingertips_m(joints_rad[None])[0]
         robot_m = np.linalg.norm(tips_m - tips_m[thumb], axis=-1)
         return np.where(touches, robot_m - apart_m, 0.0)
+
+
+if __name__ == "__main__":
+    warm_up()
