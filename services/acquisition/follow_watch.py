@@ -110,6 +110,8 @@ class _Hand:
     def look(self, make: MakeFollowCheck, calibration: Mapping[str, Matrix]) -> None:
         """Check the newest sample, if it is new."""
         if self._check is None:
+            if self.note != LOADING:
+                return  # It could not be made, and nothing changes that.
             self._check = make(self._side, calibration)
         sample, before_ns = self.newest, self._before_ns
         if sample is None or (before_ns is not None and sample.t_host_ns <= before_ns):

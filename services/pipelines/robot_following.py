@@ -1,5 +1,6 @@
 """Live check whether the robot's hand can follow a tracked hand, and why not, finger by finger."""
 
+import os
 from collections.abc import Mapping
 from typing import Final
 
@@ -153,4 +154,6 @@ class RobotHandCheck:
 
 
 if __name__ == "__main__":
+    # The station that waits for it records meanwhile.
+    os.nice(10)
     warm_up()

@@ -29,24 +29,28 @@ def load_robot_check(side: Side, calibration: Mapping[str, Matrix]) -> "RobotHan
         InvalidInputError: the calibration has an invalid profile or wrist frame.
     """
     _compile_apart()
+    # Collections of the many objects that it makes would hold up the readers: none while it loads,
+    # and none visits them afterwards, since they stay.
+    gc.disable()
     try:
         from services.pipelines.robot_following import RobotHandCheck
+
+        return RobotHandCheck(side, calibration)
     except ModuleNotFoundError as error:
         raise UnavailableError(
             f"{error.name} is not installed; install it with pip install 'dextouch-wm[align]'"
         ) from error
-    check = RobotHandCheck(side, calibration)
-    # Compiled code and its modules stay: collections that visit them would hold up the readers.
-    gc.freeze()
-    return check
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @cache
 def _compile_apart() -> None:
     """Compile the solver, once a machine, in a process of its own, which leaves it in the cache.
 
-    In this one it would hold up the readers: while it compiled, threads woke up to 0.39 s late, and
-    0.06 s while it was loaded (5 ms timer on two busy cores).
+    In this one it would hold up the readers: a thread with a 5 ms timer woke up to 0.39 s late
+    while it compiled, and wakes up to 34 ms late while it is loaded (two busy cores; else 23 ms).
     """
     compiling = (sys.executable, "-m", f"{__package__}.robot_following")
     subprocess.run(compiling, check=False, stderr=subprocess.DEVNULL)  # noqa: S603 - this program

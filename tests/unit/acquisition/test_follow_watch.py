@@ -106,6 +106,19 @@ def test_what_cannot_be_checked_says_why_and_is_tried_again():
     assert watched.counts()["keypoints_left"].num_checks == 1
 
 
+def test_a_check_that_cannot_be_made_is_not_made_again():
+    asked = []
+
+    def refuse(side, calibration):
+        asked.append(side)
+        raise InvalidInputError("no valid profile")
+
+    watched = FollowWatch([STREAM], {}, refuse, clock=VirtualClock())
+    see(watched, 100, 140)
+    assert asked == ["left"]
+    assert live(watched, 140).message == "robot's hand not checked: no valid profile"
+
+
 def test_a_check_that_fails_ends_nothing():
     watched = watch(Script(ZeroDivisionError(), {}))
     see(watched, 100)
