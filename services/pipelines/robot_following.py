@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands import chain_indices
 from dextouch.schemas import FollowCause, Matrix
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting import (
@@ -27,13 +26,10 @@ from services.alignment.retargeting.wrist_frame import (
 
 # Tip errors from which a finger is not followed. Of motions that the robot can make, simulated
 # people leave up to 10 mm (99th percentile) and 19.5 mm (largest of 7200 samples, 30 Hz), most in
-# pinches; beside a joint that is held at a limit or by its speed, less proves it.
+# pinches: the solver moves tips to close them, so that one it cannot close shows here, too. Beside a
+# joint that is held at a limit or by its speed, less proves it.
 BLOCKED_M: Final = 0.010
 REACH_M: Final = 0.020
-# Thumb and finger of the person touch or nearly do, and the robot's are so much further apart: the
-# same people leave at most 4.2 mm.
-PINCH_M: Final = 0.020
-PINCH_GAP_M: Final = 0.008
 # Joints end exactly at their limits; rounding only.
 AT_LIMIT_RAD: Final = 1e-6
 # Of the axes of the keypoints, a second at 30 Hz: turned axes would look like joint limits.
@@ -64,7 +60,6 @@ class RobotHandCheck:
         counts = [len(finger.joints) for finger in hand.fingers]
         self._fingers = np.split(np.arange(len(hand.joint_names)), np.cumsum(counts)[:-1])
         self._names = [finger.chain for finger in hand.fingers]
-        self._tips = [chain_indices(finger.chain)[-1] for finger in hand.fingers]
         self._before_rad: np.ndarray | None = None
         self._first: list[np.ndarray] | None = []
         # Loads the compiled solver.
@@ -90,7 +85,7 @@ class RobotHandCheck:
         if self._T_keypoints_wrist is not None:
             keypoints = to_wrist_axes(keypoints[None], self._T_keypoints_wrist)[0]
         result = self._retargeter.step(keypoints, elapsed_s)
-        causes = self._causes(keypoints, result, elapsed_s)
+        causes = self._causes(result, elapsed_s)
         self._before_rad = result.joints_rad[0]
         return causes
 
@@ -108,9 +103,7 @@ class RobotHandCheck:
         self._first = None
         return True
 
-    def _causes(
-        self, keypoints: np.ndarray, result: RetargetResult, elapsed_s: float
-    ) -> dict[str, FollowCause]:
+    def _causes(self, result: RetargetResult, elapsed_s: float) -> dict[str, FollowCause]:
         hand, joints_rad = self._retargeter.hand, result.joints_rad[0]
         at_limit = (joints_rad <= hand.lower_rad + AT_LIMIT_RAD) | (
             joints_rad >= hand.upper_rad - AT_LIMIT_RAD
@@ -118,39 +111,21 @@ class RobotHandCheck:
         step_rad = self._retargeter.options.velocity_limit_rad_s * elapsed_s - AT_LIMIT_RAD
         before_rad = joints_rad if self._before_rad is None else self._before_rad
         too_fast = np.abs(joints_rad - before_rad) >= step_rad
-        gaps_m = self._pinch_gaps_m(keypoints, joints_rad)
         causes: dict[str, FollowCause] = {}
         for finger, (name, joints) in enumerate(zip(self._names, self._fingers, strict=True)):
             status, off_m = result.finger_status[0, finger], result.tip_error_m[0, finger]
-            is_open = gaps_m[finger] > PINCH_GAP_M
-            is_off = off_m > BLOCKED_M or is_open
-            if status >= RetargetStatus.IMPLAUSIBLE:
-                causes[name] = "unseen"
-            elif is_off and status == RetargetStatus.REACQUIRED:
-                # It still comes from where it was when it was lost.
+            is_off = off_m > BLOCKED_M
+            # One that was lost still comes from where it was then.
+            is_late = is_off and status == RetargetStatus.REACQUIRED
+            if is_late or status >= RetargetStatus.IMPLAUSIBLE:
                 causes[name] = "unseen"
             elif is_off and too_fast[joints].any():
                 causes[name] = "speed"
             elif is_off and at_limit[joints].any():
                 causes[name] = "limit"
-            elif off_m > REACH_M or is_open:
+            elif off_m > REACH_M:
                 causes[name] = "reach"
         return causes
-
-    def _pinch_gaps_m(self, keypoints: np.ndarray, joints_rad: np.ndarray) -> np.ndarray:
-        """By how much the robot's fingertips are further from the thumb's than touching ones."""
-        if "thumb" not in self._names:
-            return np.zeros(len(self._names))
-        thumb = self._names.index("thumb")
-        tracked_m = keypoints[self._tips]
-        apart_m = np.linalg.norm(tracked_m - tracked_m[thumb], axis=-1)
-        touches = apart_m < PINCH_M
-        touches[thumb] = False
-        if not touches.any():
-            return np.zeros(len(self._names))
-        tips_m = self._retargeter.hand.fingertips_m(joints_rad[None])[0]
-        robot_m = np.linalg.norm(tips_m - tips_m[thumb], axis=-1)
-        return np.where(touches, robot_m - apart_m, 0.0)
 
 
 if __name__ == "__main__":

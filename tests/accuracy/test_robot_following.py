@@ -105,6 +105,16 @@ def test_a_finger_that_is_lost_is_not_tracked():
     assert share == pytest.approx(10 / 31)
 
 
+def test_a_finger_that_was_lost_is_not_too_fast_when_it_returns():
+    """It returns as a fist, 100 degrees away: the robot's needs 0.18 s, six samples."""
+    keypoints = held(mean_hand_m("right"))
+    keypoints[20:] = bent(mean_hand_m("right"), "ring", FLEXION, [80, 100, 60])
+    keypoints[10:20, chain_indices("ring")] = np.nan
+    _, causes = followed(keypoints)
+    assert {*causes} == {("ring", "unseen")}
+    assert 12 <= causes["ring", "unseen"] <= 16
+
+
 def test_turned_axes_are_refused_and_those_of_the_calibration_are_followed():
     R = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     joints = moving_joints(RobotHand("right"), 200, 1, natural=True)[::2]
