@@ -26,8 +26,8 @@ from services.alignment.retargeting.wrist_frame import (
 
 # Tip errors from which a finger is not followed. Of motions that the robot can make, simulated
 # people leave up to 10 mm (99th percentile) and 19.5 mm (largest of 7200 samples, 30 Hz), most in
-# pinches: the solver moves tips to close them, so that one it cannot close shows here, too. Beside a
-# joint that is held at a limit or by its speed, less proves it.
+# pinches: the solver moves tips to close them, so that one it cannot close shows here, too. Beside
+# a joint that is held at a limit or by its speed, less proves it.
 BLOCKED_M: Final = 0.010
 REACH_M: Final = 0.020
 # Joints end exactly at their limits; rounding only.
