@@ -11,6 +11,7 @@ from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.health import HealthCollector
 from services.acquisition.health.metrics import RecorderCollector
 from services.acquisition.memory import keep_for_life
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
 
 
-def _real_station(settings: AcquisitionSettings) -> Station:
+def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> Station:
     """A station of real devices; those that are absent are waited for in the background."""
     clock = StationClock()
     return Station(
@@ -35,10 +36,11 @@ def _real_station(settings: AcquisitionSettings) -> Station:
         clock=clock,
         calibration=load_calibration(settings.calibration),
         safety=settings,
+        follow=follow,
     )
 
 
-def _mock_station(settings: AcquisitionSettings) -> "MockStation":
+def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> "MockStation":
     """A station whose mock devices play an episode, or a pattern."""
     from services.acquisition.mock_station import MockStation
     from services.acquisition.mocks.faults import FaultScript
@@ -66,6 +68,7 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
         calibration={**known, **load_calibration(settings.calibration)},
         links=settings.mock_links,
         safety=settings,
+        follow=follow,
     )
 
 
@@ -92,12 +95,18 @@ def _make_uploader(settings: AcquisitionSettings, recorder: Recorder) -> Uploade
     )
 
 
-def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) -> FastAPI:
+def create_app(
+    settings: AcquisitionSettings,
+    uploader: Uploader | None = None,
+    *,
+    follow: MakeFollowCheck | None = None,
+) -> FastAPI:
     """A station; takes that an earlier process left unfinished are closed first.
 
     Args:
         settings: devices, spool and store.
         uploader: how takes reach the store; made from the settings when not given.
+        follow: as of `Station`.
 
     Raises:
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.
@@ -107,8 +116,8 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     with disk_errors(f"make the spool {settings.spool}"):
         settings.spool.mkdir(parents=True, exist_ok=True)
     recover_spool(settings.spool)
-    mock = _mock_station(settings) if settings.mock else None
-    station = _real_station(settings) if mock is None else mock.station
+    mock = _mock_station(settings, follow) if settings.mock else None
+    station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
 
     @asynccontextmanager
@@ -153,11 +162,11 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     return app
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run a station until SIGINT or SIGTERM."""
+def main(argv: Sequence[str], *, follow: MakeFollowCheck | None = None) -> int:
+    """Run a station until SIGINT or SIGTERM; `follow` as of `Station`."""
 
     def create(settings: AcquisitionSettings) -> FastAPI:
-        app = create_app(settings)
+        app = create_app(settings, follow=follow)
         keep_for_life()
         return app
 

@@ -22,6 +22,7 @@ from services.acquisition.devices.kinds import (
 )
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
+from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.cameras_and_robot import (
     CameraSource,
@@ -200,6 +201,7 @@ class MockStation:
         safety: of the spool.
         unit_seed: of the devices' own offsets and gains, and of what the station knows of path
             delays; stations with one value have the same devices. Default: the seed.
+        follow: as of `Station`.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -215,6 +217,7 @@ class MockStation:
         links: MockLinks | None = None,
         safety: SpoolSafety | None = None,
         unit_seed: int | None = None,
+        follow: MakeFollowCheck | None = None,
     ) -> None:
         unit_seed = seed if unit_seed is None else unit_seed
         self.pairs = build_mocks(
@@ -232,6 +235,7 @@ class MockStation:
             calibration={**_known_of(self.pairs, unit_seed), **(calibration or {})},
             safety=safety,
             simulated=True,
+            follow=follow,
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []

@@ -33,6 +33,7 @@ from dextouch.serving import ServedFolder
 from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.follow_watch import FollowWatch
 from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
@@ -68,13 +69,15 @@ class TakeOptions:
 
     `device_events` gives, by device, counts of named events since the station's start (those of the
     drivers if None); `health` provides the findings of the station in the meantime, `latencies` the
-    measured path delays of streams whose delay the calibration does not name.
+    measured path delays of streams whose delay the calibration does not name, `follow` whether the
+    robot's hand could follow the tracked ones.
     """
 
     safety: SpoolSafety = field(default_factory=SpoolSafety)
     device_events: Callable[[], DeviceEvents] | None = None
     health: HealthMonitor | None = None
     latencies: Callable[[], Mapping[str, PathLatency]] = dict
+    follow: FollowWatch | None = None
 
 
 class Recorder:
@@ -252,7 +255,13 @@ class Recorder:
         check_free_space(self.spool_root, self._options.safety)
         spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
         count, health = self._options.device_events, self._options.health
-        watch = TakeWatch(self._drivers, self._clock, device_events=count, health=health)
+        watch = TakeWatch(
+            self._drivers,
+            self._clock,
+            device_events=count,
+            health=health,
+            follow=self._options.follow,
+        )
         self.take = Take(spool, watch, clock=self._clock, safety=self._options.safety)
         self._done = set()
         if health is not None:

@@ -15,6 +15,7 @@ from dextouch.streams import H264_UNIT, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
+from services.acquisition.follow_watch import FollowWatch, MakeFollowCheck
 from services.acquisition.glove_record import NO_CELL, glove_record
 from services.acquisition.health import HealthMonitor
 from services.acquisition.path_latency import PathWatch
@@ -45,6 +46,7 @@ class Station:
         calibration: matrices that travel with every recording.
         safety: how often the spool reaches the disk, and how much space is kept.
         simulated: whether the devices are mocks.
+        follow: makes the check whether the robot's hand can follow a tracked hand; None: no check.
     """
 
     def __init__(  # noqa: PLR0913 - all by name
@@ -57,6 +59,7 @@ class Station:
         calibration: Mapping[str, Matrix],
         safety: SpoolSafety | None = None,
         simulated: bool = False,
+        follow: MakeFollowCheck | None = None,
     ) -> None:
         self.name = name
         self.clock = clock
@@ -65,12 +68,15 @@ class Station:
             DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
         ]
         self.paths = PathWatch(self.supervisors, clock=clock)
+        descriptors = [descriptor for driver in drivers for descriptor in driver.descriptors]
+        self.follow = FollowWatch(descriptors, calibration, follow, clock=clock)
         self.health = HealthMonitor(
             self.supervisors,
             station=name,
             calibration=calibration,
             clock=clock,
             paths=self.paths,
+            follow=self.follow,
             simulated=simulated,
         )
         self.recorder = Recorder(
@@ -84,6 +90,7 @@ class Station:
                 lambda: {s.driver.name: s.events() for s in self.supervisors},
                 self.health,
                 self.paths.latencies,
+                self.follow,
             ),
         )
 
@@ -93,6 +100,7 @@ class Station:
             supervisor.start()
         self.health.start()
         self.paths.start()
+        self.follow.start()
 
     def wait_connected(self, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         """Block until every device answers.
@@ -108,6 +116,7 @@ class Station:
         """Stop everything; an unsaved take stays in the spool."""
         # First, while the readers still bring the answer that it may wait for.
         self.paths.stop()
+        self.follow.stop()
         self.health.stop()
         stoppers = [threading.Thread(target=supervisor.stop) for supervisor in self.supervisors]
         for stopper in stoppers:
@@ -130,6 +139,7 @@ class Station:
         if take is not None:
             take.accept(readings)
         self.live.accept(readings)
+        self.follow.accept(readings)
         now_ns = self.clock.now_ns()
         for name, samples in readings.items():
             self.health.queues[name].add(samples, now_ns)

@@ -22,6 +22,7 @@ from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.follow_watch import FollowCounts, FollowWatch
 from services.acquisition.glove_record import is_ours
 from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.health.causes import SIMULATED_ADVICE
@@ -279,6 +280,7 @@ class TakeWatch:
         device_events: by device, counts of named events since the station's start; those of the
             drivers if None.
         health: of the station.
+        follow: whether the robot's hand could follow the tracked ones.
 
     Attributes:
         streams: counters by name of the samples that the take keeps.
@@ -293,6 +295,7 @@ class TakeWatch:
         *,
         device_events: Callable[[], DeviceEvents] | None = None,
         health: HealthMonitor | None = None,
+        follow: FollowWatch | None = None,
     ) -> None:
         self.streams = {
             d.name: StreamCounters() for driver in drivers.values() for d in driver.descriptors
@@ -309,6 +312,8 @@ class TakeWatch:
         self._facts: list[StreamFacts] = []
         self._host = HostWatch(clock)
         self._findings = TakeFindings(health, self.started_ns)
+        self._count_follow = follow.counts if follow else dict[str, FollowCounts]
+        self._follow = self._count_follow()
 
     @property
     def duration_s(self) -> float:
@@ -326,6 +331,8 @@ class TakeWatch:
         if self.has_ended:
             return
         self._findings.end()
+        after_follow = self._count_follow()
+        self._follow = {n: after_follow[n].since(c) for n, c in self._follow.items()}
         after, self._stopped_ns = self._count(), self._clock.now_ns()
         for name, driver in self._drivers.items():
             before = self._before[name]
@@ -358,7 +365,8 @@ class TakeWatch:
             )
             for fact in self._facts
         )
-        problems = (*own, *self._findings.problems(self.streams, own))
+        followed = self._follow_problems()
+        problems = (*own, *followed, *self._findings.problems(self.streams, own))
         cause = self._findings.cause(problems)
         if self._host.events["host_suspended"]:
             cause = TakeCause(message=self.host_problems()[0], advice=SUSPENDED)
@@ -369,6 +377,12 @@ class TakeWatch:
             problems=problems,
             cause=cause,
         )
+
+    def _follow_problems(self) -> Iterator[TakeProblem]:
+        for name, counts in self._follow.items():
+            share = counts.figures().get("not_followed_ratio", 0.0)
+            if share > CODES["not_followed"].warn:
+                yield _problem(name, "not_followed", "WARN", counts.words())
 
     def ledger(self) -> tuple[LedgerEntry, ...]:
         """Everything that was noticed during the take, counted."""
@@ -391,6 +405,8 @@ class TakeWatch:
     def quality(self) -> dict[str, float]:
         """Figures of the ended take by stream; the episode takes them over."""
         quality = self._findings.quality()
+        for name, counts in self._follow.items():
+            quality |= {f"{name}_{figure}": n for figure, n in counts.figures().items()}
         for fact in self._facts:
             name, rate_hz = fact.descriptor.name, fact.rate_hz
             quality[f"{name}_largest_gap_s"] = fact.largest_gap_s

@@ -45,7 +45,7 @@ COMMANDS = {
     "twin serve": Command("serve rollouts in the twin", "twin.serving:serve", "twin"),
     "station": Command("record and calibrate a station's devices"),
     "station serve": Command(
-        "record gloves, trackers and cameras", "acquisition.app:main", "acquisition"
+        "record gloves, trackers and cameras", "pipelines.station:main", "acquisition"
     ),
     "station enrol": Command(
         "exchange a one-time token for the station's key of the store",

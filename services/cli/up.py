@@ -150,8 +150,10 @@ def _alignment(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
 
 def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     from services.acquisition.app import create_app
+    from services.pipelines.station import load_robot_check
 
-    return create_app(_station(settings, episode_store_url=urls["episode_store"]))
+    station = _station(settings, episode_store_url=urls["episode_store"])
+    return create_app(station, follow=load_robot_check)
 
 
 def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":

@@ -13,6 +13,7 @@ from dextouch.schemas import (
     Problem,
     RecorderSession,
     RecorderStatus,
+    RobotFollowing,
     StationHealth,
     StreamHealth,
     TakePrompt,
@@ -108,6 +109,7 @@ class StationView(FrozenModel):
     streams: tuple[StreamView, ...] = ()
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
     gloves: Mapping[str, GloveView] = {}
+    following: Mapping[str, RobotFollowing] = {}
 
 
 def trouble(error: DexTouchError, address: str) -> tuple[str, str]:
@@ -160,6 +162,11 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
             item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s)
             for item in station.streams
             if item.hand is not None and item.stream == f"tactile_{item.hand}"
+        },
+        following={
+            item.hand: item.following
+            for item in station.streams
+            if item.hand is not None and item.following is not None
         },
     )
 

@@ -27,7 +27,7 @@ QUICK = (
 )
 # Told to whoever asks while a sample is overdue; what needs minutes of asking the device; and what
 # happens to the computer (test_health_chaos.py).
-TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused"}
+TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused", "not_followed"}
 TESTED_ELSEWHERE |= {"overload", "host_suspended", "wall_clock_set"}
 
 

@@ -117,6 +117,8 @@ CODES: Final[Mapping[str, Rule]] = {
         "Adjust exposure or lighting, and make sure that nothing covers the lens."),
     "image_gap": Rule(0.0, 1.0, "s", "now", "how long the camera's timestamps lack images",
         "Connect the camera to a port of its own; it skips images."),
+    "not_followed": Rule(0.05, NEVER, "%", "take", "time that the robot's hand could not follow",
+        "Record it again slower, and within the joint limits of the robot's hand."),
     "disk": Rule(-1800.0, -300.0, "min left", "10 s", "time to a full disk at this data rate",
         "Upload and delete takes, or use a larger disk for the spool."),
     "calibration_missing": Rule(0.0, 0.0, "", "now", "matrices without which there is no episode",

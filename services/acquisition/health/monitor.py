@@ -16,6 +16,7 @@ from dextouch.schemas import (
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.follow_watch import FollowWatch
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.cells import TaxelCheck, cell_judge, refused_taxels
@@ -178,6 +179,7 @@ class HealthMonitor:
         calibration: of the station.
         clock: of the station.
         paths: measured path delays, which are compared with the calibration.
+        follow: says of tracked hands whether the robot's can follow them.
         simulated: whether the devices are mocks, of which nothing can be plugged or replaced.
 
     Attributes:
@@ -186,7 +188,7 @@ class HealthMonitor:
         nominal_rates_hz: of the streams.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all but the first by name
         self,
         supervisors: Sequence[DeviceSupervisor],
         *,
@@ -194,10 +196,12 @@ class HealthMonitor:
         calibration: Mapping[str, Matrix],
         clock: StationClock,
         paths: PathWatch | None = None,
+        follow: FollowWatch | None = None,
         simulated: bool = False,
     ) -> None:
         self._station = station
         self._simulated = simulated
+        self._follow = follow
         self._supervisors = list(supervisors)
         self._clock = clock
         self._log = EventLog()
@@ -284,6 +288,8 @@ class HealthMonitor:
     def _health(self, stream: _WatchedStream, now_ns: int) -> StreamHealth:
         """A stream at this moment, without advice about plugs and cables that a mock has not."""
         health = stream.health(now_ns)
+        if self._follow is not None and (following := self._follow.live(stream.name, now_ns)):
+            health = health.model_copy(update={"following": following})
         if not self._simulated:
             return health
         findings = [f.model_copy(update={"advice": SIMULATED_ADVICE}) for f in health.findings]

@@ -5,6 +5,7 @@ import { css } from "./canvas.js";
 import { DevicesPanel } from "./devices.js";
 import { element, setText } from "./dom.js";
 import { age } from "./format.js";
+import { FollowLines } from "./following.js";
 import { Freshness } from "./freshness.js";
 import { drawScale, HandCanvas, readTaxels } from "./hands.js";
 import { showRefused, showServices, showTakes } from "./lists.js";
@@ -33,6 +34,7 @@ function textsOf(side) {
 const poses = new PoseView(find("pose_canvas"), find("pose_list"), heatmap.bones);
 const cameras = new CameraPanel(find("cameras"), find("camera_row"), find("camera_larger"));
 const recorder = new RecorderPanel(find("recorder"));
+const following = new FollowLines(find, recorder.sounds);
 const devices = new DevicesPanel(find("devices"));
 drawScale(find("scale"), heatmap);
 setText(find("scale_end"), `${heatmap.full_scale_kpa} kPa`);
@@ -73,6 +75,7 @@ function showStation(station) {
   devices.show(station);
   recorder.show(station.recorder, station.level);
   showGloves(station.gloves ?? {});
+  following.show(station.following ?? {}, station.recorder.state === "recording");
 }
 
 const topics = {

@@ -5,6 +5,7 @@ const TONES = {
   start: [[660, 0, 0.11, "sine"], [990, 0.12, 0.2, "sine"]],
   stop: [[880, 0, 0.11, "sine"], [440, 0.12, 0.22, "sine"]],
   saved: [[523, 0, 0.1, "sine"], [659, 0.1, 0.1, "sine"], [784, 0.2, 0.24, "sine"]],
+  follow: [[587, 0, 0.14, "triangle"]],
   problem: [[185, 0, 0.2, "square"], [185, 0.28, 0.34, "square"]],
 };
 const VOLUME = 0.25;

@@ -129,6 +129,7 @@ from .station import DeletionStatus as DeletionStatus
 from .station import DeviceHealth as DeviceHealth
 from .station import EnrolmentToken as EnrolmentToken
 from .station import EnrolStation as EnrolStation
+from .station import FollowCause as FollowCause
 from .station import HealthCause as HealthCause
 from .station import HealthEvent as HealthEvent
 from .station import HealthEvents as HealthEvents
@@ -141,6 +142,7 @@ from .station import RecorderAction as RecorderAction
 from .station import RecorderSession as RecorderSession
 from .station import RecorderState as RecorderState
 from .station import RecorderStatus as RecorderStatus
+from .station import RobotFollowing as RobotFollowing
 from .station import SavedTakes as SavedTakes
 from .station import SaveTake as SaveTake
 from .station import SharedLink as SharedLink

@@ -15,6 +15,8 @@ HealthLevel = Literal["OK", "WARN", "ERROR", "STALE"]
 StaleCode = Literal["unplugged", "silent"]
 LinkKind = Literal["hub", "network", "bridge"]
 TaxelState = Literal["dead", "stuck", "saturated", "drifting", "gone", "refused", "absent"]
+# Why a robot's hand cannot follow a person's finger (docs/retargeting.md).
+FollowCause = Literal["limit", "speed", "reach", "unseen"]
 CauseCode = Literal["host", "hub", "network", "bridge", "gone", "clock", "device", "station"]
 KEY_NAME_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
 KeyName = Annotated[str, Field(pattern=KEY_NAME_PATTERN)]
@@ -170,6 +172,19 @@ class RaisedFinding(FrozenModel):
     lasted_s: float | None
 
 
+class RobotFollowing(FrozenModel):
+    """Whether the robot's hand can follow a tracked hand at this moment (docs/retargeting.md).
+
+    WARN: not the `fingers`, by cause, and that for `lasted_s`; STALE: it is not checked. `message`
+    says it in words.
+    """
+
+    level: HealthLevel
+    message: str
+    fingers: dict[str, FollowCause] = Field(default_factory=dict)
+    lasted_s: float = 0.0
+
+
 class StreamHealth(FrozenModel):
     """One stream at this moment; `lost` and `received` count its device's packets since start.
 
@@ -177,7 +192,7 @@ class StreamHealth(FrozenModel):
     messages. `figures` are the numbers behind them by their Prometheus names, none while the
     stream is stale. Of a glove, `taxels` are those out of order by their state, in anatomical
     order (`dextouch.tactile.layout`), and `tare_age_s` is the age of its tare where the calibration
-    says when it was made.
+    says when it was made. `following` is that of a tracked hand, where the station checks it.
     """
 
     stream: str
@@ -198,6 +213,7 @@ class StreamHealth(FrozenModel):
     clock_residual_ms: float | None = None
     taxels: dict[TaxelState, tuple[int, ...]] = Field(default_factory=dict)
     tare_age_s: float | None = None
+    following: RobotFollowing | None = None
 
 
 class SharedLink(FrozenModel):
