@@ -1,4 +1,4 @@
-"""A HID device read by a process of its own; the device is a socket with a queue as the kernel's."""
+"""A HID device that a process of its own reads; the device is a socket with the kernel's queue."""
 
 import os
 import signal
