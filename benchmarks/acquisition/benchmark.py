@@ -9,7 +9,14 @@ from benchmarks.acquisition.families import make_families
 from benchmarks.acquisition.noise import Line, count_split_differences, judge
 from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.speed import measure_speed
-from benchmarks.acquisition.tables import panels, requirements, tables
+from benchmarks.acquisition.starved import Load, Way, run_starved
+from benchmarks.acquisition.tables import (
+    panels,
+    requirements,
+    starved_requirement,
+    starved_table,
+    tables,
+)
 from benchmarks.figures import Figure
 from benchmarks.report import StageReport
 from benchmarks.stages import Amounts, Bar
@@ -20,6 +27,11 @@ AMOUNTS = Amounts(
     quick={"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5},
 )
 _NUM_PTY_ROUNDS = 3
+STARVED: tuple[tuple[Load, Way], ...] = (
+    ("idle", "process"),
+    ("starved", "thread"),
+    ("starved", "process"),
+)
 _BLOCKS = 500
 
 
@@ -62,14 +74,25 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         for index in range(num_pty_rounds):
             step(f"run {index + 1}")
             runs.append(run_ptys(plan["seconds"]))
+    starved = {}
+    with bar("starved computer", len(STARVED)) as step:
+        for load, way in STARVED:
+            step(f"{load}, {way}")
+            starved[load, way] = run_starved(load, way, plan["seconds"])
     share = Figure.of([100 * run["cpu_s"] / run["seconds"] / NUM_STREAMS for run in runs])
     return StageReport(
         stage="acquisition",
         packages=("numpy", "pyserial"),
         options={**plan, "seed": seed},
-        tables=tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
+        tables=[
+            *tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
+            starved_table(starved),
+        ],
         panels=panels(judgements, speeds),
-        requirements=requirements(judgements, driver_us, splits, share),
+        requirements=[
+            *requirements(judgements, driver_us, splits, share),
+            starved_requirement(starved),
+        ],
         data={
             "line": asdict(LINE),
             "judgements": [asdict(found) for found in judgements],
@@ -88,6 +111,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 for talk in talks
             ],
             "eight_gloves": runs,
+            "starved": [
+                {"load": load, "way": way, **found} for (load, way), found in starved.items()
+            ],
         },
         notes=[
             "justfloat has no checksum: no decoder can detect errors that leave a plausible "

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from benchmarks.acquisition.drivers import DeviceTalk
 from benchmarks.acquisition.noise import Judgement, Line
 from benchmarks.acquisition.speed import READ_SIZES, WHOLE
+from benchmarks.acquisition.starved import Load, Way
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_most
 from benchmarks.report import ResultTable, cells
@@ -12,6 +13,7 @@ from benchmarks.report import ResultTable, cells
 OURS = "ours"
 CHECKED = ("dextouch", "wuji")
 GLOVE = "glove "
+Starved = Mapping[tuple[Load, Way], Mapping[str, float]]
 Speeds = Mapping[tuple[str, str, int], Figure]
 
 
@@ -68,6 +70,28 @@ def tables(
             [("open, read, stamp, decode", core_share.text())],
         ),
     ]
+
+
+def starved_table(starved: Starved) -> ResultTable:
+    """Packets lost where busy threads and processes take the processors."""
+    return ResultTable(
+        "Finger tracker (HID) and glove (serial) among 4 busy threads and 4 busy processes "
+        "(starved), or alone (idle), by what reads the HID device",
+        ("load, HID reader", "fingers lost (%)", "glove lost (%)", "reader process (% of a core)"),
+        [
+            (
+                f"{load}, {way}",
+                *cells(100 * found["fingers"], 100 * found["glove"], 100 * found["reader_cpu"]),
+            )
+            for (load, way), found in starved.items()
+        ],
+    )
+
+
+def starved_requirement(starved: Starved) -> Requirement:
+    """Requirement on a HID device that a process of its own reads."""
+    lost = 100 * starved["starved", "process"]["fingers"]
+    return at_most("finger packets lost on a starved computer, reader process", lost, 1.0, "%")
 
 
 def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:

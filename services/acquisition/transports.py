@@ -61,10 +61,15 @@ class HandleTransport(ABC, Generic[Handle]):
     """Way to one device, over what a library opens: a port, a device, a socket, a camera.
 
     Every failure of the link is a DeviceError; an OSError of the library is one.
+
+    Attributes:
+        arrived_ns: when what the last `read` gave arrived, by the station's clock; None where that
+            is when `read` returned.
     """
 
     # What to look at where it cannot be opened.
     advice: ClassVar = "is it plugged in, and allowed by udev?"
+    arrived_ns: int | None = None
 
     def __init__(self, info: TransportInfo) -> None:
         self.info = info

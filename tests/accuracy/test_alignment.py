@@ -257,17 +257,17 @@ def test_streams_that_may_be_absent_are_skipped_and_told(tmp_path):
 
 def test_missing_needed_streams_are_named(tmp_path):
     store = EpisodeStore(tmp_path)
-    write_recording(store, truth_streams("human"), "human", leave_out=("head", "keypoints_right"))
-    with pytest.raises(InvalidInputError, match=r"head.*keypoints_right"):
+    hands = ("wrist_left", "wrist_right", "keypoints_left", "keypoints_right")
+    write_recording(store, truth_streams("human"), "human", leave_out=hands)
+    with pytest.raises(InvalidInputError, match=r"wrist_left.*keypoints_right"):
         align_recording(store, "take", AlignmentOptions())
     with pytest.raises(NotFoundError):
         align_recording(store, "nothing", AlignmentOptions())
     assert store.list(kind="episode") == []
 
 
-@pytest.mark.parametrize("key", ["K_head", "tactile_left_tare_counts"])
-def test_missing_calibration_is_named(tmp_path, key):
-    store = EpisodeStore(tmp_path)
+def test_missing_calibration_is_named(tmp_path):
+    store, key = EpisodeStore(tmp_path), "tactile_left_tare_counts"
     streams = truth_streams("robot")
     write_recording(store, streams, "robot", edit=lambda _, calibration: calibration.pop(key))
     with pytest.raises(InvalidInputError, match=key):

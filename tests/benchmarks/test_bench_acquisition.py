@@ -53,6 +53,8 @@ def test_a_quick_run_measures_everything(run):
     (eight,) = figures["eight_gloves"]
     assert eight["errors"] == 0
     assert eight["packets"] > 0
+    assert [row["way"] for row in figures["starved"]] == ["process", "thread", "process"]
+    assert all(row["sent"] > 0 for row in figures["starved"])
     assert all(r["figure"] is not None for r in figures["requirements"])
     assert "wrong packets of 600, dextouch" in text
 

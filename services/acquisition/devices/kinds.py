@@ -23,14 +23,13 @@ from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, hand_name
+from services.acquisition.hid_process import HidProcessTransport
 from services.acquisition.transports import (
-    HidTransport,
     SerialTransport,
     Transport,
     UsbAddress,
     UsbTransport,
     find_port,
-    hid_opener,
     tcp_transport,
     unix_transport,
 )
@@ -182,15 +181,8 @@ def tracker_transport(settings: TrackerSettings) -> Transport:
     if settings.port is not None:
         return tcp_transport(settings.host, settings.port)
     # Validated: without a bridge there are both ids.
-    ids = {"vendor_id": settings.vendor_id or 0, "product_id": settings.product_id or 0}
-    address = UsbAddress(**ids, serial_number=settings.serial_number)
-    if settings.link == "usb":
-        return UsbTransport(address)
-    return HidTransport(
-        hid_opener(**ids, serial_number=settings.serial_number),
-        address=str(address),
-        serial_number=settings.serial_number,
-    )
+    address = UsbAddress(settings.vendor_id or 0, settings.product_id or 0, settings.serial_number)
+    return UsbTransport(address) if settings.link == "usb" else HidProcessTransport(address)
 
 
 _MATRICES = TypeAdapter(dict[str, Matrix])

@@ -135,7 +135,8 @@ def glove_stream(side: Side, label: str | None, **about: Any) -> StreamDescripto
 class Driver:
     """One device: opens its transport, stamps what arrives, decodes it.
 
-    The stamp is taken right after `read` returns; all packets of one read share it.
+    The stamp is the transport's, or taken right after `read` returns; all packets of one read share
+    it.
     """
 
     def __init__(
@@ -195,7 +196,7 @@ class Driver:
             DeviceError: the device is disconnected or uses another protocol.
         """
         data = self.transport.read()
-        t_host_ns = self._clock.now_ns()
+        t_host_ns = self.transport.arrived_ns or self._clock.now_ns()
         return self.decoder.decode(data, t_host_ns) if data else {}
 
     def close(self) -> None:

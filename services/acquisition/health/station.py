@@ -26,8 +26,11 @@ from services.acquisition.supervisor import DeviceSupervisor
 
 MIN_RATE_SPAN_NS = 900_000_000
 CALIBRATED_AT = "calibrated_at_unix_s"
-# A tenth of a second apart: the last 10 s at least half full.
-MIN_WAKES = 50
+# Half of the last 10 s must be known. A wake stands for the wait before it and for how late it was,
+# a second of that at most: one long stop is no overload.
+WAIT_S = 0.1
+MAX_COUNTED_LATE_S = 1.0
+MIN_KNOWN_S = 5.0
 PERCENTILE = 90
 # How long a sleep, or a setting of the wall clock, is shown.
 SUSPENDED_SHOWN_NS = 20_000_000_000
@@ -209,7 +212,7 @@ class HostCheck:
         self._judge_processors(evaluation)
         empty = np.empty(0)
         wakes_s = self._late.add(empty.astype(np.int64), empty, evaluation.now_ns)
-        if len(wakes_s) < MIN_WAKES:
+        if (WAIT_S + np.minimum(wakes_s, MAX_COUNTED_LATE_S)).sum() < MIN_KNOWN_S:
             return
         late_s = float(np.percentile(wakes_s, PERCENTILE))
         evaluation.figures["host_wake_p90_seconds"] = late_s

@@ -180,16 +180,18 @@ def test_the_docs_hold_the_table_of_causes():
 
 
 def wakes(late_ms):
-    judge = HostCheck(lambda: (15.2, 2))
-    for index, late in enumerate(late_ms):
-        judge.note(index * 10**8, round(late * 1e6))
-    evaluation = Evaluation(len(late_ms) * 10**8)
+    judge, now_ns = HostCheck(lambda: (15.2, 2)), 0
+    for late in late_ms:
+        now_ns += round((100 + late) * 1e6)
+        judge.note(now_ns, round(late * 1e6))
+    evaluation = Evaluation(now_ns)
     judge(evaluation)
     return evaluation
 
 
 @pytest.mark.parametrize(
-    ("late_ms", "level"), [(1, None), (19, None), (25, "WARN"), (99, "WARN"), (150, "ERROR")]
+    ("late_ms", "level"),
+    [(1, None), (19, None), (25, "WARN"), (99, "WARN"), (150, "ERROR"), (700, "ERROR")],
 )
 def test_threads_that_wake_late_are_an_overload(late_ms, level):
     evaluation = wakes([late_ms] * 100)
@@ -205,7 +207,18 @@ def test_one_sleep_of_the_computer_is_no_overload():
 
 
 def test_few_wakes_say_nothing():
-    assert wakes([500] * 20).findings == []
+    assert wakes([25] * 30).findings == []
+    assert wakes([500] * 8).findings == []
+
+
+def test_a_starved_computer_is_one_cause_of_what_it_delays_however_late_its_threads_are():
+    streams = [
+        stream("keypoints_left", finding("loss"), finding("latency")),
+        stream("tactile_left", finding("gap"), finding("silent", "STALE", 0.4)),
+    ]
+    found = wakes([400] * 25).findings
+    station = [finding(one.code, one.level, message=one.message) for one in found]
+    assert brief(causes(streams, station=station)) == [("host", ("keypoints_left", "tactile_left"))]
 
 
 @pytest.fixture

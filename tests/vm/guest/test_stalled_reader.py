@@ -1,5 +1,7 @@
 """A reader that stalls while a finger tracker sends: the kernel's ring fills, the rest is lost."""
 
+import os
+import signal
 from itertools import chain
 
 import numpy as np
@@ -38,8 +40,11 @@ def assert_keypoints(samples, numbers):
 def fill_the_ring(tracker, driver, messages):
     """Send all while nobody reads, then read what the kernel kept: its number of whole messages."""
     before = driver.decoder.reports.num_reports
+    # The process that reads stalls; that of the station may do so without a loss.
+    os.kill(driver.transport.reader_pid, signal.SIGSTOP)
     for report in chain(*messages):
         tracker.send(report)
+    os.kill(driver.transport.reader_pid, signal.SIGCONT)
     num_kept = RING // len(messages[0])
     assert_keypoints(collect(driver, STREAM, num_kept), range(num_kept))
     # What is left is the begin of a message, and then nothing.
