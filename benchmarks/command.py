@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
 
 def usage() -> str:
     """The text of `python -m benchmarks --help`."""
-    rows = "\n".join(f"  {name:<13}{entry.does}" for name, entry in STAGES.items())
+    rows = "\n".join(f"  {name:<14}{entry.does}" for name, entry in STAGES.items())
     return f"""usage: python -m benchmarks STAGE [options]
 
 {DESCRIPTION}

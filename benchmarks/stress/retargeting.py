@@ -13,6 +13,8 @@ from services.twin.hands import twin_hand
 
 STAGE = StageCells("retargeting")
 _MAX_STEP_RAD = 0.16
+# Of a call that comes late: the retargeter's default, 9.6 rad/s at 30 Hz.
+_LATE_STEP_RAD = 0.32
 
 
 @STAGE.cell("rotations", "straight fingers (a singular Jacobian), joints at both limits, one point")
@@ -52,7 +54,7 @@ def _clock(check: Check) -> None:
     retargeter.reset()
     before = retargeter.step(motion.keypoints_m[0]).joints_rad
     after = retargeter.step(motion.keypoints_m[90], elapsed_s=3600.0).joints_rad
-    check.at_most("step after an hour", np.abs(after - before).max(), _MAX_STEP_RAD + 1e-9, "rad")
+    check.at_most("step after an hour", np.abs(after - before).max(), _LATE_STEP_RAD + 1e-9, "rad")
 
 
 @STAGE.cell(

@@ -23,7 +23,7 @@ def test_station_operator_and_figures_are_taken_over():
         quality={"coverage": 0.9, "num_steps_refused": 7.0},
     )
     recording = SimpleNamespace(attributes=source, content_sha256="0" * 64)
-    actions = SimpleNamespace(anchor=AnchorPoses(np.eye(4), np.eye(4), np.eye(4)))
+    actions = SimpleNamespace(anchor=AnchorPoses(np.eye(4), np.eye(4), np.eye(4)), absent=())
     build = getattr(_episode_attributes, "__wrapped__", _episode_attributes)
     episode = build(recording, "take-1-x", actions, {}, {"num_steps_refused": 2.0})
     assert (episode.station, episode.operator, episode.recovered) == ("bench", "ada", True)

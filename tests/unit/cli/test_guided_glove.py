@@ -153,7 +153,8 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert "got 'ten', expected 30, or" in said
     assert "toe" in said
     assert "Not used: gain: no pressed taxel moved" in said
-    assert "2 presses, not enough yet: gain: 320 taxels are off a straight line" in said
+    assert "2 presses, not enough yet: gain: the response of all taxels" in said
+    assert "pressures probably do not belong" in said
     assert "1 presses are left" in said
     assert "2 presses: 320 of 320 taxels known" in said
     assert report["num_by_state"] == {"ok": 320}
