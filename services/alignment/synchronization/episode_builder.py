@@ -102,12 +102,7 @@ def build_episode(
     """
     check_complete(recording)
     objects = options.of_task(recording.attributes.task).objects
-    streams = {}
-    for number, name in enumerate(recording.streams):
-        on_progress(progress_within("dating", number / len(recording.streams), name))
-        # One sample is not in motion, and has no clock.
-        if recording.num_samples(name) >= MIN_USABLE:
-            streams[name] = date_stream(recording, name)
+    streams = _dated_streams(recording, on_progress)
     _check_hands(recording, streams)
     streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
     checked = {
@@ -160,6 +155,16 @@ def build_episode(
         "object_boxes_m": tuple(one.box_m for one in listed),
     }
     return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
+
+
+def _dated_streams(recording: RecordingReader, on_progress: OnProgress) -> dict[str, DatedStream]:
+    """All streams but those of a single sample or none, which have no clock and show no motion."""
+    streams = {}
+    for number, name in enumerate(recording.streams):
+        on_progress(progress_within("dating", number / len(recording.streams), name))
+        if recording.num_samples(name) >= MIN_USABLE:
+            streams[name] = date_stream(recording, name)
+    return streams
 
 
 def _num_interpolated(stretch: _Stretch, actions: GridActions) -> int:
