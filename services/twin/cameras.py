@@ -4,13 +4,14 @@ Flat object colours with Lambert shading by one light, and a chequered table tha
 visible. Equal states give equal bytes.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Final
 
 import mujoco
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from dextouch.geometry import invert, pinhole_matrix, transform, transform_from_pose
 from services.twin.markers import Markers
@@ -25,6 +26,10 @@ FOVY_RAD: Final = {
 }
 _CHECKER_M: Final = 0.08
 _FAR_M: Final = 4.0
+# Rays that descend less than this from a camera 4 mm above a plane do not meet it within _FAR_M.
+_LEVEL: Final = 1e-3
+# Corners of boxes nearer to the plane of the camera have no useful projection.
+_NEAR_M: Final = 1e-3
 # Geoms of group 4 (the sensing skin) are invisible.
 _VISIBLE_GROUPS: Final = np.array([1, 1, 1, 1, 0, 0], dtype=np.uint8)
 TO_LIGHT: Final = np.array([0.30, -0.40, 0.85])
@@ -118,6 +123,8 @@ class CameraRig:
         own_colours = np.array(scene.model.geom_rgba[:, :3], dtype=np.float64)
         self.own_appearance = self.appearance = Appearance.of(own_colours)
         self._table = scene.model.geom("table").id
+        self._bodies = _visible_besides(scene.model, self._table)
+        self._corners_m = _corners_m(scene.model, self._bodies)
         self.markers: Markers | None = None
         self.mounts = [_wrist_mount(hand.palm_sign) for hand in scene.hands]
         self.K = {
@@ -125,10 +132,6 @@ class CameraRig:
             for name in CAMERAS
         }
         self._rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
-        num_rays = height_px * width_px
-        self._geom_ids = np.empty(num_rays, dtype=np.int32)
-        self._distances = np.empty(num_rays)
-        self._normals = np.empty(3 * num_rays)
 
     def _ray_table(self, K: np.ndarray) -> Float64[np.ndarray, "rays 3"]:
         """Unit rays of all pixel centres, row by row, in the optical frame."""
@@ -151,15 +154,14 @@ class CameraRig:
 
     def image(self, simulation: Simulation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """Render one camera; derived quantities of the simulation must be current."""
-        eye_m, rays_world = self._cast(simulation, camera)
-        image = self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+        view = self._cast(simulation, camera)
+        image = self._shaded(view).reshape(*self.shape_px, 3)
         if self.markers is not None:
-            range_m = np.where(self._geom_ids >= 0, self._distances, np.inf)
             Ts_camera_object = invert(self.pose(simulation, camera)) @ transform_from_pose(
                 simulation.object_poses()
             )
             self.markers.draw(
-                image, range_m.reshape(self.shape_px), self.K[camera], Ts_camera_object
+                image, view.distances_m.reshape(self.shape_px), self.K[camera], Ts_camera_object
             )
         return image
 
@@ -167,45 +169,153 @@ class CameraRig:
         self, simulation: Simulation, camera: str
     ) -> tuple[Int64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
         """Geom that each pixel shows, -1 for none, and its depth along the optical axis (m)."""
-        self._cast(simulation, camera)
-        hit = self._geom_ids >= 0
-        depth_m = np.where(hit, self._distances * self._rays[camera][:, 2], np.inf)
-        shape = self.shape_px
-        return self._geom_ids.astype(np.int64).reshape(shape), depth_m.reshape(shape)
+        view = self._cast(simulation, camera)
+        depth_m = view.distances_m * self._rays[camera][:, 2]
+        return view.geoms.reshape(self.shape_px), depth_m.reshape(self.shape_px)
 
-    def _cast(
-        self, simulation: Simulation, camera: str
-    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "rays 3"]]:
-        """Cast the rays of a camera; returns its position and the rays in the world."""
+    def _cast(self, simulation: Simulation, camera: str) -> "_View":
+        """Find what each ray of a camera meets.
+
+        MuJoCo tests every ray against every geom. Most rays meet the top of the table or nothing,
+        which one division tells; only rays near other geoms are left to MuJoCo, with equal results.
+        """
         T_world_camera = self.pose(simulation, camera)
-        rays_world = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
+        rays = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])
+        is_near = np.zeros(self.shape_px, dtype=bool)
+        for box in self._boxes_px(simulation, camera, T_world_camera):
+            is_near[box] = True
+        distances_m, may_meet_side = self._table_top(simulation, eye_m, rays)
+        cast = np.flatnonzero(is_near.ravel() | may_meet_side)
+        geoms = np.where(distances_m < np.inf, self._table, -1)
+        view = _View(eye_m, rays, geoms, distances_m, cast, np.empty((len(cast), 3)))
+        if len(cast):
+            self._cast_some(simulation, view)
+        return view
+
+    def _table_top(
+        self, simulation: Simulation, eye_m: np.ndarray, rays: np.ndarray
+    ) -> tuple[Float64[np.ndarray, " rays"], Bool[np.ndarray, " rays"]]:
+        """Distance (m) to the top of the table, infinite for none; and rays that may meet a side.
+
+        A ray from above meets the top where it crosses its plane within the table. It can meet a
+        side only if the eye and this crossing are both beyond that side.
+        """
+        eye_m = eye_m - simulation.data.geom_xpos[self._table]
+        half_m = self._model.geom_size[self._table]
+        if eye_m[2] - half_m[2] <= _LEVEL * _FAR_M:
+            return np.full(len(rays), np.inf), np.ones(len(rays), dtype=bool)
+        down = np.minimum(rays[:, 2], -_LEVEL)
+        distances_m = (half_m[2] - eye_m[2]) / down
+        is_on_top, may_meet_side = distances_m <= _FAR_M, np.zeros(len(rays), dtype=bool)
+        for axis in (0, 1):
+            crossing_m = distances_m * rays[:, axis] + eye_m[axis]
+            is_on_top &= np.abs(crossing_m) <= half_m[axis]
+            if abs(eye_m[axis]) > half_m[axis]:
+                may_meet_side |= crossing_m * np.sign(eye_m[axis]) > half_m[axis]
+        distances_m[~is_on_top] = np.inf
+        return distances_m, may_meet_side
+
+    def _boxes_px(
+        self, simulation: Simulation, camera: str, T_world_camera: np.ndarray
+    ) -> list[tuple[slice, slice]]:
+        """Rows and columns of the image that contain each geom's bounding box."""
+        data, corners_m = simulation.data, self._corners_m
+        Rs = data.geom_xmat[self._bodies].reshape(-1, 3, 3)
+        corners_m = corners_m @ Rs.transpose(0, 2, 1) + data.geom_xpos[self._bodies, None]
+        corners_m = (corners_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        depths_m = corners_m[..., 2]
+        is_before = depths_m > _NEAR_M
+        pixels = corners_m @ self.K[camera].T / np.where(is_before, depths_m, 1.0)[..., None]
+        first = np.floor(pixels[..., 1::-1].min(axis=1)).clip(0, self.shape_px)
+        last = np.ceil(pixels[..., 1::-1].max(axis=1)).clip(0, self.shape_px)
+        # A box that reaches behind the camera may be anywhere.
+        first[~is_before.all(axis=1)] = 0
+        last[~is_before.all(axis=1)] = self.shape_px
+        last[~is_before.any(axis=1)] = 0
+        bounds = np.stack([first, last], axis=2).astype(int)
+        return [(slice(*rows), slice(*columns)) for rows, columns in bounds]
+
+    def _cast_some(self, simulation: Simulation, view: "_View") -> None:
+        """Cast the rays `view.cast` through the whole scene, and note what they meet."""
+        geoms = np.empty(len(view.cast), dtype=np.int32)
+        distances_m, normals = np.empty(len(view.cast)), np.empty(3 * len(view.cast))
         mujoco.mj_multiRay(
             self._model,
             simulation.data,
-            eye_m,
-            rays_world.ravel(),
+            view.eye_m,
+            view.rays[view.cast].ravel(),
             _VISIBLE_GROUPS,
             1,
             -1,
-            self._geom_ids,
-            self._distances,
-            self._normals,
-            len(rays_world),
+            geoms,
+            distances_m,
+            normals,
+            len(geoms),
             _FAR_M,
         )
-        return eye_m, rays_world
+        view.geoms[view.cast] = geoms
+        view.distances_m[view.cast] = np.where(geoms >= 0, distances_m, np.inf)
+        view.normals[:] = normals.reshape(-1, 3)
 
-    def _shaded(self, eye_m: np.ndarray, rays_world: np.ndarray) -> UInt8[np.ndarray, "rays 3"]:
-        hit = self._geom_ids >= 0
+    def _shaded(self, view: "_View") -> UInt8[np.ndarray, "rays 3"]:
+        """Colours of all rays: few for the table and the background, one by one for the rest."""
         look = self.appearance
-        light = self._normals.reshape(-1, 3) @ look.to_light
-        brightness = look.ambient + (1 - look.ambient) * np.clip(light, 0.0, 1.0)
-        on_table = self._geom_ids == self._table
-        points = eye_m[:2] + rays_world[on_table, :2] * self._distances[on_table, None]
-        cells = np.floor(points / _CHECKER_M).sum(axis=1) % 2
-        brightness[on_table] *= 1 - look.checker_depth * cells
-        rgb = np.where(
-            hit[:, None], look.colours[self._geom_ids] * brightness[:, None], look.background
-        )
-        return (np.clip(rgb, 0.0, 1.0) * 255).round().astype(np.uint8)
+        light = look.ambient + (1 - look.ambient) * np.clip(look.to_light[2], 0.0, 1.0)
+        table = look.colours[self._table]
+        dark = table * (light * (1 - look.checker_depth))
+        palette = _bytes(np.stack([table * light, dark, look.background]))
+        index = np.full(len(view.geoms), 2)
+        on_table = np.flatnonzero(view.geoms == self._table)
+        index[on_table] = self._is_dark(view, on_table)
+        image = palette[index]
+        hit = view.geoms[view.cast] >= 0
+        near = view.cast[hit]
+        towards = np.clip(view.normals[hit] @ look.to_light, 0.0, 1.0)
+        brightness = look.ambient + (1 - look.ambient) * towards
+        brightness[index[near] == 1] *= 1 - look.checker_depth
+        image[near] = _bytes(look.colours[view.geoms[near]] * brightness[:, None])
+        return image
+
+    def _is_dark(self, view: "_View", rays: np.ndarray) -> Bool[np.ndarray, " rays"]:
+        """Whether rays that meet the table meet one of its darker fields."""
+        num_fields = np.zeros(len(rays), dtype=np.int64)
+        for axis in (0, 1):
+            met_m = view.eye_m[axis] + view.rays[rays, axis] * view.distances_m[rays]
+            num_fields += np.floor(met_m / _CHECKER_M).astype(np.int64)
+        return num_fields % 2 == 1
+
+
+@dataclass(frozen=True)
+class _View:
+    """What the rays of a camera meet: geom (−1 for none) and distance (m, infinite for none).
+
+    `rays` are unit vectors in the world, `cast` those that MuJoCo cast, with `normals` where they
+    meet something. All others meet the top of the table or nothing.
+    """
+
+    eye_m: Float64[np.ndarray, "3"]
+    rays: Float64[np.ndarray, "rays 3"]
+    geoms: Int64[np.ndarray, " rays"]
+    distances_m: Float64[np.ndarray, " rays"]
+    cast: Int64[np.ndarray, " cast"]
+    normals: Float64[np.ndarray, "cast 3"]
+
+
+def _visible_besides(model: mujoco.MjModel, table: int) -> Int64[np.ndarray, " geoms"]:
+    """Geoms that rays can meet, without the table."""
+    is_visible = _VISIBLE_GROUPS[model.geom_group] == 1
+    is_visible[table] = False
+    return np.flatnonzero(is_visible)
+
+
+def _corners_m(model: mujoco.MjModel, geoms: np.ndarray) -> Float64[np.ndarray, "geoms 8 3"]:
+    """Corners of the bounding boxes of geoms, in their own frames."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    centres_m, halves_m = model.geom_aabb[geoms, None, :3], model.geom_aabb[geoms, None, 3:]
+    corners: np.ndarray = centres_m + signs * halves_m
+    return corners
+
+
+def _bytes(rgb: np.ndarray) -> UInt8[np.ndarray, "colours 3"]:
+    return (np.clip(rgb, 0.0, 1.0) * 255).round().astype(np.uint8)

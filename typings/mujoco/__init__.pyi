@@ -72,6 +72,8 @@ class MjModel:
     geom_quat: np.ndarray
     geom_aabb: np.ndarray
     geom_rbound: np.ndarray
+    geom_group: np.ndarray
+    geom_aabb: np.ndarray
     body_bvhadr: np.ndarray
     body_bvhnum: np.ndarray
     bvh_aabb: np.ndarray
