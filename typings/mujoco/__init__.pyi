@@ -73,7 +73,6 @@ class MjModel:
     geom_aabb: np.ndarray
     geom_rbound: np.ndarray
     geom_group: np.ndarray
-    geom_aabb: np.ndarray
     body_bvhadr: np.ndarray
     body_bvhnum: np.ndarray
     bvh_aabb: np.ndarray
