@@ -5,6 +5,7 @@ redis-server.
 """
 
 import asyncio
+import gc
 import shutil
 import subprocess
 import tempfile
@@ -139,6 +140,9 @@ def main() -> None:
             durable = WorldServiceSettings(state_url=url, limits=limits)
             apps["durable"] = create_world_app({"still": StillWorld()}, durable)
         with served(apps) as urls:
+            # As `dextouch.serving.run` does.
+            gc.collect()
+            gc.freeze()
             answer({**bare, **urls})
             for _ in requests:
                 pass

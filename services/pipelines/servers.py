@@ -1,6 +1,7 @@
 """Several service applications served from one event loop, or from a background thread."""
 
 import asyncio
+import gc
 import signal
 import socket
 import time
@@ -91,6 +92,9 @@ async def serve_all(
         UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
     servers = {place.name: _server(app, grace_s) for place, app in placed}
+    # A full collection would visit all modules and hold up every request for some 60 ms.
+    gc.collect()
+    gc.freeze()
     tasks = {
         place.name: asyncio.create_task(servers[place.name].serve(sockets=[place.socket]))
         for place, _ in placed
