@@ -64,11 +64,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | None:
-    """The parser that would print its help; None if no parser did.
-
-    Args:
-        show_help: runs a command with `--help`; it prints nothing here.
-    """
+    """The parser that `show_help`, a command with `--help`, would print; None if no parser did."""
     asked: list[argparse.ArgumentParser] = []
     token = _asked_parsers.set(asked)
     try:
@@ -82,11 +78,7 @@ def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | 
 class ProgressLines:
     """Progress of a long job as lines on standard error, where no terminal shows a bar.
 
-    Args:
-        title: of the job.
-        has_bar: whether a terminal shows a bar instead.
-        period_s: shortest time between two lines.
-        clock_s: tells the time.
+    If it `has_bar`, a terminal shows that instead; `period_s` is the shortest time between lines.
     """
 
     def __init__(
@@ -145,15 +137,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -> None:
-    """Write the result of a command as JSON.
+    """Write the result of a command as JSON to a file; `-` is standard output, None writes nothing.
 
-    Args:
-        path: file to write, `-` for standard output, None to write nothing.
-        result: values that JSON can hold.
-        allow_nan: False to refuse numbers that are not finite.
-
-    Raises:
-        ValueError: a number is not finite and `allow_nan` is False.
+    Raises ValueError for a number that is not finite unless `allow_nan`.
     """
     if path is not None:
         text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)

@@ -11,20 +11,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from dextouch.episodes import (
-    GOP_IMAGES,
-    EpisodeReader,
-    RecordingReader,
-    disk_errors,
-)
+from dextouch.episodes import GOP_IMAGES, EpisodeReader, RecordingReader, disk_errors
 from dextouch.errors import ConflictError
-from dextouch.streams import (
-    ENCODED_UNITS,
-    H264_UNIT,
-    NO_DEVICE_TIME,
-    NO_SEQUENCE,
-    encoded_values,
-)
+from dextouch.streams import ENCODED_UNITS, H264_UNIT, NO_DEVICE_TIME, NO_SEQUENCE, encoded_values
 
 BLOCK_IMAGES: Final = 32
 Reader = EpisodeReader | RecordingReader

@@ -37,7 +37,7 @@ ResultT = TypeVar("ResultT")
 
 
 class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
-    """One task in one served world.
+    """One task in one served world; an action is `chunk_steps` model steps.
 
     The observation is that of the newest step: `tactile_kpa` [2, 320], `action_reached` [67] and
     one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends the
@@ -46,14 +46,6 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
     `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far, and the numbers that the
     world reports about the chunk.
-
-    Args:
-        client: of the service.
-        world: its name at the service.
-        task: one of the world's.
-        instruction: in words.
-        chunk_steps: model steps of an action, a multiple of the world's chunk.
-        max_chunks: number of chunks after which the episode is truncated.
     """
 
     def __init__(

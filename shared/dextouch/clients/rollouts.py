@@ -49,14 +49,10 @@ InitialObservation = tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]
 class RolloutClient:
     """A connection to a service of worlds; not thread-safe (open one per thread).
 
-    Args:
-        url: of the service.
-        api_key: with the scope `rollout`; None where the service requires none.
-        timeout_s: for one response.
-        patience_s: how long a service that has ever responded may be full or away, as while
-            another worker takes over; requests are repeated meanwhile.
-        selector: cameras and steps to return for every rollout of this client.
-        name: shown to those who watch its rollouts, such as the policy's.
+    The key needs the scope `rollout`. A service that has ever responded may be full or away for
+    `patience_s`, as while another worker takes over; requests are repeated meanwhile. `selector`
+    says which cameras and steps its rollouts return; `name`, such as the policy's, is shown to
+    those who watch.
     """
 
     def __init__(
@@ -169,19 +165,13 @@ class Rollout:
         selector: ReturnSelector | None = None,
         validated: bool = False,
     ) -> Observation:
-        """Advance by one action chunk.
+        """Advance by one action chunk, and return the observation of its K steps.
 
-        If this raises UnavailableError, the same call may be made again: a chunk that the service
-        already applied is not applied twice; its response is repeated.
-
-        Args:
-            actions: [K, 67], K a multiple of the world's chunk; row i is the pose at step i+1 of
-                the chunk, relative to the rollout's step 0.
-            selector: of this chunk alone; None for the client's.
-            validated: `check_actions` has returned these actions, and they need no second look.
-
-        Returns:
-            The observation of the K steps (of the last one if the selector says so).
+        Row i of `actions` [K, 67], K a multiple of the world's chunk, is the pose at step i+1 of
+        the chunk, relative to the rollout's step 0. `selector` is of this chunk alone, None the
+        client's; with `validated` they come from `check_actions`. If this raises UnavailableError,
+        the same call may be made again: a chunk that the service already applied is not applied
+        twice.
 
         Raises:
             EndedError: the world cannot continue this rollout, for the `reason` given; the last

@@ -10,12 +10,7 @@ from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    ID_PATTERN,
-    EpisodeAttributes,
-    RecordingAttributes,
-    StreamContent,
-)
+from dextouch.schemas import ID_PATTERN, EpisodeAttributes, RecordingAttributes, StreamContent
 from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
 Kind = Literal["episode", "recording"]

@@ -2,11 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import (
-    AbstractAsyncContextManager,
-    AsyncExitStack,
-    asynccontextmanager,
-)
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from functools import partial
 from http import HTTPStatus
 
@@ -64,21 +60,15 @@ def create_service_app(  # noqa: PLR0913 - all by name
     admits: Admits | None = None,
     folders: Sequence[ServedFolder] = (),
 ) -> FastAPI:
-    """Create the application of one service.
+    """Create the application of one service, whose routes raise DexTouch errors only.
 
-    Args:
-        name: of the service, in health, logs and titles.
-        settings: keys, limits, host names and origins.
-        routers: routes of the service; they raise DexTouch errors only.
-        lifespan: context of the application (pools, workers).
-        readiness: called by /readyz; returns the names of what is missing.
-        admits: accepts requests without a key, such as those of signed-in browsers.
-        folders: that all routes need; the service is not ready without them.
+    `readiness` is called by /readyz and returns the names of what is missing. `admits` accepts
+    requests without a key, such as those of signed-in browsers. All routes need the `folders`; the
+    service is not ready without them.
 
-    Returns:
-        The application; `app.state.registry` accepts further metrics, `app.state.refusal_page`
-        renders a refusal or an error as an HTML page for browsers, and `app.state.shortcut` answers
-        some requests in place of their route (see `Shortcut`).
+    `app.state.registry` of the application accepts further metrics, `app.state.refusal_page`
+    renders a refusal or an error as an HTML page for browsers, and `app.state.shortcut` answers
+    some requests in place of their route (see `Shortcut`).
     """
     hide_secrets(settings)
     app = FastAPI(

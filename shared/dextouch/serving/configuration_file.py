@@ -141,8 +141,7 @@ def section_of(settings_cls: type[BaseSettings]) -> str:
 def configuration_path() -> Path | None:
     """The file that DEXTOUCH_CONFIG names, or dextouch.toml in the working folder; None without.
 
-    Raises:
-        InvalidInputError: the named file does not exist.
+    Raises InvalidInputError if the named file does not exist.
     """
     named = os.environ.get(VARIABLE)
     if not named:

@@ -1,8 +1,7 @@
 """OpenAPI documents: what routes declare of keys, bodies and refusals, made visible to clients.
 
-FastAPI documents parameters, models and successful responses. The rest is the same for every
-service and follows from its routes: `RequireScope` the security scheme, `takes` the request body,
-method and parameters the refusals, all of them problem+json.
+FastAPI documents parameters, models and successful responses. The rest follows from the routes:
+`RequireScope` the security scheme, `takes` the request body, method and parameters the refusals.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,14 +30,9 @@ OF_CHANGES = frozenset({403, 404, 409, 422, 507})
 def document_service(
     app: FastAPI, routers: Sequence[APIRouter], *, needs_key: bool
 ) -> dict[str, Any]:
-    """The OpenAPI document of a service, made once.
+    """The OpenAPI document of a service, made once; without keys of the service a key is optional.
 
     A route declares further refusals by `responses={406: {}}`.
-
-    Args:
-        app: the application.
-        routers: its routes.
-        needs_key: whether the service has keys; without them a key is optional.
     """
     if app.openapi_schema is not None:
         return app.openapi_schema

@@ -148,12 +148,9 @@ def takes(
 ) -> Callable[[EndpointT], EndpointT]:
     """Decorator that declares the bodies a route accepts, placed directly above the function.
 
-    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, larger
-    bodies with 413, both before the body is read.
-
-    Args:
-        max_bytes: maximum size by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
-        needs_key: False if the route can be called without a key.
+    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, bodies
+    larger than `max_bytes` of their type (such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`) with 413,
+    both before the body is read. `needs_key` is False if the route can be called without a key.
     """
 
     def mark(endpoint: EndpointT) -> EndpointT:

@@ -151,11 +151,7 @@ class AccessControl:
         return matches[0] if matches else None
 
     def granted(self, authorization: str | None, scope: str) -> Grant:
-        """Check a key and its scope, and return what the key allows.
-
-        Raises:
-            AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
-        """
+        """What a key allows; raises AccessDeniedError without it or the scope (see `reason`)."""
         if not self._keys:
             return _open_grant(scope)
         grant = self.find(authorization)

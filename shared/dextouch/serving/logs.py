@@ -19,10 +19,7 @@ def configure_logging(
 ) -> None:
     """Route structlog and the standard library's loggers (uvicorn) to stderr in one format.
 
-    Args:
-        service: bound to every event.
-        log_format: auto is console when stderr is a terminal, JSON otherwise.
-        level: minimum level.
+    `service` is bound to every event; auto is console when stderr is a terminal, JSON otherwise.
     """
     console = log_format == "console" or (log_format == "auto" and sys.stderr.isatty())
     shared: list[Processor] = [

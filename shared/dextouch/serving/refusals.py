@@ -115,11 +115,7 @@ class WrongKeys:
         self._limit = RateLimit()
 
     def count(self, connection: HTTPConnection, *, what: str = "key") -> None:
-        """Count a wrong key.
-
-        Raises:
-            AccessDeniedError: there are too many of this address, or in all.
-        """
+        """Count a wrong key; raises AccessDeniedError for too many of this address, or in all."""
         caller = caller_of(connection.scope)
         if wait_s := self._limit.wait_s(caller):
             raise AccessDeniedError(
@@ -143,12 +139,9 @@ class RefusalLog:
         self._num_not_logged = 0
 
     def note(self, connection: HTTPConnection, status: int, reason: str) -> None:
-        """Log that a request or WebSocket is refused.
+        """Log a refused request or WebSocket: its method, path, address and the name of its key.
 
-        Args:
-            connection: whose method, path, address and key's name are logged.
-            status: of the response.
-            reason: a word, or a sentence without anything secret.
+        `reason` is a word, or a sentence without anything secret.
         """
         scope, path = connection.scope, connection.scope["path"]
         is_request = scope["type"] == "http"

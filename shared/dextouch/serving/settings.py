@@ -114,9 +114,7 @@ class ServiceSettings(CommandSettings):
 def service_config(service: str, command: str | None = None) -> SettingsConfigDict:
     """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>.
 
-    Args:
-        service: prefix of the variables.
-        command: as users type it, such as `dextouch station`; names the program in its help.
+    `command` is what users type, such as `dextouch station`; it names the program in its help.
     """
     return SettingsConfigDict(
         frozen=True,

@@ -121,8 +121,7 @@ class RolloutRecord:
     def from_stored(stored: Versioned) -> "RolloutRecord":
         """The record that a store holds.
 
-        Raises:
-            StorageError: not the whole record, or one of another version of DexTouch.
+        Raises StorageError if it is not the whole record, or one of another version of DexTouch.
         """
         fields = msgpack.unpackb(stored.value)
         if not isinstance(fields, list) or fields[0] != RECORD_FORMAT:
@@ -302,11 +301,7 @@ _NS: Final = 1e-9
 
 
 class RolloutWatch:
-    """The open rollouts of a state store; one newest response is read at a time.
-
-    Args:
-        records: of the rollouts, in this process and in all others with the same store.
-    """
+    """The open rollouts of all processes with one state store; one response is read at a time."""
 
     def __init__(self, records: RecordStore) -> None:
         self._records = records

@@ -314,9 +314,7 @@ def wants_json(accepted: str) -> bool:
 def actions_from(body: bytes, dtype: str) -> Shaped[np.ndarray, "..."]:
     """Actions [K, 67] of a binary body.
 
-    Raises:
-        InvalidInputError: an unknown dtype.
-        ShapeError: no whole rows.
+    Raises InvalidInputError for an unknown dtype, ShapeError for no whole rows.
     """
     if dtype not in DTYPES:
         raise InvalidInputError(

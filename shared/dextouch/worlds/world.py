@@ -109,11 +109,7 @@ class World(Protocol[State]):
         ...
 
     def restore(self, data: bytes) -> State:
-        """Restore the state of a snapshot.
-
-        Raises:
-            InvalidInputError: not a snapshot of this world.
-        """
+        """Restore the state of a snapshot; raises InvalidInputError for one of another world."""
         ...
 
 
@@ -143,11 +139,8 @@ class BatchWorld(World[State], Protocol[State]):
     ) -> list[SteppedRollout[State]]:
         """`step` for each entry; results do not depend on the other entries.
 
-        Args:
-            states: one per rollout.
-            actions: chunks of one length.
-            seeds: one per rollout.
-            selectors: one per rollout; None requests everything.
+        Chunks have one length; there is one seed per rollout, and one selector: None requests
+        everything.
         """
         ...
 
