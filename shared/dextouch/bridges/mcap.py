@@ -59,22 +59,14 @@ Attributes = EpisodeAttributes | RecordingAttributes
 def export_mcap(
     reader: Reader, path: Path, *, overwrite: bool = False, jpeg_quality: int | None = None
 ) -> int:
-    """Write one episode or recording as MCAP.
+    """Write one episode or recording as MCAP and return the number of messages.
 
     `log_time` is t_ref_ns (episode) or t_host_ns (recording), `publish_time` the device's stamp
-    where there is one. Encoded images are copied unchanged.
-
-    Args:
-        reader: of the episode or recording.
-        path: of the new file.
-        overwrite: whether an existing file is replaced.
-        jpeg_quality: 1 … 100 encodes `rgb8` images as JPEG, which is lossy; None keeps raw pixels.
-
-    Returns:
-        Number of messages.
+    where there is one. Encoded images are copied unchanged; `jpeg_quality` 1 … 100 encodes `rgb8`
+    images as JPEG, which is lossy, None keeps raw pixels.
 
     Raises:
-        ConflictError: the file exists.
+        ConflictError: the file exists, and is not to be overwritten.
         InvalidInputError: a quality outside 1 … 100.
         StorageError: the write failed.
     """
@@ -216,14 +208,7 @@ class _Export:
 
 
 def import_mcap(path: Path, store: EpisodeStore) -> str:
-    """Import an MCAP file written by `export_mcap` into a store.
-
-    Args:
-        path: of the file; it may come from anywhere.
-        store: where the episode or recording appears under the id that it had.
-
-    Returns:
-        The id.
+    """Import an MCAP file of `export_mcap` into a store, under the id that it had; returns the id.
 
     Raises:
         NotFoundError: no such file.
@@ -365,11 +350,7 @@ class _Bounded:
 def records(path: Path) -> Iterator[McapRecord]:
     """Schemas, channels, messages, attachments and metadata in the order of the file.
 
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not an MCAP file, or an unsupported compression.
-        CorruptDataError: truncated, or a checksum mismatch.
-        LimitExceededError: a record exceeds the size limit.
+    Raises as `import_mcap`; InvalidInputError also for an unsupported compression.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")

@@ -29,20 +29,12 @@ _Columns = Callable[[Block], dict[str, Any]]
 
 
 def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
-    """Write one episode or recording for the Rerun viewer.
+    """Write one episode or recording for the Rerun viewer, and return the number of samples.
 
     The timeline is `t_ref` (episode) or `t_host` (recording). Encoded images are not decoded.
 
-    Args:
-        reader: of the episode or recording.
-        path: of the new file.
-        overwrite: whether an existing file is replaced.
-
-    Returns:
-        Number of samples.
-
     Raises:
-        ConflictError: the file exists.
+        ConflictError: the file exists, and is not to be overwritten.
         InvalidInputError: a stream that Rerun cannot display.
         StorageError: the write failed.
     """
@@ -221,12 +213,9 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
 
 
 def heat_map(row: np.ndarray, *, side: Side, full_scale: float) -> UInt8[np.ndarray, "28 26 3"]:
-    """One reading of a glove as a small RGB picture of the hand.
+    """One reading of a glove, 320 taxels or 360 raw cells, as a small RGB picture of the hand.
 
-    Args:
-        row: 320 taxels or the 360 raw cells.
-        side: of the hand.
-        full_scale: reading shown at full brightness, in the unit of the row.
+    `full_scale` is the reading shown at full brightness, in the unit of the row.
     """
     taxels = select_taxels(row, side=side) if row.shape == (NUM_RAW_TAXELS,) else row
     return colour(hand_canvas(taxels, side=side), full_scale_kpa=full_scale)

@@ -64,9 +64,8 @@ class HandTrajectory:
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
     """Validate actions and return them as float64 [T, 67].
 
-    Raises:
-        ShapeError: not [T, 67] with T ≥ 1.
-        NonFiniteError: NaN or infinity; the message names the first row and column.
+    Raises ShapeError unless they are [T ≥ 1, 67], NonFiniteError for NaN or infinity, with the
+    place.
     """
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
@@ -185,14 +184,10 @@ def poses_from_actions(
 ) -> HandTrajectory:
     """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`.
 
-    Args:
-        actions: [T, 67].
-        anchor: poses that they are relative to.
-        where: what gave the actions, for messages.
-        validated: `check_actions` has returned these actions, and they need no second look.
+    Messages begin with `where`; `validated` actions come from `check_actions`.
 
     Raises:
-        ShapeError, NonFiniteError: as `check_actions`, whose messages begin with `where`.
+        ShapeError, NonFiniteError: as `check_actions`.
         DegenerateRotationError: a 6-D rotation that is none.
     """
     checked = actions if validated else check_actions(actions, where=where)

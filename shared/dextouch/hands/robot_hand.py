@@ -163,10 +163,8 @@ class HandModel:
     ) -> Float64[np.ndarray, "time fingers hinges 4 4"]:
         """T_wrist_joint of every hinge after its rotation; [T, 5, 4, 4, 4] for the Wuji hand.
 
-        A finger with fewer hinges than another repeats its last frame.
-
-        Args:
-            joints_rad: [T, J] joint angles in the order of `joint_names`.
+        A finger with fewer hinges than another repeats its last frame. Angles [T, J] are in the
+        order of `joint_names`.
 
         Raises:
             ShapeError: not [T, J].
@@ -204,11 +202,7 @@ class RobotHand(HandModel):
     the exact values of the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on
     PyPI), the fingertips its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
 
-    Args:
-        side: "left" or "right".
-
-    Raises:
-        UnknownNameError: any other side.
+    Raises UnknownNameError for a side other than "left" and "right".
     """
 
     def __init__(self, side: str) -> None:
@@ -216,10 +210,9 @@ class RobotHand(HandModel):
 
 
 def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 2 5 4 3"]:
-    """`RobotHand.chain_points_m` of the left and the right hand, in little more time than of one.
+    """`RobotHand.chain_points_m` of both hands, in little more time than of one.
 
-    Args:
-        joints_rad: [T, 2, 20] finite joint angles, left before right.
+    Joint angles [T, 2, 20] are finite, left before right.
     """
     chains = _both_hands()
     angles_rad = np.asarray(joints_rad, dtype=np.float64).reshape(-1, *chains.axes.shape[:-1])

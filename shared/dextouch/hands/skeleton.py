@@ -68,8 +68,7 @@ def solver_indices(chain: str) -> list[int]:
 def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
     """The 25 keypoints of the mean hand, flat, in wrist axes, metres; read-only.
 
-    Raises:
-        UnknownNameError: a side other than "left" and "right".
+    Raises UnknownNameError for a side other than "left" and "right".
     """
     if side not in ("left", "right"):
         raise UnknownNameError("side", side, ["left", "right"])
@@ -136,8 +135,7 @@ class NodeOrder:
     def keypoints(self, points: np.ndarray) -> Float64[np.ndarray, "*batch 25 3"]:
         """Reorder a tracker's points [..., n, 3] to our keypoints; NaN where absent.
 
-        Raises:
-            ShapeError: not one point per node.
+        Raises ShapeError for another number of points than nodes.
         """
         array = np.asarray(points, dtype=np.float64)
         if array.shape[-2:] != (len(self.places), 3):

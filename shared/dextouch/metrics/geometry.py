@@ -8,11 +8,8 @@ from dextouch.errors import InvalidInputError, ShapeError
 def depth_error(*, predicted_m: np.ndarray, true_m: np.ndarray) -> float:
     """AbsRel after alignment of the scale: mean of abs(s p - t) / t, s = median(t) / median(p).
 
-    One scale for all images together. Pixels without depth on either side (infinite) do not count.
-
-    Args:
-        predicted_m: depths [..., h, w].
-        true_m: depths of the same shape.
+    One scale for all depths [..., h, w] together. Pixels without depth on either side (infinite) do
+    not count.
 
     Raises:
         ShapeError: different shapes.

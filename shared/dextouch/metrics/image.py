@@ -46,13 +46,9 @@ def checked_pair(
 def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean over images of 10 log10(255² / MSE) in dB, each image capped at 100 dB.
 
-    Args:
-        predicted: images [..., h, w, 3] in 0 … 255 (uint8, or a float that was not yet rounded).
-        true: images of the same shape.
+    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded).
 
-    Raises:
-        ShapeError: different shapes or not [..., h, w, 3].
-        NonFiniteError: NaN or infinity.
+    Raises ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
     """
     a, b = checked_pair(predicted, true, what="PSNR of images", tail=(None, None, 3))
     mse = np.mean((a - b) ** 2, axis=(-3, -2, -1))
@@ -66,14 +62,10 @@ def decibels(mse: np.ndarray | np.floating, *, peak: float) -> Float64[np.ndarra
 
 
 def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
-    """Mean structural similarity, 1 for equal images.
+    """Mean structural similarity of images [..., h, w, 3] in 0 … 255, 1 for equal images.
 
-    Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255,
-    each channel separately, only where the whole window lies inside the image.
-
-    Args:
-        predicted: images [..., h, w, 3] in 0 … 255, at least 11 px high and wide.
-        true: images of the same shape.
+    Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255, each
+    channel separately, only where the whole window lies inside the image.
 
     Raises:
         ShapeError: different shapes, not [..., h, w, 3], or images smaller than the window.

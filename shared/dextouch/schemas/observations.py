@@ -288,11 +288,7 @@ def answer_parts(
 
 
 def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
-    """Decode a packed response that holds touch.
-
-    Raises:
-        InvalidInputError: not a valid response.
-    """
+    """Decode a packed response that holds touch; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(AnswerFields, raw, where="answer")
     if any(name.startswith(JPEG_PREFIX) for name in arrays):
@@ -308,11 +304,7 @@ def encode_observation(observation: Observation) -> bytes:
 
 
 def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
-    """Inverse of `encode_observation`.
-
-    Raises:
-        InvalidInputError: not a valid observation.
-    """
+    """Inverse of `encode_observation`; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(ObservationFields, raw, where="observation")
     return _observation_from(fields, arrays, where="observation")
@@ -333,11 +325,7 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
-    """Decode and validate a start request from an untrusted source.
-
-    Raises:
-        InvalidInputError: not a valid start request.
-    """
+    """Decode a start request of an untrusted source; raises InvalidInputError if it is invalid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
@@ -420,11 +408,7 @@ def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarra
 
 
 def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    """A model of decoded fields, or of JSON as bytes.
-
-    Raises:
-        InvalidInputError: wrong fields; the message begins with `where`.
-    """
+    """A model of decoded fields, or of JSON as bytes; an InvalidInputError begins with `where`."""
     try:
         # Not model_validate_json, which converts unknown parts once per mistake.
         return model.model_validate(from_json(fields) if isinstance(fields, bytes) else fields)

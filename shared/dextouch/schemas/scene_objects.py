@@ -281,9 +281,8 @@ def load_scene_objects(path: Path) -> SceneObjects:
 def load_object_clicks(path: Path) -> ObjectClicks:
     """Read objects, and clicks on them, of a JSON file.
 
-    Raises:
-        NotFoundError: there is no such file.
-        InvalidInputError: not JSON, too large, or other fields than expected.
+    Raises NotFoundError without the file, InvalidInputError if it is not JSON, too large, or has
+    other fields than expected.
     """
     return _loaded(path, ObjectClicks)
 

@@ -100,16 +100,11 @@ def implausible_values(
     *,
     of_robot: bool = False,
 ) -> list[Implausible]:
-    """What is implausible in samples of a stream of poses, joints or keypoints; of others nothing.
+    """What is implausible in samples [n, …] of a stream of poses, joints or keypoints.
 
     What is commanded may leap, may be kept, and may lie beyond limits to press: only its unit is
-    checked.
-
-    Args:
-        descriptor: of the stream.
-        t_ns: increasing times.
-        values: [n, …] as the device sends them.
-        of_robot: whether what they show may rest exactly. Joints and poses in a robot's base do.
+    checked. What is `of_robot` may rest exactly; joints and poses in a robot's base always may.
+    Times increase.
     """
     if descriptor.kind == "pose":
         can_rest = of_robot or descriptor.frame == "base"
@@ -144,14 +139,10 @@ def _limits_rad() -> tuple[Float64[np.ndarray, "40"], Float64[np.ndarray, "40"]]
 def implausible_poses(
     t_ns: Int64[np.ndarray, " n"], poses: np.ndarray, *, period_ns: int, can_rest: bool = False
 ) -> list[Implausible]:
-    """What is implausible in poses of a tracked hand or head.
+    """What is implausible in poses [n, 7] of a tracked hand or head, at increasing times.
 
-    Args:
-        t_ns: increasing times.
-        poses: [n, 7] position (m) and quaternion (w, x, y, z); samples with NaN or a quaternion of
-            zeros are lost, not implausible.
-        period_ns: nominal period.
-        can_rest: of a robot, see `implausible_repeats`.
+    Poses are position (m) and quaternion (w, x, y, z); samples with NaN or a quaternion of zeros
+    are lost, not implausible. `period_ns` is nominal; `can_rest` as in `implausible_repeats`.
     """
     values = np.asarray(poses, dtype=np.float64)
     norms = np.linalg.norm(values[:, 3:], axis=1)
@@ -216,10 +207,7 @@ def lasting_jumps(
 ) -> Int64[np.ndarray, " jumps"]:
     """Numbers of the samples from which on a tracker's world is another: it found itself anew.
 
-    Args:
-        t_ns: increasing times of poses that were all seen.
-        poses: [n, 7], without outliers.
-        period_ns: nominal period.
+    Poses [n, 7] were all seen, at increasing times, and are without outliers.
     """
     if len(poses) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -395,12 +383,7 @@ def _catches_up(rows: np.ndarray, is_next: np.ndarray, start: int, stop: int) ->
 def check_camera_matrix(
     K: Float64[np.ndarray, "3 3"], size_px: tuple[int, int], *, where: str
 ) -> None:
-    """Refuse a camera matrix that no lens in front of these images has.
-
-    Args:
-        K: pinhole intrinsics in pixels.
-        size_px: width and height of the images.
-        where: names the matrix in the error.
+    """Refuse a camera matrix (px) that no lens before images of width and height `size_px` has.
 
     Raises:
         InvalidInputError: not finite, not of this form, a principal point outside the image, or

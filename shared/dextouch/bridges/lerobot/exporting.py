@@ -64,20 +64,15 @@ def export_lerobot(
 ) -> int:
     """Write episodes as one LeRobotDataset v3.0 and return the number of frames.
 
-    Args:
-        readers: of the episodes, in the order of the dataset; opened one at a time.
-        folder: of the dataset; must not exist.
-        repo_id: name of the dataset, `user/name`.
-        options: rate, cameras, quality.
+    Readers are opened one at a time, in the order of the dataset. `repo_id` is its name,
+    `user/name`.
 
     Raises:
         ConflictError: the folder exists.
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
-            one dataset.
-        UnknownNameError: a camera that an episode does not have.
+            one dataset, such as with a camera that one of them lacks.
         ShapeError: images with an odd side.
-        CorruptDataError: a damaged episode.
-        StorageError: the write failed.
+        CorruptDataError, StorageError: a damaged episode; the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
@@ -101,11 +96,7 @@ def export_lerobot(
 
 
 def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
-    """Rows of the data files from columns [n, *shape].
-
-    A feature of shape [1] is a plain value, one of another axis a fixed list, one of several axes
-    lists of lists.
-    """
+    """Rows of the data files from columns [n, *shape]; a feature of shape [1] is a plain value."""
     table = {}
     for name, values in columns.items():
         shape = [] if features[name]["shape"] == [1] else features[name]["shape"]
@@ -148,8 +139,7 @@ class _ParquetFiles:
 class _Dataset:
     """Writes a new dataset episode by episode; `finish` writes the metadata.
 
-    The first episode decides about its cameras and whether its actions are commanded ones, beside
-    which measured ones are stored.
+    The first episode decides about cameras, and whether actions are commanded ones.
     """
 
     def __init__(self, folder: Path, first: EpisodeReader, options: ExportOptions) -> None:
@@ -269,11 +259,7 @@ class _Dataset:
             self._rows = []
 
     def finish(self, repo_id: str) -> None:
-        """Complete the files and write the metadata; `repo_id` is the dataset's name.
-
-        Raises:
-            StorageError: the write failed.
-        """
+        """Complete the files and write the metadata; raises StorageError if the write failed."""
         self.close()
         self._write_tasks()
         statistics = {

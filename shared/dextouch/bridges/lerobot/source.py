@@ -93,9 +93,7 @@ class LeRobotFolder:
     def columns(self, entry: EpisodeEntry, names: list[str]) -> dict[str, np.ndarray]:
         """Columns [n, *shape] of one episode by feature.
 
-        Raises:
-            NotFoundError: the data file is missing.
-            CorruptDataError: it does not hold the episode's frames in order.
+        Raises NotFoundError without the data file, CorruptDataError if that lacks frames in order.
         """
         path = self.data_file(entry)
         table = self._rows(path, entry)
@@ -116,10 +114,9 @@ class LeRobotFolder:
         return columns
 
     def sidecar(self, entry: EpisodeEntry) -> layout.Sidecar | None:
-        """An episode's sidecar; None where the dataset was not written by DexTouch.
+        """An episode's sidecar, None in a foreign dataset.
 
-        Raises:
-            CorruptDataError: an invalid sidecar file.
+        Raises CorruptDataError for an invalid file.
         """
         name = layout.SIDECAR_PATH.format(episode_index=entry.index)
         path = layout.confined(self.folder, name)
@@ -146,8 +143,7 @@ class LeRobotFolder:
     def span(self, entry: EpisodeEntry, key: str) -> VideoSpan:
         """File and time span of an episode's images of one camera.
 
-        Raises:
-            CorruptDataError: missing from the table of episodes.
+        Raises CorruptDataError if they are missing from the table of episodes.
         """
         if self.info.video_path is None:
             raise CorruptDataError(f"{self.folder}: has video features but no video_path")
