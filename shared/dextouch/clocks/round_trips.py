@@ -102,8 +102,7 @@ class RoundTripClock:
     def add(self, exchange: RoundTrip) -> None:
         """Add one exchange, in order of the requests.
 
-        Raises:
-            InvalidInputError: a reply before its request, or out of order.
+        Raises InvalidInputError for a reply before its request, or out of order.
         """
         if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
             raise InvalidInputError(
@@ -137,12 +136,9 @@ class RoundTripClock:
     ) -> ClockOffset:
         """Offset at a local time; by default at the last exchange.
 
-        Args:
-            at_local_ns: any local time.
-            skew: estimate from another source, used if more accurate than that of the exchanges.
+        `skew`, of another source, is used if it is more accurate than that of the exchanges.
 
-        Raises:
-            ClockFitError: no exchange yet (`details["cause"]` is "too_few").
+        Raises ClockFitError without an exchange (`details["cause"]` is "too_few").
         """
         if self._reference is None:
             raise ClockFitError("round trip clock: no exchange yet", cause="too_few")
@@ -167,10 +163,7 @@ class RoundTripClock:
     ) -> PathLatency:
         """Path latency that is still contained in a device's corrected times.
 
-        Args:
-            t_remote_ns: a sample's device time.
-            t_estimated_ns: the same sample's time by `OnlineClock` or `fit_clock`.
-            skew: of the remote clock, as estimated from samples.
+        It comes from a sample's device time, and its time by `OnlineClock` or `fit_clock`.
         """
         offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns

@@ -28,13 +28,9 @@ MAX_METADATA_BYTES = 1 << 24
 
 @contextmanager
 def disk_errors(what: str, *, advice: str = "free space and try again") -> Iterator[None]:
-    """Context manager that maps OSError to DexTouch errors, naming the operation `what`.
+    """Context manager that maps OSError to StorageError; a full disk or quota to StorageFullError.
 
-    `advice` ends the message about a full disk.
-
-    Raises:
-        StorageFullError: no space, quota or file size left.
-        StorageError: any other I/O error.
+    `what` names the operation; `advice` ends the message about a full disk.
     """
     try:
         yield
@@ -181,11 +177,7 @@ class GroupFiles(Protocol):
 class OpenedGroup:
     """The committed group that a reader has opened, to tell its deletion from damage.
 
-    Attributes:
-        files: of the group.
-        commit_name: name of its commit record.
-        commit_sha256: hash of the commit record when it was opened.
-        what: names the group in errors.
+    `commit_sha256` is the hash of its commit record then; `what` names the group in errors.
     """
 
     files: GroupFiles
@@ -194,11 +186,7 @@ class OpenedGroup:
     what: str
 
     def check_present(self, error: StorageError | None = None) -> None:
-        """Refuse a group that was deleted or replaced, of which `error` is the consequence.
-
-        Raises:
-            NotFoundError: its commit record is gone, or another one.
-        """
+        """Raise NotFoundError if the group was deleted or replaced, and so caused `error`."""
         try:
             commit = self.files.get_now(self.commit_name)
         except StorageError:
@@ -256,11 +244,10 @@ class LocalFile:
 
 
 class LocalGroup:
-    """The files of a group in a local folder, all of which must lie inside it.
+    """The files of a group in a local folder.
 
-    Raises:
-        CorruptDataError: the folder, a file or a folder between is a symbolic link, or a small file
-            is larger than any metadata.
+    Reading raises CorruptDataError for a symbolic link at or below the folder, and for a small file
+    that is larger than any metadata.
     """
 
     def __init__(self, folder: Path) -> None:

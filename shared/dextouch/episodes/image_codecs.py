@@ -89,11 +89,7 @@ def parameter_sets(access_unit: bytes) -> bytes:
 
 
 def check_video_size(height: int, width: int) -> None:
-    """Refuse image sizes that 4:2:0 H.264 cannot encode.
-
-    Raises:
-        InvalidInputError: an odd or empty side.
-    """
+    """Raise InvalidInputError for sides that 4:2:0 H.264 cannot encode: odd or empty ones."""
     if height % 2 or width % 2 or not height or not width:
         raise InvalidInputError(
             f"H.264: got images of {height} x {width} pixels, expected even numbers; "
@@ -102,14 +98,9 @@ def check_video_size(height: int, width: int) -> None:
 
 
 class GopEncoder:
-    """Persistent encoder of one camera; every `group_images`-th access unit begins a group.
+    """Persistent encoder of one camera with images of even sides, in groups of pictures.
 
-    Args:
-        height: of the images, even.
-        width: of the images, even.
-        rate_hz: nominal, for players of the stream.
-        settings: quality and speed.
-        group_images: of the store by default, which takes no others.
+    `rate_hz` is nominal, for players of the stream; the store takes only its own `group_images`.
 
     Raises:
         InvalidInputError: an invalid size or invalid settings.
@@ -188,12 +179,9 @@ class GopDecoder:
     def decode(
         self, access_units: list[bytes], wanted: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Decode images of a group into `out`, uint8 [len(wanted), *form.shape].
+        """Decode images of a group into `out`, uint8 [n, *form.shape]; raises as `frames`.
 
-        `access_units` go up to the last requested image, `wanted` are ascending indices.
-
-        Raises:
-            CorruptDataError: invalid access units, or another number or size of images.
+        `access_units` go up to the last requested image, `wanted` are n ascending indices.
         """
         rows = {place: row for row, place in enumerate(wanted)}
         for place, frame in enumerate(self.frames(access_units)):
@@ -305,11 +293,7 @@ def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
 
 
 def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None:
-    """Decode a group of pictures, or its first images, and discard them.
-
-    Raises:
-        CorruptDataError: as `GopDecoder.frames`.
-    """
+    """Decode a group of pictures, or its first images, and discard them; raises as `frames`."""
     for _ in decoder_of_this_thread(*size_px).frames(access_units):
         pass
 
@@ -337,8 +321,7 @@ class ImageChunks:
     def unpack(self, payload: bytes, number: int) -> list[bytes]:
         """Split storage chunk `number` into its encoded images, the inverse of `pack_chunk`.
 
-        Raises:
-            CorruptDataError: an invalid storage chunk.
+        Raises CorruptDataError if it is invalid.
         """
         if self.codec == "jpeg":
             return [payload]
@@ -358,10 +341,7 @@ class ImageChunks:
         """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
 
         `places` are the ascending indices of the requested images in the chunk, `out` is uint8
-        [len(places), *form.shape(shape)].
-
-        Raises:
-            CorruptDataError: invalid image data.
+        [len(places), *form.shape(shape)]. Raises CorruptDataError for invalid image data.
         """
         images = self.unpack(payload, number)
         if places[-1] >= len(images):

@@ -104,13 +104,9 @@ def object_track(
     """Poses of an episode's objects at given times, in the order of its `object_names`.
 
     They come from the stream `object_poses` or else from the streams `object_NAME`, which have
-    samples only where the object was seen.
+    samples only where the object was seen; None if the episode has neither.
 
-    Returns:
-        None if the episode has neither.
-
-    Raises:
-        CorruptDataError: damaged bytes.
+    Raises CorruptDataError for damaged bytes.
     """
     if OBJECT_POSES in reader.streams:
         return ObjectTrack.of_one_source("twin", *_all_at_once(reader, t_ref_ns))
@@ -219,9 +215,7 @@ def first_camera(
 def listed_objects(about: EpisodeAttributes, objects: SceneObjects) -> tuple[SceneObject, ...]:
     """The objects that a file lists for an episode's task.
 
-    Raises:
-        UnknownNameError: the file does not have the task.
-        InvalidInputError: the episode has other objects.
+    Raises UnknownNameError without the task, InvalidInputError if the episode has other objects.
     """
     if about.task not in objects.tasks:
         raise UnknownNameError("task of the objects", about.task, list(objects.tasks))
@@ -244,14 +238,8 @@ def clicked_poses(
 ) -> ClickedPoses:
     """Poses of an episode's objects at its first step.
 
-    Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away.
-
-    Args:
-        about: the episode.
-        objects: of the tasks, with the height of the table.
-        clicks: on objects of this episode.
-        may_lack_headings: whether an object whose second click is missing counts as unknown,
-            and is not refused.
+    Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away. If
+    they `may_lack_headings`, an object whose second click is missing is unknown, and not refused.
 
     Raises:
         UnknownNameError: a task or an object that the file of objects does not have.

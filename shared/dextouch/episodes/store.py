@@ -95,9 +95,8 @@ class EpisodeStore:
     def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
 
-        Raises:
-            ConflictError: the id exists already.
-            InvalidInputError: attributes of the other kind.
+        Raises ConflictError for an id that exists, InvalidInputError for attributes of the other
+        kind.
         """
         model = ATTRIBUTES[_check_kind(kind)]
         if not isinstance(attributes, model):
@@ -110,9 +109,8 @@ class EpisodeStore:
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
 
-        Raises:
-            NotFoundError: no such episode.
-            CorruptDataError, StorageError: damaged, or of a newer format.
+        Raises NotFoundError without it, CorruptDataError or StorageError if it is damaged, or of a
+        newer format.
         """
         return EpisodeReader(self._read("episode", episode_id, EpisodeAttributes))
 
@@ -130,11 +128,7 @@ class EpisodeStore:
             raise
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
-        """The raw files of a committed group, for inspection and repair.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """The raw files of a committed group, for inspection and repair; raises as `revision`."""
         return self._storage.group(*_check(kind, item_id))
 
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
@@ -144,8 +138,7 @@ class EpisodeStore:
     def revision(self, item_id: str, *, kind: Kind = "episode") -> int:
         """A number that changes when an id is deleted and written again.
 
-        Raises:
-            NotFoundError: no such id.
+        Raises NotFoundError without the id.
         """
         return self._storage.revision(*_check(kind, item_id))
 
@@ -160,19 +153,13 @@ class EpisodeStore:
     def review(self, item_id: str, *, kind: Kind = "episode") -> Review | None:
         """The review of an item; None if nobody reviewed it.
 
-        Raises:
-            NotFoundError: no such id.
-            CorruptDataError: its review cannot be read.
+        Raises NotFoundError without the id, CorruptDataError if its review cannot be read.
         """
         group = self._storage.group(*_check(kind, item_id))
         return read_remark(group, REVIEW_FILE, Review, what=f"{kind} {item_id!r}")
 
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
-        """Keep the review of an item in place of an earlier one; None removes it.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """Keep the review of an item in place of an earlier one, None for none; raises as `revision`."""
         self._set_remark(kind, item_id, REVIEW_FILE, review)
 
     def clicks(self, episode_id: str) -> EpisodeClicks | None:
@@ -192,12 +179,9 @@ class EpisodeStore:
         self._storage.set_remark(kind, item_id, name, content)
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
-        """Move an episode or recording to the trash, or delete it `for_good`.
+        """Move an item to the trash, or delete it `for_good`, as always in object storage.
 
-        Object storage has no trash, so there it is always for good.
-
-        Raises:
-            NotFoundError: no such id.
+        Raises NotFoundError without the id.
         """
         self._storage.group(*_check(kind, item_id))
         if for_good or not isinstance(self._storage, _LocalStorage):
@@ -218,11 +202,7 @@ class EpisodeStore:
         return purge_trash(self._trash_root(), older_than_s=older_than_s)
 
     def require_trash(self) -> None:
-        """Check that deleted items can be restored.
-
-        Raises:
-            InvalidInputError: a store in a bucket, which has no trash.
-        """
+        """Raise InvalidInputError for a store in a bucket, which has no trash to restore from."""
         self._trash_root()
 
     def _trash_root(self) -> Path:
@@ -292,8 +272,7 @@ def _check_kind(kind: Kind) -> Kind:
 def local_folder(url: str | Path) -> Path:
     """Local folder of a store's URL: a path, or `file:///…`.
 
-    Raises:
-        InvalidInputError: an address of another scheme, or of another host.
+    Raises InvalidInputError for another scheme or host.
     """
     if isinstance(url, Path):
         return url
@@ -392,17 +371,12 @@ def write_rollout(
     observations: Sequence[Observation],
     commanded: np.ndarray,
 ) -> None:
-    """Write a rollout as an episode on the model grid.
+    """Write a rollout, whose attributes have no `streams` yet, as an episode on the model grid.
 
-    Images are stored for the steps that have them. Object poses, if the world returned them for
-    every chunk, are the stream `object_poses`, from step 1 on: the first observation may be real,
-    without known poses.
-
-    Args:
-        store: destination.
-        attributes: of the episode, without `streams`.
-        observations: of step 0 and of every chunk; at least one has images of the head camera.
-        commanded: [T, 67] actions, row 0 the poses of step 0.
+    Observations are of step 0 and of every chunk; images are stored for the steps that have them,
+    at least one of the head camera. Object poses, if the world returned them for every chunk, are
+    the stream `object_poses`, from step 1 on: the first observation may be real, without known
+    poses. Row 0 of the commanded actions [T, 67] are the poses of step 0.
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])

@@ -147,8 +147,7 @@ class StreamWriter:
     def finish(self) -> dict[str, ArrayEntry]:
         """Complete all arrays and return their entries of the commit record.
 
-        Raises:
-            StorageError: a block was written partially because of a disk failure.
+        Raises StorageError if a block was written partially because of a disk failure.
         """
         if self._queue is not None:
             self._queue.drain()

@@ -92,8 +92,7 @@ def commit_stage(
 ) -> None:
     """Write metadata and commit record of finished arrays and rename the stage to its target.
 
-    Raises:
-        ConflictError: the target exists.
+    Raises ConflictError if the target exists.
     """
     group = group_metadata(json_ready(attributes))
     record = CommitRecord(
@@ -139,11 +138,6 @@ class EpisodeWriter:
     exception, Ctrl-C included, nothing is left, and of a killed writer only a stage that
     `EpisodeStore.sweep` removes. A take is kept by its spool (`dextouch.episodes.spool`) until it
     is committed. Streams listed in the attributes are added at the start.
-
-    Args:
-        stage: new folder on the store's file system.
-        target: where the group appears at commit.
-        attributes: of an episode or a recording.
     """
 
     def __init__(self, *, stage: Path, target: Path, attributes: Attributes) -> None:
@@ -197,17 +191,13 @@ class EpisodeWriter:
         t_device_ns: np.ndarray | None = None,
         sequence: np.ndarray | None = None,
     ) -> None:
-        """Append a block of samples to a stream.
+        """Append a block of samples to an added stream.
 
-        Args:
-            name: of an added stream.
-            values: `[n, *shape]` of the stream's dtype; finite in episodes. For the units `jpeg`
-                and `h264` uint8 images [n, h, w, 3], or an object array of encoded images (bytes),
-                stored unchanged.
-            t_ref_ns: [n], strictly increasing; episodes need exactly this stamp.
-            t_host_ns: [n], non-decreasing; required for recordings.
-            t_device_ns: [n]; recordings only, NO_DEVICE_TIME where absent.
-            sequence: [n]; recordings only, NO_SEQUENCE where absent.
+        Values are `[n, *shape]` of the stream's dtype; finite in episodes. For the units `jpeg` and
+        `h264` they are uint8 images [n, h, w, 3], or an object array of encoded images (bytes),
+        stored unchanged. Episodes need exactly `t_ref_ns` [n], strictly increasing; recordings
+        `t_host_ns` [n], non-decreasing, and where there are any `t_device_ns` and `sequence`, with
+        NO_DEVICE_TIME and NO_SEQUENCE where absent.
 
         Raises:
             UnknownNameError: no such stream.
@@ -239,8 +229,7 @@ class EpisodeWriter:
     def set_attributes(self, attributes: Attributes) -> None:
         """Replace the attributes, for values known only at the end (success, ledger).
 
-        Raises:
-            InvalidInputError: of another kind or id than the writer was opened for.
+        Raises InvalidInputError for another kind or id than the writer was opened for.
         """
         if type(attributes) is not type(self._attributes) or attributes_id(
             attributes

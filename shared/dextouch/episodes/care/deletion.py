@@ -177,8 +177,7 @@ class IdentifierSearch:
 class DeletionRequest:
     """Scope of a deletion: an operator or a recording, with all data derived from it.
 
-    Raises:
-        InvalidInputError: both or neither were given.
+    Raises InvalidInputError if both or neither were given.
     """
 
     operator: str | None = None
@@ -370,15 +369,9 @@ def delete_for_good(
     What the service of the store must refuse from now on is remembered before anything is removed.
 
     Uploads and stages locked by a writer are kept and listed as remaining: stop the writer and
-    repeat. Reviews that the operator wrote of other people's items lose their name. Checkpoints are
-    only searched.
-
-    Args:
-        root: of the store.
-        request: operator or recording.
-        receipt_path: new file outside the store.
-        checkpoints: folder with models that may have been trained on the deleted data.
-        unsent: delete an operator of whom the store holds nothing, but a station may.
+    repeat. Reviews that the operator wrote of other people's items lose their name. `checkpoints`,
+    whose models may have been trained on the deleted data, are only searched. With `unsent` an
+    operator is deleted of whom the store holds nothing, but a station may.
 
     Raises:
         NotFoundError: nothing in the store matches, and the operator reviewed nothing.
@@ -441,7 +434,7 @@ def _remove_all(
 ) -> list[Facts]:
     """Remove what a request covers until nothing more appears; returns the reviews without names.
 
-    `known` grows by what is found, and `remember` is called before anything is removed.
+    `known` grows, and `remember` is called before anything is removed.
     """
     reviewed = list[Facts]()
     for _ in range(_MAX_ROUNDS):
@@ -473,8 +466,8 @@ def _search(
 ) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Searched are all attributes files, the names of folders, and of checkpoints the headers of
-    safetensors and the JSON beside them.
+    Searched are attributes files, names of folders, and of checkpoints JSON and safetensors'
+    headers.
     """
     found, files = [], []
     facts = all_facts(root)

@@ -35,9 +35,9 @@ _SCRYPT_COST: Final = 2**14
 
 @dataclass(frozen=True)
 class TakeFacts:
-    """By what a take is recognised; `started` is `take_start` of it.
+    """By what a take is recognised; of a damaged one ids alone are known.
 
-    Of a damaged one the ids alone are known.
+    `started` is its `take_start`.
     """
 
     recording_id: str
@@ -68,10 +68,7 @@ class DeletedTake(FrozenModel):
 
 
 class DeletionRecord(FrozenModel):
-    """A deletion of an operator or of a recording.
-
-    `operator_digest` is None of a recording, and of an operator who may record again.
-    """
+    """A deletion; `operator_digest` is None of a recording, and of one who may record again."""
 
     record_version: Literal[1] = 1
     deleted_at: AwareDatetime
@@ -107,11 +104,7 @@ def take_start(started_at: datetime | str | None, started_t_host_ns: int | None)
 
 
 class DeletionRecords:
-    """The deletions that a store remembers, read anew whenever a file has changed. Thread-safe.
-
-    Args:
-        root: folder of the store.
-    """
+    """The deletions that a store remembers, read anew whenever a file has changed. Thread-safe."""
 
     def __init__(self, root: Path) -> None:
         self._folder = root / FOLDER
@@ -120,11 +113,7 @@ class DeletionRecords:
         self._salt = b""
 
     def read(self) -> Mapping[str, DeletionRecord]:
-        """All records by key, oldest first.
-
-        Raises:
-            CorruptDataError: a damaged record.
-        """
+        """All records by key, oldest first; raises CorruptDataError for a damaged one."""
         with self._lock:
             known, self._files = self._files, {}
             for path, stamp in _stamps(self._folder / "records"):
@@ -211,9 +200,8 @@ class DeletionRecords:
     def confirm(self, station: str, *, revision: str, held: Mapping[str, Sequence[str]]) -> None:
         """Note that a station holds no covered takes any more, except those in `held` by record.
 
-        Raises:
-            ConflictError: there was a deletion after that of `revision`.
-            InvalidInputError: `held` names an unknown record.
+        Raises ConflictError after a deletion later than `revision`, InvalidInputError for an
+        unknown record in `held`.
         """
         records = self.read()
         if revision != self.revision:

@@ -99,8 +99,7 @@ def inspect_group(
 ) -> ItemReport:
     """Read a committed group completely and list all damage.
 
-    Raises:
-        NotFoundError: there is no such group, or it was deleted meanwhile.
+    Raises NotFoundError if there is no such group, or it was deleted meanwhile.
     """
     try:
         contents = open_contents(files, kind)
@@ -252,10 +251,9 @@ class RepairReport:
 def repair_group(
     root: Path, kind: Kind, item_id: str, *, copy: GroupFiles | None = None
 ) -> RepairReport:
-    """Repair a committed group from a copy of the same content, or salvage its readable samples.
+    """Repair a group from a copy of the same content, or salvage its readable samples.
 
-    Raises:
-        ConflictError: a copy of other content.
+    Raises ConflictError for a copy of other content.
     """
     files = LocalGroup(root / f"{kind}s" / item_id)
     findings = inspect_group(files, kind).findings
@@ -273,10 +271,10 @@ def repair_group(
 
 
 def repair_uploads(root: Path) -> list[RepairReport]:
-    """Salvage damaged uploads.
+    """Salvage damaged uploads; intact ones are unchanged, since their station continues them.
 
-    Intact ones are unchanged, since their station continues them. The readable samples of damaged
-    ones become a recording `ID-salvaged-N`, so that the station can send everything again.
+    Their readable samples become a recording `ID-salvaged-N`: the station can send everything
+    again.
     """
     reports = []
     for spool in unheld_folders(root / UPLOADS):
@@ -313,13 +311,8 @@ def _write_salvaged(
 ) -> tuple[str, dict[str, int]]:
     """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
-    If an interrupted repair has done so already, its group is returned.
-
-    Returns:
-        The new id, and the number of dropped samples by stream.
-
-    Raises:
-        InvalidInputError: no sample is readable.
+    Returns its id, also if an interrupted repair wrote it, and the number of dropped samples by
+    stream. Raises InvalidInputError if no sample is readable.
     """
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     streams = on_one_grid(streams) if kind == "episode" else list(streams)
@@ -432,8 +425,7 @@ def _known(
 ) -> tuple[Attributes, Mapping[str, ArrayEntry], str | None]:
     """Trustworthy attributes, arrays and content hash of a damaged group.
 
-    Raises:
-        StorageError: another version, or attributes that are damaged.
+    Raises StorageError for another version, or damaged attributes.
     """
     what = f"{kind} {files.item_id}"
     record, group = _commit_of(files, kind), files.get(METADATA_FILE)

@@ -44,10 +44,9 @@ Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SalvagedStream:
-    """The readable samples of one stream.
+    """The readable samples of one stream; `kept` is the mask of samples to keep.
 
-    `kept` is the mask of samples to keep; `read` returns values and stamps of the kept ones in a
-    range that starts and ends at multiples of `block`.
+    `read` gives those of a range that starts and ends at multiples of `block`.
     """
 
     descriptor: StreamDescriptor
