@@ -159,7 +159,10 @@ class EpisodeStore:
         return read_remark(group, REVIEW_FILE, Review, what=f"{kind} {item_id!r}")
 
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
-        """Keep the review of an item in place of an earlier one, None for none; raises as `revision`."""
+        """Keep the review of an item in place of an earlier one; None removes it.
+
+        Raises NotFoundError without the id.
+        """
         self._set_remark(kind, item_id, REVIEW_FILE, review)
 
     def clicks(self, episode_id: str) -> EpisodeClicks | None:
