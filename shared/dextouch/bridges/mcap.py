@@ -28,7 +28,15 @@ from dextouch.bridges.mcap_messages import (
     descriptor_set,
     raw_encoding,
 )
-from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, disk_errors
+from dextouch.episodes import (
+    Attributes,
+    EpisodeReader,
+    EpisodeStore,
+    EpisodeWriter,
+    attributes_id,
+    disk_errors,
+    kind_of,
+)
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -53,7 +61,6 @@ _BLOCK_BYTES: Final = 1 << 24
 MAX_RECORD_BYTES: Final = 1 << 28
 MAGIC: Final = b"\x89MCAP0\r\n"
 _WANTED = (Attachment, Channel, DataEnd, Message, Metadata, Schema)
-Attributes = EpisodeAttributes | RecordingAttributes
 
 
 def export_mcap(
@@ -218,7 +225,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
         ConflictError: the id is in the store already.
     """
     attributes, counts = _about(path)
-    kind: Kind = "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+    kind = kind_of(attributes)
     with store.writer(kind=kind, attributes=attributes) as writer:
         streams = {
             f"/{stream.name}": _Stream(MessageCodec(stream), writer, is_episode=kind == "episode")
@@ -233,9 +240,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
                     f"{path}: {topic} holds {stream.num_samples} messages, expected {expected}; "
                     "the file was cut or filtered after the export"
                 )
-    if isinstance(attributes, EpisodeAttributes):
-        return attributes.episode_id
-    return attributes.recording_id
+    return attributes_id(attributes)
 
 
 def _about(path: Path) -> tuple[Attributes, dict[str, int]]:

@@ -74,10 +74,6 @@ def entity_of(descriptor: StreamDescriptor) -> str:
     return f"tactile/{name}" if descriptor.kind == "tactile" else f"numbers/{name}"
 
 
-def _names(reader: Reader, kind: str) -> list[str]:
-    return [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
-
-
 def _blueprint(reader: Reader) -> rrb.Blueprint:
     """Viewer layout: 3D view and plots on the left, cameras in the middle, touch on the right."""
     columns = [
@@ -87,7 +83,8 @@ def _blueprint(reader: Reader) -> rrb.Blueprint:
         )
     ]
     for kind in ("image", "tactile"):
-        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in _names(reader, kind)]
+        entities = [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
+        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in entities]
         if views:
             columns.append(rrb.Vertical(*views))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)

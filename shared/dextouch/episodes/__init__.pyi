@@ -9,8 +9,11 @@ from .files import replace_file as replace_file
 from .format import COMMIT_FILE as COMMIT_FILE
 from .format import GOP_IMAGES as GOP_IMAGES
 from .format import KINDS as KINDS
+from .format import Attributes as Attributes
 from .format import Kind as Kind
+from .format import attributes_id as attributes_id
 from .format import check_id as check_id
+from .format import kind_of as kind_of
 from .format import shard_path as shard_path
 from .format import stream_arrays as stream_arrays
 from .h264_headers import first_gap as first_gap

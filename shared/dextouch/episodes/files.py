@@ -198,18 +198,6 @@ class OpenedGroup:
             ) from error
 
 
-def _mapped(path: Path) -> memoryview | None:
-    """The memory-mapped bytes of a file; None if it is missing."""
-    try:
-        status = path.stat()
-        if status.st_size == 0:
-            return memoryview(b"")
-        return memoryview(_map(str(path), status.st_ino, status.st_size, status.st_mtime_ns))
-    except (FileNotFoundError, NotADirectoryError):
-        # Also if it was removed after its size was read.
-        return None
-
-
 # Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
 # A file that was replaced under the same name has another identity.
 @lru_cache(MAX_MAPPED_FILES)
@@ -236,7 +224,14 @@ class LocalFile:
 
     def _bytes(self) -> memoryview | None:
         try:
-            return _mapped(self.path)
+            status = self.path.stat()
+            if status.st_size == 0:
+                return memoryview(b"")
+            identity = (status.st_ino, status.st_size, status.st_mtime_ns)
+            return memoryview(_map(str(self.path), *identity))
+        except (FileNotFoundError, NotADirectoryError):
+            # Also if it was removed after its size was read.
+            return None
         except OSError:
             # Entered only on a miss: on every read it would cost as much as the lookup.
             with disk_errors(f"read {self.path}"):

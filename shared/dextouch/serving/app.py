@@ -176,7 +176,8 @@ def _health_router(
 
 def _add_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(DexTouchError)
-    async def ours(request: Request, error: DexTouchError) -> Response:
+    @app.exception_handler(HTTPException)
+    async def refused(request: Request, error: DexTouchError | HTTPException) -> Response:
         return _refusal(request, error)
 
     @app.exception_handler(RequestValidationError)
@@ -192,10 +193,6 @@ def _add_error_handlers(app: FastAPI) -> None:
             text += f"; and {len(found) - len(items)} more"
         ours = InvalidInputError(text or "invalid request", errors=items)
         return _problem_response(request, ours, 400 if malformed else 422)
-
-    @app.exception_handler(HTTPException)
-    async def http(request: Request, error: HTTPException) -> Response:
-        return _refusal(request, error)
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:

@@ -25,8 +25,6 @@ from pydantic_settings import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import first_problems
 
-# Problems of settings in the words of their user: the option, what it got, what it expects.
-
 MAX_PROBLEMS: Final = 5
 MAX_SHOWN: Final = 60
 # What pydantic expects, by the type of its error; `ctx` has the numbers and names.

@@ -19,6 +19,7 @@ import structlog
 from httptools import HttpParserError
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Metric
 from prometheus_client.registry import Collector
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -461,12 +462,9 @@ async def _send_without_trace(scope: Scope, send: Send, message: Message) -> Non
 
 def _request_id(scope: Scope) -> str:
     """The caller's, if it is a valid one, or a new one."""
-    for name, value in scope["headers"]:
-        if name == b"x-request-id":
-            given = value.decode("latin-1")
-            is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
-            return given if is_usable else secrets.token_hex(16)
-    return secrets.token_hex(16)
+    given = Headers(scope=scope).get("x-request-id", "")
+    is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+    return given if is_usable else secrets.token_hex(16)
 
 
 @contextmanager

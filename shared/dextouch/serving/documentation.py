@@ -53,7 +53,13 @@ def document_service(
             schema = body.model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= schema.pop("$defs", {})
             operation["requestBody"] = {"required": True, "content": {JSON: {"schema": schema}}}
-        _document_body(operation, route)
+        rule = body_rule(route.endpoint)
+        if rule is not None and rule.max_bytes:
+            # Media types that the route takes and reads by itself.
+            body_of = operation.setdefault("requestBody", {"required": True})
+            for kind in rule.max_bytes:
+                schema = {} if kind == JSON else {"schema": BINARY}
+                body_of.setdefault("content", {}).setdefault(kind, schema)
         _document_refusals(operation, method, has_scope=bool(scopes))
     return document
 
@@ -75,16 +81,6 @@ def _dependencies(dependant: Dependant, kind: type[CallT]) -> Iterator[CallT]:
         if isinstance(dependency.call, kind):
             yield dependency.call
         yield from _dependencies(dependency, kind)
-
-
-def _document_body(operation: dict[str, Any], route: APIRoute) -> None:
-    """Add the media types that the route takes and reads by itself."""
-    rule = body_rule(route.endpoint)
-    if rule is None or not rule.max_bytes:
-        return
-    content = operation.setdefault("requestBody", {"required": True}).setdefault("content", {})
-    for kind in rule.max_bytes:
-        content.setdefault(kind, {} if kind == JSON else {"schema": BINARY})
 
 
 def _document_refusals(operation: dict[str, Any], method: str, *, has_scope: bool) -> None:

@@ -323,8 +323,6 @@ class GuardMiddleware:
         self.site.check(connection, is_unsafe=is_unsafe)
 
 
-# Large JSON bodies, decoded at a bounded cost and without blocking other requests for long.
-
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # Bodies above it are decoded in a thread, so that others need not wait.

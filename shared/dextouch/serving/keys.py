@@ -13,8 +13,6 @@ from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import KEY_NAME_PATTERN
 
-# Strength of API keys: short, repetitive, orderly and published ones are refused at the start.
-
 MIN_LENGTH: Final = 16
 # So many guesses take 35 years at a thousand a second. By this estimate 97 of 100 random keys of 16
 # hexadecimal digits have as many, and all of 32 digits: the least of 20,000 had 75.

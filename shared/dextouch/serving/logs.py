@@ -50,7 +50,11 @@ def configure_logging(
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,
-            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *last, _mask],
+            processors=[
+                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+                *last,
+                lambda _, __, line: masked(str(line)),
+            ],
         )
     )
     root = logging.getLogger()
@@ -69,11 +73,6 @@ def _escape(_: WrappedLogger, __: str, event: EventDict) -> EventDict:
         name: printable(one, lines=name in {"exception", "stack"}) if isinstance(one, str) else one
         for name, one in event.items()
     }
-
-
-def _mask(_: WrappedLogger, __: str, line: EventDict | str) -> str:
-    """Last processor: hides secrets in the finished line."""
-    return masked(str(line))
 
 
 def _is_wanted(record: logging.LogRecord) -> bool:

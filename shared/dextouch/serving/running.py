@@ -15,8 +15,6 @@ from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import ServiceSettings, load_settings
 from dextouch.serving.spans import SPANS
 
-# Address that a service listens on, checked before anything is loaded or started.
-
 
 def bound_socket(what: str, host: str, port: int, *, advice: str) -> socket.socket:
     """A socket that is bound to an address, which does not listen yet; port 0 selects a free one.

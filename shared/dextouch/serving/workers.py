@@ -20,17 +20,13 @@ from uvicorn.supervisors import Multiprocess
 
 from dextouch.errors import DexTouchError, UnavailableError
 
-# Messages of a service to systemd: ready, stopping, and a watchdog that only a working one feeds.
-#
-# The protocol is sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names.
-
 logger = structlog.get_logger(__name__)
 
 IsWorking = Callable[[], bool]
 
 
 class ServiceManager:
-    """The service manager that started this process; without one nothing is sent."""
+    """The service manager that started this process, by sd_notify(3); without one it is silent."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")

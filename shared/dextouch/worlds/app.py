@@ -27,11 +27,9 @@ from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
 from dextouch.worlds.settings import WorldServiceSettings
 from dextouch.worlds.world import World
 
-# Prometheus metrics of the worlds of a process: queues, rollouts and sizes of batches.
-
 
 class WorldMetrics(Collector):
-    """Shows a process's rollouts."""
+    """Prometheus metrics of the worlds of a process: queues, rollouts and sizes of batches."""
 
     def __init__(self, service: RolloutService) -> None:
         self._service = service

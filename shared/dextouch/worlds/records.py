@@ -291,17 +291,17 @@ def selector_bytes(selector: ReturnSelector) -> bytes:
     return selector.model_dump_json().encode()
 
 
-# Read access to open rollouts for people who watch: a listing, and each one's newest response.
-#
-# Both read what the rollouts have stored anyway, so a world computes and renders nothing for them.
-
 _TAG_LETTERS: Final = 32
 _MAX_BYTES: Final = 2**30
 _NS: Final = 1e-9
 
 
 class RolloutWatch:
-    """The open rollouts of all processes with one state store; one response is read at a time."""
+    """The open rollouts of all processes with one state store, for people who watch.
+
+    It reads what they have stored anyway, so a world computes and renders nothing for it; one
+    response is read at a time.
+    """
 
     def __init__(self, records: RecordStore) -> None:
         self._records = records

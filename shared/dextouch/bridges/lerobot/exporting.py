@@ -34,6 +34,11 @@ from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 ROWS_AT_ONCE: Final = 100
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
+CARD: Final = (
+    "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
+    f"---\n\n# {{}}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from DexTouch "
+    "episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
+)
 # Of video that has to be encoded.
 VIDEO = VideoSettings(crf=23, preset="veryfast")
 GROUP_IMAGES: Final = 2
@@ -268,7 +273,7 @@ class _Dataset:
         }
         for name, content in ((layout.STATS_FILE, statistics), (layout.INFO_FILE, self._info())):
             self._write(name, json.dumps(content, indent=4, allow_nan=False) + "\n")
-        self._write(layout.CARD_FILE, _card(repo_id))
+        self._write(layout.CARD_FILE, CARD.format(repo_id))
 
     def _write_tasks(self) -> None:
         """A table whose pandas index is the task's text."""
@@ -308,17 +313,6 @@ class _Dataset:
         with disk_errors(f"write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-
-
-def _card(repo_id: str) -> str:
-    front = (
-        "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n"
-        "  data_files: data/*/*.parquet\n---\n"
-    )
-    return (
-        f"{front}\n# {repo_id}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from "
-        "DexTouch episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
-    )
 
 
 def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:

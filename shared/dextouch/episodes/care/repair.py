@@ -323,7 +323,8 @@ def _write_salvaged(
         with suppress(StorageError):
             if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
                 return folder.name, lost
-    free = _free_id(root, kind, item_id)
+    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    free = next(name for name in names if not (root / f"{kind}s" / name).exists())
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
     with EpisodeWriter(
@@ -344,12 +345,6 @@ def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, objec
         return {"quality": attributes.quality | figures}
     entries = (LedgerEntry(stream=name, event=LOST, count=count) for name, count in lost.items())
     return {"ledger": (*attributes.ledger, *entries)}
-
-
-def _free_id(root: Path, kind: Kind, item_id: str) -> str:
-    """The first id `ID-salvaged-1`, `ID-salvaged-2` … that is not in use."""
-    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
-    return next(name for name in names if not (root / f"{kind}s" / name).exists())
 
 
 def _rewrite_metadata(files: LocalGroup, kind: Kind) -> None:
