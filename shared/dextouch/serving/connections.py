@@ -29,7 +29,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
 from dextouch.serving.guard import Refuse
-from dextouch.serving.masking import masked
+from dextouch.serving.logs import masked
 from dextouch.serving.refusals import RefusalLog, caller_of
 from dextouch.serving.spans import traced
 

@@ -29,9 +29,9 @@ from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError, InvalidInputError
 from dextouch.schemas import MAX_NAMED, first_problems, status_of
-from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presented_key
 from dextouch.serving.refusals import RefusalLog, WrongKeys
+from dextouch.serving.settings import canonical_host, canonical_origin, is_loopback
 
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})

@@ -17,7 +17,7 @@ from starlette.types import Scope
 
 from dextouch.errors import AccessDeniedError
 from dextouch.serving.keys import AccessControl, presented_key
-from dextouch.serving.masking import MASK
+from dextouch.serving.logs import MASK
 
 logger = structlog.get_logger(__name__)
 

@@ -6,7 +6,7 @@ import pytest
 from pydantic import BaseModel, SecretStr
 
 from dextouch.serving import masking
-from dextouch.serving.masking import hide_secrets, masked
+from dextouch.serving.logs import hide_secrets, masked
 
 
 class Inner(BaseModel):
