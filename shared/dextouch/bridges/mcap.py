@@ -85,8 +85,6 @@ def export_mcap(
 
 
 class _Export:
-    """One file that is being written."""
-
     def __init__(self, reader: Reader, writer: Writer, jpeg_quality: int | None) -> None:
         self._reader, self._writer, self._quality = reader, writer, jpeg_quality
         self._is_episode = isinstance(reader, EpisodeReader)
@@ -290,7 +288,6 @@ class _Stream:
         self._sent: list[Sent] = []
 
     def add(self, data: bytes) -> None:
-        """Add one message."""
         self._sent.append(self.codec.decode(data))
         self.num_samples += 1
         self._num_bytes += len(data)
@@ -298,7 +295,6 @@ class _Stream:
             self.flush()
 
     def flush(self) -> None:
-        """Write the buffered samples."""
         sent, descriptor = self._sent, self.codec.descriptor
         self._sent, self._num_bytes = [], 0
         if not sent:

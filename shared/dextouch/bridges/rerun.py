@@ -104,7 +104,6 @@ def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
 
 
 def _log(stream: rr.RecordingStream, reader: Reader, descriptor: StreamDescriptor) -> int:
-    """Log one stream; returns its number of samples."""
     entity, kind, num_samples = entity_of(descriptor), descriptor.kind, 0
     if kind == "image":
         columns = _images(stream, entity, descriptor)

@@ -148,7 +148,6 @@ def _append_episode(group: zarr.Group, reader: EpisodeReader, cameras: tuple[str
 
 
 def _numbers(reader: EpisodeReader) -> dict[str, np.ndarray]:
-    """Rows of the arrays in `NUMBERS`."""
     data = reader.read("action")
     arrays = {"data/t_ref_ns": data.t_ref_ns, "data/action": data.values}
     if "action_commanded" in reader.streams:

@@ -232,7 +232,6 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         self._threads.shutdown()
 
     def _chosen(self, mask: object) -> list[int]:
-        """Indices of the environments to reset."""
         if mask is None:
             return list(range(self.num_envs))
         array = np.asarray(mask)

@@ -427,7 +427,6 @@ class _Bits:
         self._value, self._left = int.from_bytes(payload, "big"), 8 * len(payload)
 
     def read(self, count: int) -> int:
-        """The next bits, as an unsigned number."""
         self._left -= count
         if self._left < 0:
             raise CorruptDataError("H.264: a header is cut off")
@@ -441,7 +440,6 @@ class _Bits:
         return (1 << zeros) - 1 + self.read(zeros)
 
     def skip_codes(self, count: int) -> None:
-        """Skip Exp-Golomb codes, signed or unsigned."""
         for _ in range(count):
             self.unsigned()
 

@@ -61,7 +61,6 @@ class _Hold:
 
     @property
     def lets_go(self) -> bool:
-        """Whether the contact ends before the episode does."""
         return self.end + 1 < len(self.Ts_world_wrist)
 
     @cached_property

@@ -240,7 +240,6 @@ class ShardReader:
 
 
 def _row_layout(entry: ArrayEntry) -> tuple[np.dtype[Any], int]:
-    """Type and number of bytes of a row of a `zstd` array."""
     dtype = np.dtype(entry.dtype).newbyteorder("<")
     return dtype, math.prod(entry.shape[1:]) * dtype.itemsize
 

@@ -203,7 +203,6 @@ class SpoolReader:
 
 
 def _num_samples(rows: np.ndarray, names: list[str]) -> dict[str, int]:
-    """Samples by stream in records of a log."""
     return {
         name: int(rows["num_samples"][rows["stream"] == number].sum())
         for number, name in enumerate(names)

@@ -262,7 +262,6 @@ def _open_storage(
 
 
 def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
-    """Validate a kind and an id."""
     return _check_kind(kind), check_id(item_id, kind=f"{kind} id")
 
 

@@ -391,7 +391,6 @@ class StreamWriter:
             )
 
     def _write(self, values: np.ndarray, stamps: Stamps) -> None:
-        """Append a validated block to all arrays of the stream."""
         self._check_unbroken()
         self._is_broken = True
         array = self.arrays[self.descriptor.name]
@@ -451,7 +450,6 @@ class _EncodedImages:
             check_video_size(*descriptor.shape[:2])
 
     def check(self, values: np.ndarray) -> None:
-        """Refuse encoded images that do not belong to this stream."""
         name = self._descriptor.name
         for index, data in enumerate(values):
             number = self._num_given + index
@@ -476,7 +474,6 @@ class _EncodedImages:
         return complete
 
     def rest(self) -> list[tuple[bytes, int]]:
-        """The last, partial storage chunk."""
         group, self._group = self._group, []
         return [(pack_chunk(self._codec, group), len(group))] if group else []
 
@@ -520,7 +517,6 @@ class _ImageQueue:
             self._take_oldest()
 
     def stop(self) -> None:
-        """End the thread and discard the queued blocks."""
         self._thread.shutdown(cancel_futures=True)
 
     def _copy(self, values: np.ndarray) -> np.ndarray:

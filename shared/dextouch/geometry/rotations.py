@@ -26,7 +26,6 @@ def _checked(values: np.ndarray, tail: tuple[int, ...], what: str) -> Float64[np
 
 
 def _matrices(rows: Sequence[Sequence[npt.ArrayLike]]) -> Float64[np.ndarray, "*batch m n"]:
-    """Matrices from arrays of their entries."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

@@ -202,7 +202,6 @@ def poses_from_actions(
 
 
 def _poses(actions: np.ndarray) -> Float64[np.ndarray, "time 3 4 4"]:
-    """Left wrist, right wrist and head camera of actions [T, 67]."""
     return pose_from_9d(actions[:, _POSE_COLUMNS].reshape(-1, len(POSE_SLICES), POSE_DIM))
 
 

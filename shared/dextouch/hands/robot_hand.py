@@ -75,7 +75,6 @@ class _Chains:
 
     @classmethod
     def of(cls, fingers: Sequence[FingerTable]) -> "_Chains":
-        """The hinges of one hand."""
         counts = np.array([len(finger.joints) for finger in fingers])
         is_joint = np.arange(counts.max()) < counts[:, np.newaxis]
         rows = [row for finger in fingers for row in finger.joints]
@@ -89,7 +88,6 @@ class _Chains:
 
     @cached_property
     def _cross(self) -> Float64[np.ndarray, "*hands fingers hinges 3 3"]:
-        """Cross product matrices of the axes."""
         return np.cross(np.eye(3), self.axes[..., None, :])
 
     @cached_property
@@ -115,7 +113,6 @@ class _Chains:
     def points_m(
         self, frames: Float64[np.ndarray, "time *hands fingers hinges 4 4"]
     ) -> Float64[np.ndarray, "time *hands fingers 4 3"]:
-        """Knuckle, PIP, DIP and tip of every finger."""
         # Padded with the last frame, so that index -1 is valid for all fingers.
         last = frames[..., -1, :, :]
         tips_m = (last[..., :3, :3] @ self.tips_m[..., None])[..., 0] + last[..., :3, 3]

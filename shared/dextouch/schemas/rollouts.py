@@ -43,7 +43,6 @@ def reported_milestones(info: Mapping[str, float]) -> dict[str, float]:
 
 
 def _is_none(value: object) -> bool:
-    """For fields that are omitted where they are unknown, so that older clients can read them."""
     return value is None
 
 

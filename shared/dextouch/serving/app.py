@@ -135,8 +135,6 @@ def create_service_app(  # noqa: PLR0913 - all by name
 
 
 def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Lifespan:
-    """Mark the application as running during its lifespan."""
-
     @asynccontextmanager
     async def around(app: FastAPI) -> AsyncIterator[None]:
         for folder in folders:
@@ -325,7 +323,6 @@ def _operations(
 
 
 def _dependencies(dependant: Dependant, kind: type[CallT]) -> Iterator[CallT]:
-    """Dependencies of a route of one kind, in order."""
     for dependency in dependant.dependencies:
         if isinstance(dependency.call, kind):
             yield dependency.call

@@ -84,12 +84,10 @@ class _Limits:
     # Made in the process that needs it: with several workers the limits are sent to each.
     @cached_property
     def refusals(self) -> RefusalLog:
-        """The lines about refused callers."""
         return RefusalLog()
 
     @property
     def check_period_s(self) -> float:
-        """Time between two looks at a connection."""
         return min(self.client_timeout_s / 8, MAX_CHECK_PERIOD_S)
 
 
@@ -243,7 +241,6 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
             self._limits.idle[self] = None
 
     def _has_headers(self) -> bool:
-        """Whether the request that is being received has its headers."""
         return self.cycle is not None and self.cycle.scope is self.scope
 
     def _waits_for_request(self) -> bool:
@@ -310,7 +307,7 @@ class ShortcutMiddleware:
     refuse: Refuse
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        """Handle one request; other scopes pass through."""
         shortcut: Shortcut | None = scope["app"].state.shortcut
         direct = shortcut(scope) if shortcut is not None and scope["type"] == "http" else None
         if direct is None:
@@ -339,7 +336,6 @@ class _Uncounted(Collector):
             self.collect()
 
     def collect(self) -> Iterable[Metric]:
-        """Count those that wait; it has no metrics of its own."""
         waiting, self._waiting = self._waiting, []
         for answered in waiting:
             self._count(answered)
@@ -384,7 +380,7 @@ class RequestMiddleware:
         self._histogram = cache(self._seconds.labels)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request or WebSocket; other scopes (lifespan) pass through."""
+        """Handle one request; other scopes pass through."""
         if scope["type"] == "websocket":
             await self._count_websocket(scope, receive, send)
             return

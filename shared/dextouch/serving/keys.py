@@ -64,7 +64,6 @@ def _follows(text: str, index: int) -> bool:
 
 
 def _is_step(text: str, index: int, lag: int) -> bool:
-    """Whether a character is next to an earlier one, or the same."""
     before, after = text[index - lag], text[index]
     is_near = abs(ord(after) - ord(before)) <= 1
     return is_near or any(before + after in row or after + before in row for row in KEYBOARD_ROWS)
@@ -165,7 +164,6 @@ class AccessControl:
 
 @lru_cache(maxsize=64)
 def _open_grant(scope: str) -> Grant:
-    """What a service without keys allows everybody."""
     return Grant(name="loopback", scopes=(scope,))
 
 

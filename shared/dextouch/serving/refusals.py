@@ -82,7 +82,6 @@ class RateLimit:
 
 
 def _refilled(bucket: tuple[float, float], size: int, now_s: float) -> tuple[float, float]:
-    """What a bucket holds now, and the time until it holds one event."""
     left = min(float(size), bucket[0] + (now_s - bucket[1]) * size / PERIOD_S)
     return left, 0.0 if left >= 1 else (1 - left) * PERIOD_S / size
 

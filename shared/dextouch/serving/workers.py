@@ -124,7 +124,6 @@ class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which notices at once if a worker dies while it is asked to respond."""
 
     def keep_subprocess_alive(self) -> None:
-        """Replace workers that ended or hang."""
         for worker in self.processes:
             # While this process holds the worker's end of their pipe too, it never reads its end.
             worker.child_conn.close()

@@ -120,7 +120,6 @@ def _wrong_size(
 
 @lru_cache
 def _row(dtype: str, shape: tuple[int, ...]) -> np.dtype[np.void]:
-    """Memory of one sample of numbers."""
     values = ("values", np.dtype(dtype).newbyteorder("<"), shape)
     return np.dtype([*((stamp, "<i8") for stamp in _STAMPS), values])
 

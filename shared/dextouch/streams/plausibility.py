@@ -406,7 +406,6 @@ def check_camera_matrix(
 def _speeds(
     t_ns: np.ndarray, poses: np.ndarray, period_ns: int
 ) -> tuple[Float64[np.ndarray, " steps"], Float64[np.ndarray, " steps"]]:
-    """Speeds of each step, in m/s and rad/s."""
     # Times of bursts are closer than the samples were.
     steps_s = np.maximum(np.diff(t_ns), max(period_ns / 2, MIN_STEP_NS)) / _NS_PER_S
     speeds_m_s = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / steps_s
@@ -416,7 +415,6 @@ def _speeds(
 
 
 def _is_fast(speeds_m_s: np.ndarray, turns_rad_s: np.ndarray) -> Bool[np.ndarray, " steps"]:
-    """Steps that no body makes."""
     return np.asarray((speeds_m_s > MAX_SPEED_M_S) | (turns_rad_s > MAX_TURN_RAD_S))
 
 
@@ -491,5 +489,4 @@ def _excess(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndar
 def _beyond(
     values: np.ndarray, lower_rad: np.ndarray, upper_rad: np.ndarray
 ) -> Bool[np.ndarray, " n"]:
-    """Samples in which a joint is far beyond its limits."""
     return np.asarray((_excess(values, lower_rad, upper_rad) > LIMIT_SLACK_RAD).any(axis=1))

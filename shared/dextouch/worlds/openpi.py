@@ -63,8 +63,6 @@ def openpi_router(service: RolloutService) -> APIRouter:
 
 
 class _Session:
-    """The rollout and the selector of one connection."""
-
     def __init__(self, service: RolloutService, owner: str) -> None:
         self._service = service
         self._owner = owner

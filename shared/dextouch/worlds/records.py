@@ -362,6 +362,5 @@ def _watched(info: dict[str, Any], written_host_ns: int, note: WatchNote) -> Wat
 
 
 def _shown(payload: bytes, rollout: dict[str, Any]) -> bytes:
-    """A response with the id of its rollout left out."""
     fields, arrays = unpack(payload, max_bytes=_MAX_BYTES)
     return pack(fields | {"rollout": rollout}, arrays)

@@ -239,7 +239,6 @@ def client_name(header: str) -> str:
 
 
 def _json_body(model: type[FrozenModel]) -> dict[str, Any]:
-    """OpenAPI fields of a body that the route reads by itself."""
     content = {JSON: {"schema": model.model_json_schema()}}
     return {"requestBody": {"required": True, "content": content}}
 

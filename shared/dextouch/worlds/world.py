@@ -271,7 +271,6 @@ def _check_fits(
 
 
 def _size_px(description: WorldDescription) -> tuple[int, int]:
-    """Height and width of a world's images."""
     return description.image_height_px, description.image_width_px
 
 

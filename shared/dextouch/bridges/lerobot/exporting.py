@@ -134,7 +134,6 @@ class _ParquetFiles:
         return self._number
 
     def close(self) -> None:
-        """Complete the file that is open."""
         if self._writer is not None:
             with disk_errors(f"complete {self._path}"):
                 self._writer.close()
@@ -179,7 +178,6 @@ class _Dataset:
         }
 
     def add(self, reader: EpisodeReader) -> None:
-        """Write one episode."""
         _check_cameras(reader, self._cameras)
         attributes, frames = reader.attributes, frames_of(reader, self._cameras, self.fps)
         where = f"episode {attributes.episode_id!r}"
@@ -251,7 +249,6 @@ class _Dataset:
         return {name: columns[name] for name in self._features if name in columns}
 
     def close(self) -> None:
-        """Complete the data, video and episode files."""
         for video in self._videos.values():
             video.close()
         self._write_rows()

@@ -115,7 +115,6 @@ def _facts(folder: Path, place: str) -> Facts:
 
 
 def _named(name: str, place: str) -> tuple[str, str]:
-    """Kind and id from the name of a folder."""
     match = _AROUND[place].fullmatch(name) if place in _AROUND else None
     if match is None:
         return PLACES[place], name.removesuffix(".new")

@@ -398,7 +398,6 @@ def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
 
 
 def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[int | None]]:
-    """Damaged arrays with their damaged storage chunks; None for the whole array."""
     found: dict[str, frozenset[int | None]] = {}
     for finding in inspect_group(files, kind).findings:
         if finding.array is not None:
