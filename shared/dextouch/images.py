@@ -71,12 +71,8 @@ def scaled_square(
 ) -> tuple[UInt8[np.ndarray, "n side side 3"], Float64[np.ndarray, "3 3"]]:
     """The middle square of images, each pixel the mean of the area that it covers, and its camera.
 
-    Images that have the side already are returned as they are.
-
-    Args:
-        images: of one camera.
-        K: of the camera (px), with pixel centres at half-integers.
-        side_px: wanted width and height.
+    Images that have the side already are returned as they are. K is in pixels, whose centres are at
+    half-integers.
     """
     height_px, width_px = images.shape[1:3]
     if height_px == width_px == side_px:

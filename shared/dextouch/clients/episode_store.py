@@ -273,11 +273,7 @@ class EpisodeStoreClient:
             headers["content-type"] = "application/octet-stream" if binary else "application/json"
         try:
             response = self._http.request(
-                method,
-                path,
-                params=httpx.QueryParams(given),
-                content=content,
-                headers=headers,
+                method, path, params=httpx.QueryParams(given), content=content, headers=headers
             )
         except httpx.TransportError as error:
             raise UnavailableError(

@@ -93,8 +93,8 @@ class RolloutClient:
     ) -> "Rollout":
         """Start a rollout from a task and seed, or from an observation made elsewhere.
 
-        A connection that is lost meanwhile may leave a second, unused rollout at the service; it
-        expires there by itself.
+        A connection that is lost meanwhile may leave an unused rollout at the service, which
+        expires there.
 
         Raises:
             UnknownNameError: world, task or action kind (the valid ones are listed).

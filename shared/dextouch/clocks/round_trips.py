@@ -77,15 +77,9 @@ class RoundTripClock:
     """Estimates the offset between the local clock and a remote one that replies to requests.
 
     Used for devices (stamps against the host's clock) and for other hosts (their clock against the
-    station's reference clock). A step of the remote clock by more than the band is detected at once
-    and restarts the estimate; memory is bounded.
-
-    Args:
-        resolution_ns: of the remote stamps.
-
-    Attributes:
-        num_steps: steps of the remote clock.
-        num_exchanges: exchanges since the last step.
+    station's reference clock). A step of the remote clock by more than the band, counted in
+    `num_steps`, is detected at once and restarts the estimate, of `num_exchanges` exchanges since;
+    memory is bounded. `resolution_ns` is that of the remote stamps.
     """
 
     def __init__(self, *, resolution_ns: int = 1) -> None:

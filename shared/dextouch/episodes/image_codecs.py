@@ -351,9 +351,8 @@ class ImageChunks:
     def check(self, payload: bytes, number: int) -> None:
         """Decode storage chunk `number` by the rule of `decode`, and discard the images.
 
-        Raises:
-            CorruptDataError: an invalid storage chunk; or an image that cannot be decoded, and then
-                `place` in the details is the first such image of the chunk.
+        Raises CorruptDataError if it is invalid, or for an image that cannot be decoded: then
+        `place` in the details is the first such image of the chunk.
         """
         images, size_px = self.unpack(payload, number), (self.shape[0], self.shape[1])
         with self._located(number):
@@ -468,10 +467,8 @@ def first_gap(access_units: Sequence[bytes]) -> int | None:
 
     None where there is none, or where the encoder may skip numbers. A picture is numbered one
     higher than the last reference picture before it (7.4.3, frame_num), and an IDR picture 0.
-
-    Raises:
-        CorruptDataError: a header that cannot be read, or no slice; `place` in its details is the
-            index of the access unit.
+    Raises CorruptDataError without a readable header or a slice; `place` in its details is the
+    index.
     """
     parameters = _parameters(access_units[0])
     if parameters.may_skip_numbers:

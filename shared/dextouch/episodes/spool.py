@@ -348,8 +348,7 @@ class SpoolWriter:
     def close(self) -> None:
         """Flush and seal the complete recording; closing twice does nothing.
 
-        Raises:
-            StorageError: the disk refused, and the spool is still open; try again or abandon it.
+        Raises StorageError if the disk refused; the spool is open: try again or abandon it.
         """
         if self._lock < 0:
             return

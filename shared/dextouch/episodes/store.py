@@ -72,14 +72,10 @@ class EpisodeStore:
     Concurrent use from several processes is safe: committed groups are immutable, and uncommitted
     ones are invisible.
 
-    Args:
-        url: local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
-            `region` and others of `dextouch.episodes.object_bucket` after a `?`.
-        storage_options: of an `s3://…` store; credentials belong here or in the usual AWS_*
-            environment, which obstore reads.
-
-    `url` is the address as given; `root` is the local folder of unfinished groups: the store itself
-    if that is a folder, otherwise the work folder.
+    `url` is a local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
+    `region` and others of `dextouch.episodes.object_bucket` after a `?`; its credentials are
+    storage options, or in the usual AWS_* environment, which obstore reads. `root` is the local
+    folder of unfinished groups: the store itself if that is a folder, otherwise the work folder.
     """
 
     def __init__(self, url: str | Path, storage_options: Mapping[str, str] | None = None) -> None:
@@ -219,11 +215,9 @@ class EpisodeStore:
     def complete_uploads(self) -> tuple[tuple[Kind, str], ...]:
         """Upload groups whose upload was interrupted after their commit; their kinds and ids.
 
-        Only a store in a bucket has any: what is committed in a folder is in its place.
-
-        Raises:
-            StorageError, UnavailableError: an upload failed, others are completed; try again later.
-                Notes name what was uploaded, and other failures.
+        Only a store in a bucket has any: what is committed in a folder is in its place. Raises
+        StorageError or UnavailableError if an upload failed; others are completed, and notes name
+        them.
         """
         if isinstance(self._storage, _LocalStorage):
             return ()
@@ -400,18 +394,9 @@ def write_rollout(
         streams.append(("object_poses", "pose", "pose_m_wxyz", values))
     with store.writer(kind="episode", attributes=attributes) as writer:
         for name, kind, unit, values in streams:
-            writer.add_stream(
-                StreamDescriptor.model_validate(
-                    {
-                        "name": name,
-                        "kind": kind,
-                        "shape": values.shape[1:],
-                        "dtype": values.dtype.name,
-                        "unit": unit,
-                        "nominal_rate_hz": rate_hz,
-                        "frame": "world" if kind == "pose" else None,
-                    }
-                )
-            )
+            known = {"name": name, "kind": kind, "unit": unit, "nominal_rate_hz": rate_hz}
+            known |= {"dtype": values.dtype.name, "shape": values.shape[1:]}
+            known |= {"frame": "world"} if kind == "pose" else {}
+            writer.add_stream(StreamDescriptor.model_validate(known))
             stamps_ns = t_ref_ns[shown_steps] if name == HEAD_CAMERA else t_ref_ns[-len(values) :]
             writer.append(name, values=values, t_ref_ns=stamps_ns)

@@ -180,10 +180,9 @@ class EpisodeWriter:
     def add_stream(self, descriptor: StreamDescriptor) -> None:
         """Add a stream.
 
-        Raises:
-            ConflictError: one of its arrays has the name of an array that exists.
-            InvalidInputError: one stream more than MAX_STREAMS, a `jpeg` or `h264` stream that
-                does not hold uint8 [h, w, 3], or an `h264` stream of odd height or width.
+        Raises ConflictError if one of its arrays has the name of another, InvalidInputError beyond
+        MAX_STREAMS, or for a `jpeg` or `h264` stream that does not hold uint8 [h, w, 3], with even
+        sides for `h264`.
         """
         if len(self._streams) >= MAX_STREAMS:
             raise InvalidInputError(

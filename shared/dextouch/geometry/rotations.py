@@ -80,12 +80,9 @@ def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
 
 
 def rotation_from_quaternion(q_wxyz: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices from quaternions (w, x, y, z) of any positive length.
+    """Rotation matrices from quaternions [..., 4] (w, x, y, z) of any positive length.
 
-    Raises:
-        DegenerateRotationError: a quaternion is (nearly) zero.
-        ShapeError: the last axis is not 4.
-        NonFiniteError: NaN or infinity.
+    Raises DegenerateRotationError for one that is (nearly) zero, and as `rotation_to_6d`.
     """
     q = _checked(q_wxyz, (4,), "quaternion")
     norm = np.linalg.norm(q, axis=-1, keepdims=True)

@@ -176,11 +176,7 @@ def _relative_9d(T_world_anchor: np.ndarray, Ts_world_x: np.ndarray) -> Float64[
 
 
 def poses_from_actions(
-    actions: np.ndarray,
-    anchor: AnchorPoses,
-    *,
-    where: str = "actions",
-    validated: bool = False,
+    actions: np.ndarray, anchor: AnchorPoses, *, where: str = "actions", validated: bool = False
 ) -> HandTrajectory:
     """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`.
 
@@ -208,17 +204,13 @@ def _poses(actions: np.ndarray) -> Float64[np.ndarray, "time 3 4 4"]:
 def reanchor(
     actions: np.ndarray, index: int, *, anchor_action: np.ndarray | None = None
 ) -> Float64[np.ndarray, "time 67"]:
-    """Re-express actions relative to another step.
+    """Re-express actions [T, 67], all relative to one anchor, relative to the step at `index`.
 
-    Args:
-        actions: [T, 67], all relative to one anchor.
-        index: step that becomes the anchor; its poses come out as exactly the identity.
-        anchor_action: [67], relative to the same anchor as `actions`: source of the new anchor
-            instead of `actions[index]`. Commanded actions need this: their anchor is the *measured*
-            action of the step.
+    The poses of that step come out as exactly the identity. `anchor_action` [67], relative to the
+    same anchor as `actions`, is the source of the new anchor instead of `actions[index]`. Commanded
+    actions need it: their anchor is the *measured* action of the step.
 
-    Raises:
-        InvalidInputError: index outside 0 … T-1.
+    Raises InvalidInputError for an index outside 0 … T-1.
     """
     checked = check_actions(actions)
     if not 0 <= index < len(checked):

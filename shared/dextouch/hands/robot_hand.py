@@ -122,21 +122,15 @@ class _Chains:
 
 
 class HandModel:
-    """A hand of 1 to 5 fingers with 1 to 6 hinges each.
+    """A hand of 1 to 5 fingers with 1 to 6 hinges each, whose name is for messages.
 
     Attributes:
         fingers: the tables, which do not change: others are another hand.
         joint_names: in the order of the joint vector: finger by finger, from the wrist out.
-        lower_rad: lower joint limits [joints].
-        upper_rad: upper joint limits [joints].
-
-    Args:
-        side: "left" or "right".
-        fingers: tables in the order of the hand's joint vector.
-        name: for messages.
+        lower_rad, upper_rad: joint limits [joints].
 
     Raises:
-        UnknownNameError: any other side, or a chain that the tracked skeleton lacks.
+        UnknownNameError: a side other than "left" and "right", or an unknown chain.
         InvalidInputError: no finger, a chain or name given twice, too few or many hinges, limits
             that are not an interval, an axis that is not a unit vector, points out of order; the
             message names the joint.

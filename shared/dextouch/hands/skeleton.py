@@ -124,9 +124,8 @@ _THUMB_WORDS: Final = (("cmc", "mcp", "ip", "tip"), ("mcp", "pip", "dip", "tip")
 class NodeOrder:
     """Assignment of a tracker's nodes to keypoints.
 
-    Attributes:
-        places: our keypoint index of each of the tracker's nodes, in its order; −1 for a palm.
-        absent: our nodes that the tracker lacks.
+    `places` are our keypoint indices of the tracker's nodes, −1 for a palm; `absent` nodes it
+    lacks.
     """
 
     places: tuple[int, ...]
@@ -150,17 +149,13 @@ class NodeOrder:
 
 
 def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> NodeOrder:
-    """Assign nodes given by chain and joint.
+    """Assign a tracker's nodes, given in its order by chain and joint; case-insensitive.
 
-    Args:
-        nodes: (chain, joint) in the tracker's order. Chains by our names ("pinky" is "little", the
-            chain "hand" the wrist), joints of a chain all by our names, or all by medicine's (CMC
-            MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them; case-insensitive. A palm is
-            ignored.
-        may_lack: optional nodes, such as `FINGER_METACARPALS`.
+    Chains are by our names ("pinky" is "little", the chain "hand" the wrist), joints of a chain all
+    by our names, or all by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames
+    them. A palm is ignored. Nodes that the tracker `may_lack` are such as `FINGER_METACARPALS`.
 
-    Raises:
-        InvalidInputError: unknown, missing or duplicate nodes; the message lists them.
+    Raises InvalidInputError for unknown, missing or duplicate nodes, which it lists.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)

@@ -164,10 +164,8 @@ def check_observation_arrays(
 ) -> None:
     """Check that the arrays of an observation are consistent and finite.
 
-    Raises:
-        ShapeError: inconsistent dtypes, lengths or shapes.
-        NonFiniteError: in touch, actions or object poses.
-        DegenerateRotationError: an object's quaternion is not of length 1.
+    Raises ShapeError for dtypes, lengths or shapes, NonFiniteError in touch, actions or object
+    poses, DegenerateRotationError for an object's quaternion that is not of length 1.
     """
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
@@ -436,10 +434,8 @@ def decode_images(
 ) -> dict[str, np.ndarray]:
     """Inverse of `encode_images`, for a response that may hold JPEG.
 
-    Raises:
-        InvalidInputError: sizes that are missing or do not fit, or images that differ in size.
-        LimitExceededError: images that take more than `max_bytes` once decoded.
-        CorruptDataError: not JPEG.
+    Raises InvalidInputError for sizes that do not fit, LimitExceededError for more than `max_bytes`
+    once decoded, CorruptDataError for anything but JPEG.
     """
     found = {}
     for name, array in arrays.items():

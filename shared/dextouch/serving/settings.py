@@ -114,8 +114,7 @@ class ServiceSettings(CommandSettings):
         default=16 * 2**20, ge=1024, description="largest body of a request"
     )
     allowed_hosts: tuple[HostName, ...] = Field(
-        default=(),
-        description="host names other than loopback that are accepted without a key",
+        default=(), description="host names other than loopback that are accepted without a key"
     )
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
@@ -177,11 +176,8 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
 
     The help describes the command with the docstring of the class, which holds an example. Flags
     have dashes (`--num-steps`, `--limits.max-chunks`), booleans are switches (`--mock`,
-    `--no-mock`), and lists are repeated or separated by commas.
-
-    Raises:
-        InvalidInputError: invalid values; all of them are listed.
-        SystemExit: an unknown flag, or --help (after printing the usage).
+    `--no-mock`), and lists are repeated or separated by commas. Raises InvalidInputError that lists
+    all invalid values, SystemExit for an unknown flag, or --help (after printing the usage).
     """
     source = CliSettingsSource[SettingsT](
         cls,

@@ -80,11 +80,7 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
 
 
 def unpack_bounded(
-    data: bytes,
-    *,
-    max_bytes: int,
-    what: str,
-    of_map: Callable[[dict[Any, Any]], Any] | None = None,
+    data: bytes, *, max_bytes: int, what: str, of_map: Callable[[dict[Any, Any]], Any] | None = None
 ) -> Any:  # noqa: ANN401 - whatever msgpack holds
     """Deserialize msgpack from an untrusted source, with a limit of lists' and maps' items.
 

@@ -253,15 +253,11 @@ def implausible_repeats(
     """Values [n, …] that a device repeats: every one several times, or the last one for a while.
 
     Equal values of a device whose values are not noisy are frozen only if it leaps afterwards.
-
-    Args:
-        values: consecutive samples. What is missing (NaN) in a tenth of them or more is left aside,
-            and the samples that miss anything else are none.
-        what: of the stream, in words.
-        can_rest: as robots do, which keep their values exactly though they are noisy in motion.
-        may_lock: as gloves do whose sensors are coarse: what they keep without a leap is harmless.
-        follows: whether each sample but the first one came right after the one before; None if all
-            did.
+    Samples are consecutive: `follows` says whether each but the first came right after the one
+    before, None if all did. What is missing (NaN) in a tenth of them or more is left aside, and the
+    samples that miss anything else are none. Robots `can_rest`: they keep values exactly, though
+    they are noisy in motion. Gloves with coarse sensors `may_lock`: what they keep without a leap
+    is harmless.
     """
     rows = np.asarray(values).reshape(len(values), int(np.prod(np.shape(values)[1:])))
     finite = np.isfinite(rows)

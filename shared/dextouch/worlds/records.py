@@ -101,8 +101,7 @@ class RolloutRecord:
     def replay(self, chunk: int, request_sha256: str) -> "Answer | None":
         """The stored response if the request is a repetition; None if the chunk is the next one.
 
-        Raises:
-            ConflictError: another chunk, or the newest one with another body.
+        Raises ConflictError for another chunk, or the newest one with another body.
         """
         info = self.info
         if chunk == info.next_chunk:
@@ -316,10 +315,8 @@ class RolloutWatch:
     async def newest(self, watch_id: str, known: str = "") -> tuple[str, bytes | None]:
         """The newest response as the rollout's client got it, and a tag of it.
 
-        Its `rollout` is that of the listing. The bytes are None if the tag is `known`.
-
-        Raises:
-            NotFoundError: unknown, deleted or expired.
+        Its `rollout` is that of the listing. The bytes are None if the tag is `known`. Raises
+        NotFoundError for a rollout that is unknown, deleted or expired.
         """
         note = await self._records.note(watch_id)
         if not note:

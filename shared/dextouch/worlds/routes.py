@@ -216,9 +216,7 @@ def watch_router(watch: RolloutWatch) -> APIRouter:
         return await watch.listed(limit)
 
     @router.get(
-        "/{watch_id}",
-        response_class=Response,
-        responses={200: {"content": {MSGPACK: {}}}, 304: {}},
+        "/{watch_id}", response_class=Response, responses={200: {"content": {MSGPACK: {}}}, 304: {}}
     )
     async def newest(request: Request, watch_id: WatchId) -> Response:
         """The newest response of a rollout, as its client asked for it."""

@@ -88,15 +88,12 @@ class World(Protocol[State]):
     ) -> SteppedRollout[State]:
         """Advance by one action chunk, which the world validates (`check_actions`).
 
-        Args:
-            state: from `reset`, `step` or `restore`; it is not changed.
-            actions: [K, 67], row i the pose at step i+1 of the chunk, relative to the rollout's
-                step 0 (measured poses), of the action kind the rollout was started with.
-            seed: of the noise of this chunk; equal state, actions and seed give an equal
-                observation, regardless of other rollouts.
-            selector: part of the observation to return. The result equals `Observation.selected` of
-                the full one, so a world can skip rendering unrequested images. The new state does
-                not depend on it.
+        Row i of actions [K, 67] is the pose at step i+1 of the chunk, relative to the rollout's
+        step 0 (measured poses), of the action kind the rollout was started with. The state is from
+        `reset`, `step` or `restore`, and is not changed. Equal state, actions and seed of the noise
+        give an equal observation, regardless of other rollouts. The result equals
+        `Observation.selected` of the full one, so a world can skip rendering unrequested images;
+        the new state does not depend on the selector.
 
         Raises:
             InvalidInputError: wrong shape, NaN, infinity, or out of reach; nothing has changed.

@@ -77,10 +77,8 @@ class EpisodeEntry:
 class LeRobotFolder:
     """A dataset on disk; only its metadata is read up front.
 
-    Raises:
-        NotFoundError: a file of the metadata is missing.
-        InvalidInputError: another version of the format.
-        CorruptDataError: metadata that is damaged or has paths that leave the folder.
+    Raises NotFoundError for a missing file of the metadata, InvalidInputError for another version
+    of the format, CorruptDataError for damaged metadata, or paths that leave the folder.
     """
 
     def __init__(self, folder: Path) -> None:

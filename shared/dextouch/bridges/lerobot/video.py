@@ -130,9 +130,8 @@ class VideoSpan:
 def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Decode the images of a span one by one; any codec that PyAV's build supports.
 
-    Raises:
-        NotFoundError: no such file.
-        CorruptDataError: damaged, truncated, of another size, or without an image in its place.
+    Raises NotFoundError without the file, CorruptDataError if it is damaged, truncated, of another
+    size, or without an image in its place.
     """
     with _opened(span) as (container, stream):
         frames = ((frame.pts, frame) for frame in container.decode(stream))
