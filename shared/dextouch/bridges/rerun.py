@@ -209,9 +209,12 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
 
 
 def heat_map(row: np.ndarray, *, side: Side, full_scale: float) -> UInt8[np.ndarray, "28 26 3"]:
-    """One reading of a glove, 320 taxels or 360 raw cells, as a small RGB picture of the hand.
+    """One reading of a glove as a small RGB picture of the hand.
 
-    `full_scale` is the reading shown at full brightness, in the unit of the row.
+    Args:
+        row: 320 taxels or the 360 raw cells.
+        side: of the hand.
+        full_scale: reading shown at full brightness, in the unit of the row.
     """
     taxels = select_taxels(row, side=side) if row.shape == (NUM_RAW_TAXELS,) else row
     return colour(hand_canvas(taxels, side=side), full_scale_kpa=full_scale)

@@ -24,11 +24,17 @@ class OpenPiPolicy:
     Each request holds the newest step: images (uint8 [h, w, 3]) under the names in `images`,
     `observation/state` (float64 [67], the reached poses and joint angles, relative to the rollout's
     step 0), `observation/tactile` (float32 [2, 320] in kPa), and the instruction as `prompt`. The
-    server answers with `actions`, rows of 67 numbers that are commands relative to step 0, of which
-    `chunk_steps` are carried out. `api_key` is sent as `Authorization: Api-Key KEY`.
+    server answers with `actions`, rows of 67 numbers that are commands relative to step 0.
+
+    Args:
+        url: of the server, such as `ws://127.0.0.1:8000`.
+        api_key: sent as `Authorization: Api-Key KEY`.
+        images: camera by the name that the server expects.
+        chunk_steps: rows of each answer that are carried out.
+        timeout_s: for one answer.
 
     Raises:
-        UnavailableError: the server does not answer within `timeout_s`.
+        UnavailableError: the server does not answer.
     """
 
     looks = "last"

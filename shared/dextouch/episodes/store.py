@@ -367,12 +367,17 @@ def write_rollout(
     observations: Sequence[Observation],
     commanded: np.ndarray,
 ) -> None:
-    """Write a rollout, whose attributes have no `streams` yet, as an episode on the model grid.
+    """Write a rollout as an episode on the model grid.
 
-    Observations are of step 0 and of every chunk; images are stored for the steps that have them,
-    at least one of the head camera. Object poses, if the world returned them for every chunk, are
-    the stream `object_poses`, from step 1 on: the first observation may be real, without known
-    poses. Row 0 of the commanded actions [T, 67] are the poses of step 0.
+    Images are stored for the steps that have them. Object poses, if the world returned them for
+    every chunk, are the stream `object_poses`, from step 1 on: the first observation may be real,
+    without known poses.
+
+    Args:
+        store: destination.
+        attributes: of the episode, without `streams`.
+        observations: of step 0 and of every chunk; at least one has images of the head camera.
+        commanded: [T, 67] actions, row 0 the poses of step 0.
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])
@@ -394,9 +399,18 @@ def write_rollout(
         streams.append(("object_poses", "pose", "pose_m_wxyz", values))
     with store.writer(kind="episode", attributes=attributes) as writer:
         for name, kind, unit, values in streams:
-            known = {"name": name, "kind": kind, "unit": unit, "nominal_rate_hz": rate_hz}
-            known |= {"dtype": values.dtype.name, "shape": values.shape[1:]}
-            known |= {"frame": "world"} if kind == "pose" else {}
-            writer.add_stream(StreamDescriptor.model_validate(known))
+            writer.add_stream(
+                StreamDescriptor.model_validate(
+                    {
+                        "name": name,
+                        "kind": kind,
+                        "shape": values.shape[1:],
+                        "dtype": values.dtype.name,
+                        "unit": unit,
+                        "nominal_rate_hz": rate_hz,
+                        "frame": "world" if kind == "pose" else None,
+                    }
+                )
+            )
             stamps_ns = t_ref_ns[shown_steps] if name == HEAD_CAMERA else t_ref_ns[-len(values) :]
             writer.append(name, values=values, t_ref_ns=stamps_ns)
