@@ -123,7 +123,10 @@ def step_ranges(
 def mean_over_ranges(
     values: np.ndarray, ranges: np.ndarray
 ) -> tuple[Float32[np.ndarray, "n taxels"], Bool[np.ndarray, " n"]]:
-    """Means of rows [low, high), as `ranges` [n, 2] say, in float32, and a mask of non-empty ranges."""
+    """Means of rows [low, high) in float32, and a mask of non-empty ranges.
+
+    Ranges are [n, 2].
+    """
     valid = ranges[:, 1] > ranges[:, 0]
     means = np.zeros((len(ranges), *values.shape[1:]), dtype=np.float32)
     for step, (low, high) in enumerate(ranges.tolist()):

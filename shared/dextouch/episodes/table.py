@@ -134,7 +134,7 @@ class _Chosen:
         self._first: EpisodeAttributes | None = None
 
     def add(self, about: EpisodeAttributes) -> None:
-        """Add an episode; raises ConflictError for one in two stores, alignments, or at another rate."""
+        """Add an episode; raises ConflictError if it is there already, or at another rate."""
         name, first = about.episode_id, self._first or about
         recording = recording_of(about) if about.origin == "recorded" else None
         other = name if recording is None else self._of_recording.setdefault(recording, name)
@@ -214,7 +214,7 @@ class EpisodeGrid:
 
     @property
     def success(self) -> bool:
-        """The outcome; raises InvalidInputError if it is unknown, as the need `OUTCOME` asks for."""
+        """The outcome; raises InvalidInputError if it is unknown (the need `OUTCOME`)."""
         if self.about.success is None:
             raise InvalidInputError(f"episode {self.episode_id!r}: is {OUTCOME.lack}")
         return self.about.success
