@@ -30,8 +30,8 @@ JSON_HELP = "also write the result as JSON to this file; - for standard output"
 LINE_PERIOD_S = 5.0
 Item = TypeVar("Item")
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
-_asked_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
-    "asked_parsers", default=None
+_help_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
+    "help_parsers", default=None
 )
 
 
@@ -56,23 +56,23 @@ class CommandParser(argparse.ArgumentParser):
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
         """Print the help, or hand this parser to `parser_behind`."""
-        asked = _asked_parsers.get()
-        if asked is None:
+        shown = _help_parsers.get()
+        if shown is None:
             super().print_help(file)
         else:
-            asked.append(self)
+            shown.append(self)
 
 
 def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | None:
     """The parser that `show_help`, a command with `--help`, would print; None if no parser did."""
-    asked: list[argparse.ArgumentParser] = []
-    token = _asked_parsers.set(asked)
+    shown: list[argparse.ArgumentParser] = []
+    token = _help_parsers.set(shown)
     try:
         with suppress(SystemExit), redirect_stdout(StringIO()):
             show_help()
     finally:
-        _asked_parsers.reset(token)
-    return asked[0] if asked else None
+        _help_parsers.reset(token)
+    return shown[0] if shown else None
 
 
 class ProgressLines:

@@ -100,9 +100,8 @@ class _Export:
 
     def _as_sent(self, stream: StreamDescriptor) -> StreamDescriptor:
         is_raw = stream.kind == "image" and stream.unit not in ENCODED_UNITS
-        if self._quality is None or not is_raw or raw_encoding(stream) != "rgb8":
-            return stream
-        return stream.model_copy(update={"unit": "jpeg"})
+        to_jpeg = self._quality is not None and is_raw and raw_encoding(stream) == "rgb8"
+        return stream.model_copy(update={"unit": "jpeg"}) if to_jpeg else stream
 
     def run(self) -> int:
         """Write schemas, channels, attachments and messages, in this order."""

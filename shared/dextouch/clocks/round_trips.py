@@ -138,12 +138,12 @@ class RoundTripClock:
             raise ClockFitError("round trip clock: no exchange yet", cause="too_few")
         at_local_ns = self._last_ns if at_local_ns is None else at_local_ns
         x_s = self._x_s(at_local_ns)
-        slope, doubt = self._slope()
-        if skew is not None and skew.sigma_ppm * 1e3 < doubt:
-            slope, doubt = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
+        slope, uncertainty = self._slope()
+        if skew is not None and skew.sigma_ppm * 1e3 < uncertainty:
+            slope, uncertainty = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
         high_ns, low_ns, age_s = self._band(x_s, slope)
         width_ns = max(0.0, high_ns - low_ns)
-        drift_ns = doubt * age_s
+        drift_ns = uncertainty * age_s
         return ClockOffset(
             at_local_ns=at_local_ns,
             offset_ns=self._reference[1] + round((high_ns + low_ns) / 2),
@@ -185,7 +185,7 @@ class RoundTripClock:
 
     def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
         """Whether an exchange lies entirely outside the band of the others."""
-        slope, doubt = self._slope()
+        slope, uncertainty = self._slope()
         band_high_ns, band_low_ns, age_s = self._band(x_s, slope)
-        slack_ns = 2 * doubt * age_s + self._resolution_ns
+        slack_ns = 2 * uncertainty * age_s + self._resolution_ns
         return high_ns < band_low_ns - slack_ns or low_ns > band_high_ns + slack_ns

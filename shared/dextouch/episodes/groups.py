@@ -264,7 +264,11 @@ class GroupReader(Generic[A]):
         if len(indices):
             self._check_span("images", name, int(indices[0]), int(indices[-1]) + 1)
         if codec_of(descriptor) == "zstd":
-            return self._pick_plain(descriptor, indices, form)
+            first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
+            images = self._contents.shard(name).read(first, stop)
+            if not np.array_equal(indices, np.arange(first, stop)):
+                images = images[indices - first]
+            return images if form == FULL_FORM else transform_pixels(images, form)
         unique, places = np.unique(indices, return_inverse=True)
         images = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
         self._decode_images(descriptor, unique, form, images)
@@ -412,15 +416,6 @@ class GroupReader(Generic[A]):
         entry = self._contents.entries[descriptor.name]
         what = f"{self._what}: array {descriptor.name!r}"
         return ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
-
-    def _pick_plain(
-        self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm
-    ) -> np.ndarray:
-        first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
-        images = self._contents.shard(descriptor.name).read(first, stop)
-        if not np.array_equal(indices, np.arange(first, stop)):
-            images = images[indices - first]
-        return images if form == FULL_FORM else transform_pixels(images, form)
 
     def _decode_images(
         self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm, out: np.ndarray

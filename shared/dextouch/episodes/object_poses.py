@@ -116,15 +116,11 @@ def object_track(
     each = [_one(reader, object_stream(name), t_ref_ns) for name in names]
     poses = np.stack([one[0] for one in each], axis=1).astype(np.float32)
     known = np.stack([one[1] for one in each], axis=1)
-    sources = tuple(
-        _measured_by(reader, name) if known[:, index].any() else "none"
-        for index, name in enumerate(names)
-    )
-    return ObjectTrack(poses, known, sources, np.zeros(len(names), dtype=np.float32))
-
-
-def _measured_by(reader: EpisodeReader, name: str) -> ObjectSource:
-    return "markers" if reader.streams[object_stream(name)].device == HEAD_CAMERA else "tracker"
+    sources: list[ObjectSource] = ["none"] * len(names)
+    for index in np.flatnonzero(known.any(axis=0)).tolist():
+        by_camera = reader.streams[object_stream(names[index])].device == HEAD_CAMERA
+        sources[index] = "markers" if by_camera else "tracker"
+    return ObjectTrack(poses, known, tuple(sources), np.zeros(len(names), dtype=np.float32))
 
 
 def has_object_poses(reader: EpisodeReader) -> bool:

@@ -200,7 +200,14 @@ class ShardReader:
             size = self._source.size()
             if size is None:
                 raise CorruptDataError(f"{self._what}: its shard file is missing")
-            index = self._read_index(size)
+            index_bytes = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
+            if size < index_bytes:
+                raise CorruptDataError(
+                    f"{self._what}: file is too short for its index of {index_bytes} bytes"
+                )
+            data = self._source.read(size - index_bytes, index_bytes)
+            body = _without_crc(data, 0, index_bytes, f"{self._what}: shard index")
+            index = np.frombuffer(body, dtype="<u8").reshape(-1, 2)
             self._check_follows(index, size - len(index) * INDEX_ENTRY_BYTES - CRC_BYTES)
             self._check_claim(index)
             self._index = index
@@ -229,14 +236,6 @@ class ShardReader:
                 f"{self._what}: storage chunks of {entry.chunk_rows} rows need at least "
                 f"{needed[bad[0]]} bytes, got one of {lengths[bad[0]]}"
             )
-
-    def _read_index(self, file_size: int) -> np.ndarray:
-        size = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
-        start = file_size - size
-        if start < 0:
-            raise CorruptDataError(f"{self._what}: file is too short for its index of {size} bytes")
-        body = _without_crc(self._source.read(start, size), 0, size, f"{self._what}: shard index")
-        return np.frombuffer(body, dtype="<u8").reshape(-1, 2)
 
 
 def _row_layout(entry: ArrayEntry) -> tuple[np.dtype[Any], int]:

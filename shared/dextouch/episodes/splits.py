@@ -38,8 +38,11 @@ def scene_of(attributes: "EpisodeAttributes") -> str:
     """
     if attributes.seed is not None:
         return f"{attributes.task}/{attributes.seed}"
-    recording = recording_of(attributes)
-    return f"{attributes.task}/{recording or _first_episode(attributes)}"
+    found = recording_of(attributes)
+    if not found and attributes.origin == "imagined":
+        # Of the episode that this one was imagined from.
+        found = next((entry.id for entry in attributes.lineage if entry.kind == "episode"), None)
+    return f"{attributes.task}/{found or attributes.episode_id}"
 
 
 def recording_of(attributes: "EpisodeAttributes") -> str | None:
@@ -96,12 +99,3 @@ def split_by_scene(
 def _split_of(scene: str) -> Split:
     digest = hashlib.sha256(f"split/{scene}".encode()).digest()
     return SPLITS[int.from_bytes(digest[:8], "big") % len(SPLITS)]
-
-
-def _first_episode(attributes: "EpisodeAttributes") -> str:
-    """Id of the episode that this one was imagined from, or its own."""
-    if attributes.origin == "imagined":
-        for entry in attributes.lineage:
-            if entry.kind == "episode":
-                return entry.id
-    return attributes.episode_id

@@ -450,7 +450,7 @@ class RequestMiddleware:
 
 
 async def _send_without_trace(scope: Scope, send: Send, message: Message) -> None:
-    """Send a message of the lifespan; a refusal to start is told by its owner, in one line."""
+    """Send a message of the lifespan; its owner reports a refusal to start, in one line."""
     if message["type"] == "lifespan.startup.failed" and scope["app"].state.start_error is not None:
         message = {**message, "message": ""}
     await send(message)

@@ -99,9 +99,9 @@ def run(
     with suppress(KeyboardInterrupt):
         server.run()
     if not server.started:
-        told = getattr(app.state, "start_error", None)
-        if told is not None:
-            raise told
+        start_error = getattr(app.state, "start_error", None)
+        if start_error is not None:
+            raise start_error
         sys.exit(STARTUP_FAILURE)
 
 

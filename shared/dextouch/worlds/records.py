@@ -274,11 +274,11 @@ async def parts_of(
     rollout: RolloutInfo,
     seen: Observation,
     selector: ReturnSelector,
-    **told: Any,  # noqa: ANN401 - see answer_parts
+    **options: Any,  # noqa: ANN401 - see answer_parts
 ) -> AnswerParts:
     """Fields and arrays of a response, from a thread where encoding the images takes long."""
     num_bytes = sum(images.nbytes for images in seen.images.values())
-    make = partial(answer_parts, rollout, seen, selector=selector, **told)
+    make = partial(answer_parts, rollout, seen, selector=selector, **options)
     if selector.images == "raw" or num_bytes <= MAX_INLINE_IMAGE_BYTES:
         return make()
     return await asyncio.to_thread(make)

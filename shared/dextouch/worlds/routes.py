@@ -164,10 +164,10 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
     async def start(request: Request, selector: Selector, owner: Owner) -> Response:
         """Start a rollout from a task and seed, or from an observation."""
         with timed(request, "decode"):
-            asked, begin = await _start_of(request)
+            chosen, begin = await _start_of(request)
         with timed(request, "world"):
             client = client_name(request.headers.get(CLIENT_HEADER, ""))
-            answer = await service.start(asked.world, begin, selector, owner=owner, client=client)
+            answer = await service.start(chosen.world, begin, selector, owner=owner, client=client)
         return _response(request, answer, status=201)
 
     @router.get("/rollouts/{rollout_id}")

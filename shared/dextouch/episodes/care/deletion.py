@@ -315,14 +315,6 @@ def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
     return [facts for facts in all_facts(root) if facts.reviewer == request.operator]
 
 
-def _remove_reviewer(facts: Facts) -> None:
-    """Remove the reviewer's name from a review; the verdict stays."""
-    path = facts.folder / REVIEW_FILE
-    with disk_errors(f"remove the reviewer of {facts.item_id}"):
-        fields = json.loads(path.read_bytes())
-        replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
-
-
 def _reason(facts: Facts, request: DeletionRequest) -> str | None:
     if request.operator is None:
         is_it = (facts.kind, facts.item_id) == ("recording", request.recording)
@@ -443,7 +435,11 @@ def _remove_all(
         remember()
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
-            _remove_reviewer(facts)
+            # The verdict stays.
+            path = facts.folder / REVIEW_FILE
+            with disk_errors(f"remove the reviewer of {facts.item_id}"):
+                fields = json.loads(path.read_bytes())
+                replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
             reviewed.append(facts)
         if not any(went):
             break
