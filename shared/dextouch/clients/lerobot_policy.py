@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients.rollouts import PolicyStart
 from dextouch.errors import DexTouchError, InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import Observation

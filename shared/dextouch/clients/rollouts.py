@@ -1,4 +1,4 @@
-"""HTTP client of served worlds: start a rollout, step it by action chunks, fork it.
+"""Protocol of policies, which act in any world, and HTTP client of served worlds.
 
 with RolloutClient("http://127.0.0.1:8100") as client:
     with client.start(world="twin", task="stand_bottle", seed=3, instruction="…") as rollout:
@@ -8,7 +8,8 @@ with RolloutClient("http://127.0.0.1:8100") as client:
 
 from contextlib import nullcontext, suppress
 from copy import copy
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 from urllib.parse import quote, urlencode
 
 import numpy as np
@@ -230,3 +231,40 @@ def _parsed(model: type[ModelT], reply: Reply) -> ModelT:
         raise UnavailableError(
             f"answer: {first_problems(error)}; is a DexTouch service of this version there?"
         ) from error
+
+
+@dataclass(frozen=True)
+class PolicyStart:
+    """Information that a policy gets before its first observation.
+
+    `anchor` are the absolute poses of the rollout's step 0, which all actions are relative to;
+    `seed` is for the policy's own random numbers.
+    """
+
+    task: str
+    instruction: str
+    seed: int
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
+
+    A policy with an attribute `looks` that is False gets no images after the first step, so that
+    worlds need not render them. With `looks = "last"` it may get nothing but the last step of each
+    chunk. `tasks` names those it supports; `python -m benchmarks evaluator` skips all others.
+    """
+
+    def reset(self, start: PolicyStart) -> None:
+        """Reset all state for a new rollout."""
+        ...
+
+    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+        """The next action chunk, given the observations since the last call (the last step is now).
+
+        Rows are poses and joint angles as commands, relative to the rollout's step 0; their
+        number is a multiple of the world's chunk.
+        """
+        ...
