@@ -295,17 +295,9 @@ def plan_deletion(
 
 
 def _victim(facts: Facts, reason: str) -> Victim:
-    is_take = facts.kind == "recording"
-    return Victim(
-        kind=facts.kind,
-        id=facts.item_id,
-        place=facts.place,
-        folder=facts.folder.name,
-        sha256=facts.sha256,
-        reason=reason,
-        station=facts.station if is_take else None,
-        started=facts.started if is_take else "",
-    )
+    of_take = (facts.station, facts.started) if facts.kind == "recording" else (None, "")
+    identity = (facts.kind, facts.item_id, facts.place, facts.folder.name, facts.sha256)
+    return Victim(*identity, reason, *of_take)
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:

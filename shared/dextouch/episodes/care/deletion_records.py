@@ -8,7 +8,6 @@ records a station has worked off, and which of their takes it could not remove y
 import hashlib
 import os
 import secrets
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -108,20 +107,11 @@ class DeletionRecords:
 
     def __init__(self, root: Path) -> None:
         self._folder = root / FOLDER
-        self._lock = threading.Lock()
-        self._files: dict[str, tuple[tuple[int, int, int], DeletionRecord]] = {}
         self._salt = b""
 
     def read(self) -> Mapping[str, DeletionRecord]:
         """All records by key, oldest first; raises CorruptDataError for a damaged one."""
-        with self._lock:
-            known, self._files = self._files, {}
-            for path, stamp in _stamps(self._folder / "records"):
-                before = known.get(path.stem)
-                is_same = before is not None and before[0] == stamp
-                record = before[1] if is_same and before else _read(path, DeletionRecord)
-                self._files[path.stem] = (stamp, record)
-            found = {key: record for key, (_, record) in self._files.items()}
+        found = {path.stem: _record(path, at) for path, at in _stamps(self._folder / "records")}
         return dict(sorted(found.items(), key=lambda item: item[1].deleted_at))
 
     @property
@@ -285,6 +275,12 @@ def _read(path: Path, model: type[M]) -> M:
             f"deletions: {path} is damaged ({error}); restore it from a backup: without it takes "
             "of deleted operators could be uploaded again"
         ) from error
+
+
+# Many more than a store has deletions.
+@lru_cache(maxsize=4096)
+def _record(path: Path, _stamp: tuple[int, int, int]) -> DeletionRecord:
+    return _read(path, DeletionRecord)
 
 
 def _fingerprint(salt: bytes, take: TakeFacts) -> str:
