@@ -56,7 +56,7 @@ UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
 # Called after every storage chunk with the number of bytes read.
 Progress = Callable[[int], None]
-WHOLE, MENDED, SALVAGED, LEFT = "whole", "mended", "salvaged", "left"
+WHOLE, REPAIRED, SALVAGED, LEFT = "whole", "repaired", "salvaged", "left"
 LOST = "lost_to_damage"
 
 
@@ -235,9 +235,9 @@ def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
 class RepairReport:
     """Result of the repair of one item.
 
-    `action` is `whole` (nothing to do), `mended` (restored as it was before the damage), `salvaged`
-    (the readable samples are in `new_id`, the damaged group in the trash) or `left` (unchanged,
-    `notes` say why). `lost` counts the samples that a salvage dropped.
+    `action` is `whole` (nothing to do), `repaired` (restored as it was before the damage),
+    `salvaged` (the readable samples are in `new_id`, the damaged group in the trash) or `left`
+    (unchanged, `notes` say why). `lost` counts the samples that a salvage dropped.
     """
 
     kind: str
@@ -266,7 +266,7 @@ def repair_group(
         _repair_from(files, kind, copy)
     _rewrite_metadata(files, kind)
     if all(finding.foreign for finding in inspect_group(files, kind).findings):
-        return RepairReport(kind, item_id, MENDED, notes=notes)
+        return RepairReport(kind, item_id, REPAIRED, notes=notes)
     return _salvage(root, kind, files.folder, notes)
 
 
