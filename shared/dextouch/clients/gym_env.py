@@ -79,11 +79,9 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[SeenNow, dict[str, Any]]:
-        """Start a new rollout.
+        """Start a new rollout; without a seed of the start and the world's noise one is drawn.
 
-        Args:
-            seed: of the start and the world's noise; None draws one.
-            options: {"init": (observation, anchor, K_head)} starts from an observation.
+        The options {"init": (observation, anchor, K_head)} start from an observation.
         """
         super().reset(seed=seed)
         unknown = sorted(set(options or {}) - {"init"})
@@ -138,11 +136,9 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
 
     Autoreset is disabled: once an episode has ended, its environment must be reset before the next
     step, by `options={"reset_mask": terminations | truncations}`. If a reset or a step raises, some
-    environments may have done it and others not; reset all of them.
-
-    Args:
-        envs: of equal spaces, each with a client of its own, since a client is not thread-safe.
-            They are closed with this one; their clients stay open.
+    environments may have done it and others not; reset all of them. Spaces are equal, and each has
+    a client of its own, which is not thread-safe; they are closed with this one, their clients are
+    not.
     """
 
     def __init__(self, envs: Sequence[WorldEnv]) -> None:
@@ -172,12 +168,10 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[SeenNow, dict[str, Any]]:
-        """Start new rollouts.
+        """Start new rollouts; the seed of the first counts up for the others, or each has its own.
 
-        Args:
-            seed: one for each environment, or that of the first, counted up for the others.
-            options: {"reset_mask": bool array [num_envs]} leaves the others as they are;
-                {"inits": sequence} starts each from its own (observation, anchor, K_head).
+        The options {"reset_mask": bool array [num_envs]} leave the others as they are; {"inits":
+        sequence} start each from its own (observation, anchor, K_head).
         """
         rest = dict(options or {})
         chosen = self._chosen(rest.pop("reset_mask", None))
