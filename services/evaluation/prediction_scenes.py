@@ -11,7 +11,7 @@ from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert
 from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
-from dextouch.metrics import geometry as depth_metrics
+from dextouch.metrics import image as depth_metrics
 from dextouch.metrics import trajectory as trajectory_metrics
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA

@@ -21,8 +21,7 @@ _PREFIXES = ("._", ".nfs", ".trash-", ".fuse_hidden")
 def data_folder() -> Path:
     """The folder below which commands keep their data unless a flag says otherwise.
 
-    Raises:
-        InvalidInputError: the variable holds a URL.
+    Raises InvalidInputError if the variable holds a URL.
     """
     text = os.environ.get(DATA_VARIABLE) or "data"
     if "://" in text:

@@ -29,20 +29,12 @@ _Columns = Callable[[Block], dict[str, Any]]
 
 
 def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
-    """Write one episode or recording for the Rerun viewer.
+    """Write one episode or recording for the Rerun viewer, and return the number of samples.
 
     The timeline is `t_ref` (episode) or `t_host` (recording). Encoded images are not decoded.
 
-    Args:
-        reader: of the episode or recording.
-        path: of the new file.
-        overwrite: whether an existing file is replaced.
-
-    Returns:
-        Number of samples.
-
     Raises:
-        ConflictError: the file exists.
+        ConflictError: the file exists, and is not to be overwritten.
         InvalidInputError: a stream that Rerun cannot display.
         StorageError: the write failed.
     """
@@ -82,10 +74,6 @@ def entity_of(descriptor: StreamDescriptor) -> str:
     return f"tactile/{name}" if descriptor.kind == "tactile" else f"numbers/{name}"
 
 
-def _names(reader: Reader, kind: str) -> list[str]:
-    return [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
-
-
 def _blueprint(reader: Reader) -> rrb.Blueprint:
     """Viewer layout: 3D view and plots on the left, cameras in the middle, touch on the right."""
     columns = [
@@ -95,7 +83,8 @@ def _blueprint(reader: Reader) -> rrb.Blueprint:
         )
     ]
     for kind in ("image", "tactile"):
-        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in _names(reader, kind)]
+        entities = [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
+        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in entities]
         if views:
             columns.append(rrb.Vertical(*views))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)
@@ -115,7 +104,6 @@ def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
 
 
 def _log(stream: rr.RecordingStream, reader: Reader, descriptor: StreamDescriptor) -> int:
-    """Log one stream; returns its number of samples."""
     entity, kind, num_samples = entity_of(descriptor), descriptor.kind, 0
     if kind == "image":
         columns = _images(stream, entity, descriptor)

@@ -8,7 +8,7 @@ import numpy as np
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients.rollouts import PolicyStart
 from dextouch.errors import InvalidInputError, ShapeError, UnavailableError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import Observation

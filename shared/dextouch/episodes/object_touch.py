@@ -61,7 +61,6 @@ class _Hold:
 
     @property
     def lets_go(self) -> bool:
-        """Whether the contact ends before the episode does."""
         return self.end + 1 < len(self.Ts_world_wrist)
 
     @cached_property
@@ -73,13 +72,11 @@ class _Hold:
 def touched_objects(grid: EpisodeGrid, objects: SceneObjects) -> ObjectTrack:
     """Poses of an episode's objects as touch gives them; unknown where it does not.
 
-    Args:
-        grid: the episode; one without success gives no poses, as hands may have missed.
-        objects: of the tasks; those with `touch` get poses.
+    An episode without success gives no poses, as hands may have missed; objects with `touch` get
+    them.
 
-    Raises:
-        UnknownNameError: the file does not have the task.
-        InvalidInputError: the episode has other objects, or no outcome.
+    Raises UnknownNameError without the task in the file, InvalidInputError if the episode has other
+    objects, or no outcome.
     """
     listed = listed_objects(grid.about, objects)
     track = ObjectTrack.unknown(len(grid), len(listed))

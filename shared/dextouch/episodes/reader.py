@@ -107,13 +107,8 @@ def step_ranges(
     """Sample ranges [low, high) with t−1 < stamp ≤ t for grid steps start … stop-1.
 
     Step 0 has no predecessor: it takes the first sample of the stream, if that lies within half a
-    step of it. A range is empty if there is no sample.
-
-    Args:
-        stamps_ns: of the samples, strictly increasing.
-        grid_ns: of all steps of the episode.
-        start: first step.
-        stop: one past the last step.
+    step of it. A range is empty if there is no sample. Stamps of the samples are strictly
+    increasing; `grid_ns` are those of all steps of the episode.
     """
     edges = np.searchsorted(stamps_ns, grid_ns[max(0, start - 1) : stop] + SAME_INSTANT_NS, "right")
     if start > 0:
@@ -130,9 +125,7 @@ def mean_over_ranges(
 ) -> tuple[Float32[np.ndarray, "n taxels"], Bool[np.ndarray, " n"]]:
     """Means of rows [low, high) in float32, and a mask of non-empty ranges.
 
-    Args:
-        values: rows, indexed by `ranges`.
-        ranges: [n, 2].
+    Ranges are [n, 2].
     """
     valid = ranges[:, 1] > ranges[:, 0]
     means = np.zeros((len(ranges), *values.shape[1:]), dtype=np.float32)
@@ -237,9 +230,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
     ) -> SampleBatch:
         """Samples with start_ns ≤ t_host_ns < stop_ns; images come decoded, damaged ones never.
 
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
+        Raises UnknownNameError without the stream, CorruptDataError for damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
         kept, values = self._without_damaged(name, low, high)
@@ -258,12 +249,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         return found
 
     def stamps(self, name: str) -> SampleBatch:
-        """All stamps of a stream, without the values (which are [n, 0] here).
-
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
-        """
+        """All stamps of a stream, without the values (which are [n, 0] here); raises as `read`."""
         t_host_ns = self.stamps_ns(name).copy()
         # Not cached like the first column, since they are read once.
         t_device_ns, sequence = (
@@ -285,9 +271,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> StreamData:
         """Samples with start_ns ≤ t_ref_ns < stop_ns; images come decoded, damaged ones never.
 
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
+        Raises UnknownNameError without the stream, CorruptDataError for damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
         kept, values = self._without_damaged(name, low, high)
@@ -382,9 +366,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> Float64[np.ndarray, "n 67"]:
         """Actions of steps, relative to the measured poses of the first one; as in `window`.
 
-        Raises:
-            InvalidInputError: steps outside the episode.
-            UnknownNameError: an action kind that the episode does not have.
+        Raises InvalidInputError for steps outside the episode, UnknownNameError without the action
+        kind.
         """
         self._check_steps(start, num_steps)
         if kind not in ACTION_STREAMS:
@@ -434,15 +417,9 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
         """Steps that have an image at most 0.6 steps away, and the index of that image.
 
-        Images that cannot be decoded do not count: those that are chosen are decoded once.
-
-        Args:
-            camera: of an image stream.
-            steps: increasing steps to look at; None for all.
-
-        Raises:
-            UnknownNameError: no such camera.
-            NotFoundError: none of its images can be decoded.
+        Images that cannot be decoded do not count: those that are chosen are decoded once. Steps to
+        look at are increasing, None for all. Raises UnknownNameError without the camera,
+        NotFoundError if none of its images can be decoded.
         """
         self._check_cameras((camera,))
         stamps, grid_ns = self.stamps_ns(camera), self.stamps_ns("action")
@@ -457,21 +434,16 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def has_every_image(self, camera: str) -> bool:
         """Whether nearly every step has an image of its own; one in twenty may have been dropped.
 
-        Raises:
-            UnknownNameError: no such camera.
+        Raises as `shown_steps`.
         """
         num_missing = self.num_steps - len(self.shown_steps(camera)[0])
         return num_missing <= MAX_UNSHOWN_SHARE * self.num_steps
 
     def require_images(self, camera: str) -> None:
-        """Check that nearly every step of the episode has an image of its own.
+        """Raise InvalidInputError unless the episode `has_every_image` of a camera.
 
         `window` returns the nearest image whatever its time: where only every N-th step was
         rendered, that is the image of another step.
-
-        Raises:
-            InvalidInputError: more than a twentieth of the steps have no image of their own.
-            UnknownNameError: no such camera.
         """
         if not self.has_every_image(camera):
             num_missing = self.num_steps - len(self.shown_steps(camera)[0])
@@ -486,8 +458,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w c"]]:
         """Indices of the images nearest to non-decreasing times, and these images.
 
-        Raises:
-            NotFoundError: no image, or none that can be decoded.
+        Raises NotFoundError without an image, or one that can be decoded.
         """
         if not self.num_samples(camera):
             raise NotFoundError(f"{self._what}: {camera!r} holds no image")

@@ -164,10 +164,8 @@ def check_observation_arrays(
 ) -> None:
     """Check that the arrays of an observation are consistent and finite.
 
-    Raises:
-        ShapeError: inconsistent dtypes, lengths or shapes.
-        NonFiniteError: in touch, actions or object poses.
-        DegenerateRotationError: an object's quaternion is not of length 1.
+    Raises ShapeError for dtypes, lengths or shapes, NonFiniteError in touch, actions or object
+    poses, DegenerateRotationError for an object's quaternion that is not of length 1.
     """
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
@@ -288,11 +286,7 @@ def answer_parts(
 
 
 def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
-    """Decode a packed response that holds touch.
-
-    Raises:
-        InvalidInputError: not a valid response.
-    """
+    """Decode a packed response that holds touch; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(AnswerFields, raw, where="answer")
     if any(name.startswith(JPEG_PREFIX) for name in arrays):
@@ -308,11 +302,7 @@ def encode_observation(observation: Observation) -> bytes:
 
 
 def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
-    """Inverse of `encode_observation`.
-
-    Raises:
-        InvalidInputError: not a valid observation.
-    """
+    """Inverse of `encode_observation`; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(ObservationFields, raw, where="observation")
     return _observation_from(fields, arrays, where="observation")
@@ -333,11 +323,7 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
-    """Decode and validate a start request from an untrusted source.
-
-    Raises:
-        InvalidInputError: not a valid start request.
-    """
+    """Decode a start request of an untrusted source; raises InvalidInputError if it is invalid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
@@ -420,11 +406,7 @@ def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarra
 
 
 def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    """A model of decoded fields, or of JSON as bytes.
-
-    Raises:
-        InvalidInputError: wrong fields; the message begins with `where`.
-    """
+    """A model of decoded fields, or of JSON as bytes; an InvalidInputError begins with `where`."""
     try:
         # Not model_validate_json, which converts unknown parts once per mistake.
         return model.model_validate(from_json(fields) if isinstance(fields, bytes) else fields)
@@ -452,10 +434,8 @@ def decode_images(
 ) -> dict[str, np.ndarray]:
     """Inverse of `encode_images`, for a response that may hold JPEG.
 
-    Raises:
-        InvalidInputError: sizes that are missing or do not fit, or images that differ in size.
-        LimitExceededError: images that take more than `max_bytes` once decoded.
-        CorruptDataError: not JPEG.
+    Raises InvalidInputError for sizes that do not fit, LimitExceededError for more than `max_bytes`
+    once decoded, CorruptDataError for anything but JPEG.
     """
     found = {}
     for name, array in arrays.items():

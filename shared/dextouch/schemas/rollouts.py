@@ -43,7 +43,6 @@ def reported_milestones(info: Mapping[str, float]) -> dict[str, float]:
 
 
 def _is_none(value: object) -> bool:
-    """For fields that are omitted where they are unknown, so that older clients can read them."""
     return value is None
 
 
@@ -156,11 +155,9 @@ class RolloutUncertainty(FrozenModel):
     size_deviation: float | None = None
 
     def after(self, uncertainty: Uncertainty | None, *, last_step: int) -> "RolloutUncertainty":
-        """The uncertainty of the rollout after one more chunk.
+        """The uncertainty of the rollout after one more chunk, which ends at `last_step`.
 
-        Args:
-            uncertainty: of the chunk; None where the world reports none.
-            last_step: last step of the chunk.
+        That of the chunk is None where the world reports none.
         """
         reason, step = self.reason, self.step
         if reason is None and uncertainty is not None and uncertainty.outside:

@@ -134,12 +134,10 @@ def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
 
 
 def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
-    """Check that a batch matches its stream.
+    """Check that a batch matches its stream, and that `t_host_ns` never decreases.
 
-    Args:
-        descriptor: of the stream.
-        batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
-            object array of bytes; `t_host_ns` is non-decreasing.
+    Values have the descriptor's dtype and shape; for the units `jpeg` and `h264` they are an object
+    array of bytes.
 
     Raises:
         ShapeError: another dtype or shape.
@@ -169,11 +167,7 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
 
 
 def check_follows(name: str, t_host_ns: int, last_t_host_ns: int | None) -> None:
-    """Check that a batch does not start before the last sample of its stream.
-
-    Raises:
-        InvalidInputError: it does.
-    """
+    """Raise InvalidInputError if a batch starts before the last sample of its stream."""
     if last_t_host_ns is not None and t_host_ns < last_t_host_ns:
         raise InvalidInputError(
             f"{name}: t_host_ns goes back to {t_host_ns} from {last_t_host_ns}; "
@@ -193,12 +187,10 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
 
 
 def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
-    """Check an encoded image of a stream with the unit `jpeg` or `h264`.
-
-    For H.264 only the start code is checked; the size is known after decoding.
+    """Check an encoded image of a stream with the unit `jpeg`, or `h264` (its start code alone).
 
     Raises:
-        ShapeError: not bytes, or an image of another size.
+        ShapeError: not bytes, or a JPEG image of another size.
         InvalidInputError: another format.
     """
     if not isinstance(data, bytes):
@@ -234,8 +226,7 @@ RESIDUAL_SHARES: Final = (0.25, 0.5)
 def residual_limits_s(counted_period_s: float | None) -> tuple[float, float]:
     """From where on the scatter of arrivals is a warning and an error.
 
-    Args:
-        counted_period_s: period of a stream that is dated by counting its samples; None of others.
+    `counted_period_s` is that of a stream that is dated by counting its samples; None of others.
     """
     warn_s, error_s = RESIDUAL_WARN_S, RESIDUAL_ERROR_S
     if counted_period_s is None:

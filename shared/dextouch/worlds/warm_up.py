@@ -13,8 +13,7 @@ from dextouch.worlds.world import World
 def first_chunk_s(world: World[Any]) -> float:
     """Start a rollout and advance it by one chunk; returns the duration.
 
-    Raises:
-        DexTouchError: the world begins nothing from black images, or cannot continue.
+    Raises DexTouchError if the world begins nothing from black images, or cannot continue.
     """
     began_s = time.perf_counter()
     description = world.description

@@ -75,12 +75,8 @@ def import_lerobot(
 ) -> list[str]:
     """Write every episode of a dataset into the store and return their ids.
 
-    Each episode appears complete or not at all; after an error, earlier episodes remain.
-
-    Args:
-        folder: root of the dataset; nothing outside it is read.
-        store: destination.
-        options: feature names, ids, image unit, and values missing in foreign datasets.
+    Each episode appears complete or not at all; after an error, earlier episodes remain. Nothing
+    outside the folder is read.
 
     Raises:
         NotFoundError: a file is missing.
@@ -189,10 +185,9 @@ def _content(
     features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
 ) -> tuple[_Content, AnchorPoses | None]:
-    """An episode's numbers and where its videos are.
+    """An episode's numbers, where its videos are, and the poses that its actions are relative to.
 
-    Actions are relative to the measured poses of the first frame; these are returned where they are
-    not those that the dataset's description gives.
+    These are the measured ones of the first frame; None where the dataset's description gives them.
     """
     where = f"{source.folder}: episode {entry.index}"
     columns = _columns(source, entry, features)

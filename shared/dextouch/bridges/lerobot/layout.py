@@ -115,10 +115,9 @@ def _video_feature(shape: Sequence[int], fps: int) -> Feature:
 def dataset_features(
     cameras: Mapping[str, Sequence[int]], fps: int, *, has_measured: bool
 ) -> Features:
-    """Every feature of an export, by name.
+    """Every feature of an export, by name, for cameras with images of shape [height, width, 3].
 
-    `cameras` holds the shape [height, width, 3] of each camera's images; with `has_measured`
-    actions are commanded ones, and measured ones are stored beside them.
+    With `has_measured` actions are commanded ones, and measured ones are stored beside them.
     """
     names = action_names()
     pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
@@ -142,11 +141,7 @@ def file_place(number: int) -> tuple[int, int]:
 
 
 def fill_path(template: str, **values: int | str) -> str:
-    """Substitute the fields of a path template; only plain fields are supported.
-
-    Raises:
-        InvalidInputError: a field that is not among `values`, or any other brace.
-    """
+    """Fill in the plain fields of a path template; raises InvalidInputError for any other brace."""
     with suppress(KeyError, ValueError):
         if _TEMPLATE.fullmatch(template):
             return template.format(**values)
@@ -165,11 +160,7 @@ def numbered_path(folder: Path, template: str, number: int, **values: str) -> Pa
 
 
 def confined(folder: Path, relative: str) -> Path:
-    """Resolve a path below `folder`, following links.
-
-    Raises:
-        CorruptDataError: it leads out of the folder.
-    """
+    """Resolve a path below `folder`, following links; raises CorruptDataError if it leads out."""
     root = folder.resolve()
     if "\0" in relative:
         raise CorruptDataError(f"{folder}: got a path with a zero byte")
@@ -307,11 +298,7 @@ def _tactile(
 
 
 def value_statistics(values: np.ndarray) -> Statistics:
-    """Of numbers [frame, ...]: everything but the last axis is pooled, as LeRobot does it.
-
-    Args:
-        values: at least one frame; finite.
-    """
+    """Of finite numbers [frame, ...]: all but the last axis is pooled, as LeRobot does it."""
     rows = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
     if values.ndim == 1:
         rows = np.asarray(values, dtype=np.float64)[:, None]
