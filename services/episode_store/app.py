@@ -1,9 +1,8 @@
-"""Application of the episode store, which also completes uploads to a bucket while it runs."""
+"""Application of the episode store."""
 
 import threading
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from typing import Final
 
 import structlog
 from fastapi import FastAPI
@@ -13,15 +12,16 @@ from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import DexTouchError
 from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
+from services.episode_store.background import DeletionWatch, PendingUploads
 from services.episode_store.catalog import Catalog
-from services.episode_store.clicking import clicks_router
-from services.episode_store.deletions import DeletionWatch, deletions_router
+from services.episode_store.deletions import deletions_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.keys import Enrolments, enrolment_router
 from services.episode_store.reading import content_router, playback_router
 from services.episode_store.routes import (
     catalog_router,
+    clicks_router,
     idle_uploads_router,
     reviews_router,
     trash_router,
@@ -32,57 +32,6 @@ from services.episode_store.settings import EpisodeStoreSettings
 logger = structlog.get_logger(__name__)
 
 ENROLMENTS_FILE = "enrolments.json"
-# Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
-RETRY_PERIOD_S: Final = 30.0
-
-
-class PendingUploads:
-    """Uploads what waits in the outbox of a store, and removes the stages of killed writers once.
-
-    Failures, such as a bucket that cannot be reached or a read-only folder, are logged when they
-    begin or change; the service still serves everything else.
-    """
-
-    def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
-        self._store, self._period_s = store, period_s
-        self._is_swept = False
-        self._problem = ""
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="pending-uploads", daemon=True)
-
-    def start(self) -> None:
-        """Begin in the background."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread, after an upload that is under way."""
-        self._stopping.set()
-        self._thread.join()
-
-    def try_all(self) -> None:
-        """Try once.
-
-        Raises:
-            StorageError, UnavailableError: something failed and waits for the next time.
-        """
-        for kind, item_id in self._store.complete_uploads():
-            logger.warning("upload_completed", kind=kind, id=item_id)
-        if not self._is_swept:
-            removed = self._store.sweep()
-            self._is_swept = True
-            if removed:
-                logger.info("unfinished_writes_removed", count=removed)
-
-    def _run(self) -> None:
-        while not self._stopping.is_set():
-            try:
-                self.try_all()
-                self._problem = ""
-            except DexTouchError as error:
-                if error.message != self._problem:
-                    logger.error("uploads_not_completed", reason=error.message)  # noqa: TRY400
-                self._problem = error.message
-            self._stopping.wait(self._period_s)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:

@@ -126,7 +126,9 @@ def _add_delete(command: argparse.ArgumentParser) -> None:
         help="with --operator: also if the store has nothing of him and only stations may",
     )
     command.add_argument("--yes", action="store_true", help="skip the confirmation")
-    command.add_argument("--receipt", metavar="PATH", help="file for the deletion receipt")
     command.add_argument(
-        "--checkpoints", metavar="FOLDER", help="also search the models in this folder"
+        "--receipt", type=Path, metavar="PATH", help="file for the deletion receipt"
+    )
+    command.add_argument(
+        "--checkpoints", type=Path, metavar="FOLDER", help="also search the models in this folder"
     )

@@ -7,7 +7,8 @@ from fastapi.testclient import TestClient
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError, UnavailableError
-from services.episode_store.app import PendingUploads, create_app
+from services.episode_store.app import create_app
+from services.episode_store.background import PendingUploads
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
@@ -61,7 +62,7 @@ def test_what_failed_is_uploaded_when_the_bucket_is_back(s3_server, store):
     fail_to_upload(s3_server, store, made)
     with s3_server.checking_credentials():
         with pytest.raises(StorageError, match="refused"):
-            pending.try_all()
+            pending.work()
         pending.start()
         time.sleep(0.2)
     try:
