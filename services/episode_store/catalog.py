@@ -90,8 +90,8 @@ class _Shelf(Generic[S]):
         self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
     ) -> None:
         self._store = store
-        self._kind: Kind = kind
         self._summarize: Callable[[str], Entry[S]] = summarize
+        self._kind: Kind = kind
         self._folder = store.root / f"{kind}s"
         self._listed_ns: int | None = None
         self._stamp_ns: int | None = None
@@ -233,10 +233,13 @@ class Catalog:
 
     def lineage(self, kind: Kind, item_id: str) -> Lineage:
         """Everything that an item was made from and that was made from it; as `lineage_of`."""
+        shelves: dict[Kind, _Shelf[Any]]
+        shelves = {"recording": self._recordings, "episode": self._episodes}
         entries: dict[tuple[str, str], Entry[Any]] = {
-            ("recording", name): entry for name, entry in self._recordings.entries().items()
+            (each, name): entry
+            for each in shelves
+            for name, entry in shelves[each].entries().items()
         }
-        entries |= {("episode", name): entry for name, entry in self._episodes.entries().items()}
         return lineage_of(entries, (kind, item_id))
 
     def items(self, wanted: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
@@ -277,8 +280,7 @@ class Catalog:
 
     def hours_by(self, field: HoursField, wanted: HoursFilter) -> HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
-        entries = _matching(self._listed("episode"), wanted)
-        items = [entry.item for entry in entries.values()]
+        items = [one.item for one in _matching(self._listed("episode"), wanted).values()]
         return hours_by(field, items, utc_offset_min=wanted.utc_offset_min)
 
     def _listed(self, kind: ItemsKind) -> Mapping[str, Entry[Any]]:
@@ -335,12 +337,12 @@ class Catalog:
             item_id,
             about.task,
             about.instruction,
-            about.operator or "",
-            about.station or "",
-            about.trace_id or "",
+            about.operator,
+            about.station,
+            about.trace_id,
         )
-        text = "\n".join(parts).casefold()
-        return Entry(summary, item, dict(about.quality), at, about.lineage, text)
+        text = "\n".join(part or "" for part in parts)
+        return Entry(summary, item, dict(about.quality), at, about.lineage, text.casefold())
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -376,10 +378,5 @@ def _page(
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:
     # Counts come from the commit record, so no array is opened.
-    return max(
-        (
-            reader.num_samples(name) / descriptor.nominal_rate_hz
-            for name, descriptor in reader.streams.items()
-        ),
-        default=0.0,
-    )
+    rates_hz = {name: stream.nominal_rate_hz for name, stream in reader.streams.items()}
+    return max((reader.num_samples(name) / rates_hz[name] for name in rates_hz), default=0.0)

@@ -17,14 +17,14 @@ from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
 from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary
-from services.episode_store.ingest import idle_seconds
+from services.episode_store.ingest import idle_seconds, upload_folders
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
 
+# Bounds of the histograms.
 SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
-
-
+REFUSAL_REASONS: Final = ("busy", "disk", "quota", "other")
 BUSY_RETRY_S = 1
 FULL_RETRY_S = 30
 # Maximum age of the sum of finished recordings; our own commits are counted at once.
@@ -167,11 +167,12 @@ class StorageLimits:
                 station=attributes.station,
                 task=attributes.task,
                 num_bytes=folder_bytes(path),
-                idle_s=idle_seconds(path),
+                idle_s=since_s,
             )
             for path, attributes in self._spools()
+            if (since_s := idle_seconds(path)) >= idle_s
         ]
-        return UploadList(uploads=tuple(upload for upload in found if upload.idle_s >= idle_s))
+        return UploadList(uploads=tuple(found))
 
     def _check_disk(self, num_bytes: int, reserve: int, what: str) -> None:
         free = self.free_bytes()
@@ -188,7 +189,12 @@ class StorageLimits:
     def _check_quota(self, station: str, num_bytes: int) -> None:
         if self._quota is None:
             return
-        used = self._used(station)
+        now = time.monotonic()
+        with self._guard:
+            if self._finished is None or now - self._finished[0] > REFRESH_S:
+                self._finished = (now, self._recordings())
+            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
+            used = self._finished[1].get(station, 0) + sum(uploads)
         if used + num_bytes > self._quota:
             raise StorageFullError(
                 f"station {station!r}: {used} bytes are in use and {num_bytes} more were sent, "
@@ -199,20 +205,9 @@ class StorageLimits:
                 retry_after_s=FULL_RETRY_S,
             )
 
-    def _used(self, station: str) -> int:
-        now = time.monotonic()
-        with self._guard:
-            if self._finished is None or now - self._finished[0] > REFRESH_S:
-                self._finished = (now, self._recordings())
-            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
-            return self._finished[1].get(station, 0) + sum(uploads)
-
     def _spools(self) -> list[tuple[Path, RecordingAttributes]]:
         found = []
-        with disk_errors("list uploads"):
-            paths = sorted(self._folder.iterdir()) if self._folder.is_dir() else []
-        # A name with a dot is an upload that is still being created.
-        for path in (path for path in paths if "." not in path.name):
+        for path in upload_folders(self._folder):
             try:
                 found.append((path, read_attributes(path)))
             except NotFoundError:
@@ -220,9 +215,6 @@ class StorageLimits:
             except StorageError as error:
                 logger.warning("damaged_upload", recording_id=path.name, reason=error.message)
         return found
-
-
-REFUSAL_REASONS: Final = ("busy", "disk", "quota", "other")
 
 
 class UploadMetrics:

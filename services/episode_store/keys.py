@@ -199,10 +199,8 @@ class Enrolments:
     def listing(self) -> StationEnrolments:
         """All enrolments, newest first."""
         with self._lock:
-            shown = [
-                StationEnrolment.model_validate(one.model_dump(exclude={"key_sha256"}))
-                for one in self._kept
-            ]
+            fields = [one.model_dump(exclude={"key_sha256"}) for one in self._kept]
+            shown = [StationEnrolment.model_validate(one) for one in fields]
             for token in self._tokens:
                 if not token.is_used:
                     state = "waiting" if token.end_s > self._clock_s() else "expired"
