@@ -83,7 +83,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
             ServedFolder(jobs.jobs_folder, "folder of alignment jobs"),
         ],
     )
-    app.state.registry.register(jobs.metrics)
+    app.state.registry.register(jobs.metrics.registry)
     return app
 
 

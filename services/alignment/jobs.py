@@ -116,12 +116,12 @@ def check_recordings(
                 raise
             refused[recording_id] = error
     if refused:
-        told = "; ".join([error.message for error in refused.values()][:MAX_LISTED])
+        reasons = "; ".join([error.message for error in refused.values()][:MAX_LISTED])
         more = f"; and {len(refused) - MAX_LISTED} more" if len(refused) > MAX_LISTED else ""
         unknown = all(isinstance(error, NotFoundError) for error in refused.values())
         raise (NotFoundError if unknown else InvalidInputError)(
             f"alignments: {len(refused)} of {len(recording_ids)} recordings cannot be aligned, so "
-            f"no job was started; omit them: {told}{more}",
+            f"no job was started; omit them: {reasons}{more}",
             refused={recording_id: error.message for recording_id, error in refused.items()},
         )
     return episodes

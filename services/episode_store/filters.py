@@ -37,7 +37,7 @@ _WEIGHTS = {
     "recovered": 5.0,
     "not_judged": 1.0,
 }
-EARLIEST, LATEST = (at.replace(tzinfo=UTC) for at in (datetime.min, datetime.max))
+EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
 

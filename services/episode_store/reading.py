@@ -373,9 +373,14 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     for side, measured in zip(SIDES, measured_taxels(calibration), strict=True):
         if stream.name == f"tactile_{side}":
             taxels = np.flatnonzero(~measured)
-    names = ("name", "kind", "shape", "unit", "side", "frame", "nominal_rate_hz")
     return PlayedStream(
-        **{name: getattr(stream, name) for name in names},
+        name=stream.name,
+        kind=stream.kind,
+        shape=stream.shape,
+        unit=stream.unit,
+        side=stream.side,
+        frame=stream.frame,
+        nominal_rate_hz=stream.nominal_rate_hz,
         num_samples=len(stamps_ns),
         first_ns=int(stamps_ns[0]) if len(stamps_ns) else None,
         last_ns=int(stamps_ns[-1]) if len(stamps_ns) else None,

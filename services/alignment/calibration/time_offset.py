@@ -77,7 +77,7 @@ def estimate_time_offset(
     grid_a, smooth_a = low_passed(t_a, a, step_s)
     grid_b, smooth_b = low_passed(t_b, b, step_s)
     spline_b = CubicSpline(grid_b, smooth_b)
-    coarse_s = _coarse(grid_a, smooth_a, (grid_b, smooth_b), step_s)
+    coarse_s = _coarse(grid_a, smooth_a, grid_b, smooth_b, step_s)
     offset_s, sigma_s = _refined(grid_a, smooth_a, spline_b, coarse_s)
     if abs(offset_s - coarse_s) > 0.1 or sigma_s > MAX_SIGMA_S:
         raise DegenerateMotionError(
@@ -168,10 +168,9 @@ def low_passed(
 
 
 def _coarse(
-    grid_a: np.ndarray, a: np.ndarray, stream_b: tuple[np.ndarray, np.ndarray], step_s: float
+    grid_a: np.ndarray, a: np.ndarray, grid_b: np.ndarray, b: np.ndarray, step_s: float
 ) -> float:
     """The offset of highest correlation on the grid, if it is the only high one."""
-    grid_b, b = stream_b
     num = round(MAX_OFFSET_S / step_s)
     offsets = step_s * np.arange(-num, num + 1)
     scores = np.array([_correlation(grid_a, a, grid_b + offset, b) for offset in offsets])
@@ -243,8 +242,7 @@ def _onsets(t_s: np.ndarray, pressure_kpa: np.ndarray) -> tuple[list[float], flo
     touching = pressure_kpa > TOUCH_KPA
     starts = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
     onsets: list[float] = []
-    for start in starts.tolist():
-        onset = float(t_s[start] + t_s[start - 1]) / 2
+    for onset in ((t_s[starts] + t_s[starts - 1]) / 2).tolist():
         if not onsets or onset - onsets[-1] >= MIN_REST_S:
             onsets.append(onset)
     return onsets, float(np.median(np.diff(t_s)))
