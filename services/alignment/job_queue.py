@@ -7,7 +7,7 @@ import asyncio
 import sqlite3
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -221,11 +221,11 @@ class JobQueue:
 
 def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
     database = JobDatabase(folder)
-    with ExitStack() as opened:
-        opened.callback(database.close)
-        jobs = database.load()
-        opened.pop_all()
-    return database, jobs
+    try:
+        return database, database.load()
+    except StorageError:
+        database.close()
+        raise
 
 
 class JobDatabase:
@@ -247,11 +247,13 @@ class JobDatabase:
         with disk_errors(f"open the jobs in {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             self._check_emptied()
-        with ExitStack() as opened, self._errors("open"):
+        with self._errors("open"):
             self._connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
-            opened.callback(self._connection.close)
-            self._prepare(self._connection.execute)
-            opened.pop_all()
+            try:
+                self._prepare(self._connection.execute)
+            except (sqlite3.Error, StorageError):
+                self._connection.close()
+                raise
 
     def _check_emptied(self) -> None:
         """Refuse a file that was cut to nothing beside its log, which SQLite would delete."""
@@ -340,8 +342,9 @@ class JobDatabase:
                     "stop it, or give this one a --jobs-folder of its own"
                 ) from error
             if code == sqlite3.SQLITE_FULL:
-                told = f"{what}: no space left; free space and try again"
-                raise StorageFullError(told) from error
+                raise StorageFullError(
+                    f"{what}: no space left; free space and try again"
+                ) from error
             if code in DAMAGED:
                 raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
             raise StorageError(f"{what}: {error}; {MOVE_AWAY}") from error

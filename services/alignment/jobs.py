@@ -129,8 +129,8 @@ def check_recordings(
 
 def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
     """The id of the episode that a recording becomes under these options."""
-    mine = options.of_task(recording.attributes.task).model_dump_json()
-    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {mine}"
+    used = options.of_task(recording.attributes.task).model_dump_json()
+    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {used}"
     digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
     return f"{recording.attributes.recording_id[:MAX_STEM]}-{digest}"
 

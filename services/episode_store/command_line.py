@@ -208,17 +208,17 @@ def list_items(context: Context) -> Outcome:
 def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str, Any], int]:
     """List matching items of a kind; returns them and the number of all."""
     options = context.options
-    wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
+    query = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
     if kind == "episode":
-        episodes = catalog.episodes(wanted, limit=sys.maxsize)
+        episodes = catalog.episodes(query, limit=sys.maxsize)
         for row in episodes.episodes:
-            told = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
-            say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {told}")
+            facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
+            say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
         return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
-    recordings = catalog.recordings(wanted, limit=sys.maxsize)
+    recordings = catalog.recordings(query, limit=sys.maxsize)
     for each in recordings.recordings:
-        told = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
-        say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {told}")
+        facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
+        say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
     return json_ready(recordings), catalog.recordings(limit=1).num_matching
 
 
@@ -432,7 +432,7 @@ def _delete_all_of(context: Context) -> Outcome:
     request = DeletionRequest(
         operator=options.operator, recording=options.recording, derived=derived
     )
-    asked = options.operator or options.recording
+    name = options.operator or options.recording
     victims = plan_deletion(root, request)
     for victim in victims:
         say(f"{victim.place}/{victim.folder}  {victim.reason}")
@@ -440,7 +440,7 @@ def _delete_all_of(context: Context) -> Outcome:
     for facts in reviews_by(root, request):
         if (facts.place, facts.folder.name) not in gone:
             say(f"{facts.place}/{facts.folder.name}  review: loses its reviewer's name")
-    if not options.yes and _answer(f"Type {asked} to delete all of this permanently: ") != asked:
+    if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     unsent = options.unsent and options.operator is not None

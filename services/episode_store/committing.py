@@ -80,8 +80,8 @@ def commit_spool(
                 if name in announced:
                     digest.add(batch)
             if name in announced:
-                one = {name: announced[name]}
-                check_content(attributes.recording_id, {name: digest.content()}, one)
+                got = {name: digest.content()}
+                check_content(attributes.recording_id, got, {name: announced[name]})
     return {name: reader.num_samples(name) for name in reader.streams}
 
 

@@ -74,12 +74,12 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
 
     @router.post("/check", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
-    def check(wanted: Checked, sender: Writer) -> CheckedTakes:
+    def check(body: Checked, sender: Writer) -> CheckedTakes:
         """Which of these takes were deleted, and which operators."""
-        sender.check_station(wanted.station)
+        sender.check_station(body.station)
         # Before the takes, so that a deletion in between is found by the next check.
         revision = records.revision
-        found = ((take, _deletion_of(records, wanted.station, take)) for take in wanted.takes)
+        found = ((take, _deletion_of(records, body.station, take)) for take in body.takes)
         return CheckedTakes(
             revision=revision,
             takes=tuple(
@@ -87,7 +87,7 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
                 for take, key in found
                 if key is not None
             ),
-            operators=tuple(name for name in wanted.operators if records.has_operator(name)),
+            operators=tuple(name for name in body.operators if records.has_operator(name)),
         )
 
     @router.post("/confirm", dependencies=[MAY_WRITE])

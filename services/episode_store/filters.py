@@ -167,8 +167,8 @@ class ItemFilter(CatalogFilter):
             flagged = self.flagged
             checks.append(lambda entry: bool(entry.item.findings) == flagged)
         if self.id:
-            wanted = frozenset(self.id)
-            checks.append(lambda entry: entry.item.id in wanted)
+            ids = frozenset(self.id)
+            checks.append(lambda entry: entry.item.id in ids)
         return checks
 
 

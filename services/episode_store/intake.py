@@ -218,58 +218,33 @@ class StorageLimits:
 
 
 class UploadMetrics:
-    """Prometheus metrics of uploads."""
+    """Prometheus metrics of a store, in a `registry`: uploads, and what the limits measure.
 
-    def __init__(self) -> None:
-        self.batches = Counter(
-            "dextouch_store_batches",
-            "Acknowledged batches; replayed ones were stored before.",
-            ("replayed",),
-            registry=None,
-        )
-        self.bytes = Counter(
-            "dextouch_store_batch_bytes", "Bytes of acknowledged new batches.", registry=None
-        )
-        self.ack_seconds = Histogram(
-            "dextouch_store_ack_seconds",
-            "Time from admission of a batch to its acknowledgement.",
-            buckets=SECONDS,
-            registry=None,
-        )
-        self.finish_seconds = Histogram(
-            "dextouch_store_finish_seconds",
-            "Time from the request to finish an upload to the committed recording.",
-            buckets=SECONDS,
-            registry=None,
-        )
-        self.refused = Counter(
-            "dextouch_store_refused",
-            "Refused upload requests by the exhausted resource.",
-            ("reason",),
-            registry=None,
-        )
+    Args:
+        limits: of the store's disk.
+        num_items: how many recordings and episodes are stored, by kind.
+    """
 
-    def register(
-        self,
-        registry: CollectorRegistry,
-        limits: StorageLimits,
-        num_items: Mapping[str, Callable[[], int]],
-    ) -> None:
-        """Add the metrics to a registry, with what the limits measure.
-
-        Args:
-            registry: of the service.
-            limits: of the store's disk.
-            num_items: how many recordings and episodes are stored, by kind.
-        """
+    def __init__(self, limits: StorageLimits, num_items: Mapping[str, Callable[[], int]]) -> None:
+        registry = self.registry = CollectorRegistry()
+        text = "Acknowledged batches; replayed ones were stored before."
+        self.batches = Counter("dextouch_store_batches", text, ("replayed",), registry=registry)
+        text = "Bytes of acknowledged new batches."
+        self.bytes = Counter("dextouch_store_batch_bytes", text, registry=registry)
+        text = "Refused upload requests by the exhausted resource."
+        self.refused = Counter("dextouch_store_refused", text, ("reason",), registry=registry)
+        self.ack_seconds, self.finish_seconds = (
+            Histogram(f"dextouch_store_{name}_seconds", text, buckets=SECONDS, registry=registry)
+            for name, text in (
+                ("ack", "Time from admission of a batch to its acknowledgement."),
+                ("finish", "Time from the request to finish an upload to the committed recording."),
+            )
+        )
         # A rate needs a first value to grow from.
         for reason in REFUSAL_REASONS:
             self.refused.labels(reason)
         for replayed in ("true", "false"):
             self.batches.labels(replayed)
-        counts = (self.batches, self.bytes, self.refused)
-        for metric in (*counts, self.ack_seconds, self.finish_seconds):
-            registry.register(metric)
         for name, text, measure in (
             ("open_uploads", "Unfinished uploads.", lambda: limits.num_open),
             ("free_bytes", "Free bytes on the store's disk.", limits.free_bytes),

@@ -371,11 +371,11 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
 
     @router.post("", status_code=201)
     def issue(
-        wanted: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
+        body: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
     ) -> EnrolmentToken:
         """Issue a one-time token for a station, valid for 15 minutes."""
         response.headers["cache-control"] = "no-store"
-        return enrolments.issue(wanted.station, by=by)
+        return enrolments.issue(body.station, by=by)
 
     @router.post("/exchange", status_code=201)
     @takes({JSON: KIB}, needs_key=False)

@@ -13,8 +13,9 @@ def seconds_of(text: str) -> float:
     """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds, for argparse."""
     factor = _UNITS.get(text[-1:])
     if factor is None or not text[:-1].isdecimal():
-        told = f"got {text!r}, expected a number and one of s m h d, such as 30d"
-        raise argparse.ArgumentTypeError(told)
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a number and one of s m h d, such as 30d"
+        )
     return int(text[:-1]) * factor
 
 

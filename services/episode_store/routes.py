@@ -157,11 +157,11 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
         return limits.idle(idle_s=idle_s)
 
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
-    def expire(wanted: ExpireUploads) -> UploadList:
+    def expire(body: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
         gone = []
-        for upload in limits.idle(idle_s=wanted.idle_s).uploads:
-            if ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
+        for upload in limits.idle(idle_s=body.idle_s).uploads:
+            if ingest.expire(upload.recording_id, idle_s=body.idle_s):
                 limits.end(upload.recording_id)
                 gone.append(upload)
         return UploadList(uploads=tuple(gone))
@@ -187,29 +187,29 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings", tags=["recordings"])
-    def recordings(wanted: Annotated[RecordingQuery, Query()]) -> RecordingList:
+    def recordings(query: Annotated[RecordingQuery, Query()]) -> RecordingList:
         """List finished recordings that match all filters."""
-        return catalog.recordings(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.recordings(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/episodes", tags=["episodes"])
-    def episodes(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
+    def episodes(query: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
         """List episodes that match all filters."""
-        return catalog.episodes(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.episodes(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/hours", tags=["catalog"])
-    def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
+    def hours(query: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
-        return catalog.hours(wanted)
+        return catalog.hours(query)
 
     @router.get("/catalog/hours/{field}", tags=["catalog"])
-    def hours_by(field: HoursField, wanted: Annotated[HoursFilter, Query()]) -> HoursByField:
+    def hours_by(field: HoursField, query: Annotated[HoursFilter, Query()]) -> HoursByField:
         """Hours of the matching episodes by the values of one field, and by their reviews."""
-        return catalog.hours_by(field, wanted)
+        return catalog.hours_by(field, query)
 
     @router.get("/catalog/items", tags=["catalog"])
-    def items(wanted: Annotated[ItemQuery, Query()]) -> CatalogItems:
+    def items(query: Annotated[ItemQuery, Query()]) -> CatalogItems:
         """List recordings and episodes in one list; both as takes by default."""
-        return catalog.items(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.items(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/groups", tags=["catalog"])
     def groups() -> ComparedGroups:
@@ -235,18 +235,18 @@ def reviews_router(catalog: Catalog) -> APIRouter:
 
     @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+    def review(body: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
         """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
         review = None
-        if wanted.verdict is not None:
+        if body.verdict is not None:
             review = Review(
-                verdict=wanted.verdict,
-                reason=wanted.reason,
-                reviewer=wanted.reviewer,
+                verdict=body.verdict,
+                reason=body.reason,
+                reviewer=body.reviewer,
                 reviewed_at=datetime.now(UTC),
             )
-        reviewed, refused = _each(wanted.items, lambda item: catalog.review(item, review))
-        logger.info("items_reviewed", verdict=wanted.verdict, ids=[item.id for item in reviewed])
+        reviewed, refused = _each(body.items, lambda item: catalog.review(item, review))
+        logger.info("items_reviewed", verdict=body.verdict, ids=[item.id for item in reviewed])
         return ReviewedItems(reviewed=reviewed, refused=refused)
 
     return router
@@ -275,22 +275,22 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
         return TrashContents(items=tuple(items), num_items=len(entries))
 
     @router.post("", dependencies=[MAY_DELETE])
-    def delete(wanted: MoveItems) -> MovedItems:
+    def delete(body: MoveItems) -> MovedItems:
         """Move items to the trash; refused for a store in a bucket, which has none."""
         store.require_trash()
-        return _move(wanted, lambda item: store.delete(item.id, kind=item.kind))
+        return _move(body, lambda item: store.delete(item.id, kind=item.kind))
 
     @router.post("/restore", dependencies=[MAY_DELETE])
-    def restore(wanted: MoveItems) -> MovedItems:
+    def restore(body: MoveItems) -> MovedItems:
         """Restore items from the trash, each the one that was deleted last."""
         store.require_trash()
-        return _move(wanted, lambda item: store.restore(item.id, kind=item.kind))
+        return _move(body, lambda item: store.restore(item.id, kind=item.kind))
 
     return router
 
 
-def _move(wanted: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
-    moved, refused = _each(wanted.items, move)
+def _move(body: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
+    moved, refused = _each(body.items, move)
     logger.info("items_moved", moved=[item.id for item in moved], num_refused=len(refused))
     return MovedItems(moved=moved, refused=refused)
 

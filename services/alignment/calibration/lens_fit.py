@@ -112,10 +112,12 @@ def fit_lens(
         ]
         camera = _calibrated(bent, pixels, size_px, camera)
         design = _design(bent, pixels, bends, camera, size_px)
-    return _judged(camera, design, np.concatenate(bends) @ bend, [len(one) for one in points])
+    return _with_statistics(
+        camera, design, np.concatenate(bends) @ bend, [len(one) for one in points]
+    )
 
 
-def _judged(
+def _with_statistics(
     camera: _Camera, design: _Design, heights_m: np.ndarray, num_corners: list[int]
 ) -> LensFit:
     """The fit with its covariance and the structure of its residuals."""

@@ -115,16 +115,16 @@ def time_stream(
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
-    """Reasons to doubt the times, if any."""
+    """Reasons why the times may be wrong, if any."""
     skew_limit_ppm, lateness_limit_ns = MAX_RATE_ERROR_PPM, max(period_ns, MIN_LATENESS_NS)
     if dated.method == "device":
         skew_limit_ppm, lateness_limit_ns = MAX_SKEW_PPM, MAX_STAMPED_LATENESS_NS
-    doubts: dict[ClockWarning, bool] = {
+    warnings: dict[ClockWarning, bool] = {
         "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
         "residual": dated.lateness_ns > lateness_limit_ns,
         "stop": dated.has_unsure_stops,
     }
-    return tuple(name for name, is_so in doubts.items() if is_so)
+    return tuple(name for name, is_so in warnings.items() if is_so)
 
 
 def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:

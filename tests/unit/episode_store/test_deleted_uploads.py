@@ -8,8 +8,8 @@ from dextouch.episodes.care import DeletionRecords, DeletionRequest, delete_for_
 from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch
-from services.episode_store import background
-from services.episode_store.background import DeletionWatch
+from services.episode_store import app
+from services.episode_store.app import DeletionWatch
 from services.episode_store.committing import commit_spool
 from services.episode_store.ingest import Ingest
 from tests.unit.episode_store.conftest import GLOVE, glove_batch
@@ -98,7 +98,7 @@ def test_other_uploads_go_on(store, settings, attributes, delete):
 
 def test_a_problem_that_comes_back_is_logged_again(store, monkeypatch):
     """The same failure twice in a row is one warning; after a look that succeeded it is another."""
-    monkeypatch.setattr(background, "WATCH_PERIOD_S", 0.0)
+    monkeypatch.setattr(app, "WATCH_PERIOD_S", 0.0)
     records = DeletionRecords(store.root)
     watch = DeletionWatch(records, list, lambda _: None)
     looks = iter(["full", "full", None, "full"])

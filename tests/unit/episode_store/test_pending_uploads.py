@@ -7,8 +7,7 @@ from fastapi.testclient import TestClient
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError, UnavailableError
-from services.episode_store.app import create_app
-from services.episode_store.background import PendingUploads
+from services.episode_store.app import PendingUploads, create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
