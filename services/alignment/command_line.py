@@ -237,7 +237,7 @@ def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[st
         try:
             if not store.exists(check_recording(store, recording_id, options)):
                 wanted.append(recording_id)
-        except InvalidInputError as error:
+        except DexTouchError as error:
             refused.append((recording_id, error))
     return wanted, refused
 

@@ -16,7 +16,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
-from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary
+from dextouch.schemas import BatchReceipt, RecordingAttributes, UploadList, UploadSummary
 from services.episode_store.ingest import idle_seconds, upload_folders
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -254,6 +254,13 @@ class UploadMetrics:
         items = Gauge("dextouch_store_items", text, ("kind",), registry=registry)
         for kind, count in num_items.items():
             items.labels(kind).set_function(count)
+
+    def count(self, receipt: BatchReceipt, *, num_bytes: int, took_s: float) -> None:
+        """Count a batch of so many bytes that was acknowledged in `took_s` after its admission."""
+        self.ack_seconds.observe(took_s)
+        self.batches.labels(str(receipt.replayed).lower()).inc()
+        if not receipt.replayed:
+            self.bytes.inc(num_bytes)
 
     @contextmanager
     def counting_refusals(self) -> Iterator[None]:

@@ -100,8 +100,9 @@ def uploads_router(
         sender: Writer,
     ) -> BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
+        announced = request.headers.get("content-length", "")
         # A body of unknown length may be as large as the largest batch.
-        num_bytes = int(request.headers.get("content-length", MAX_BATCH_BYTES))
+        num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
         with ExitStack() as admitted:
             # A refused body is not read.
             with metrics.counting_refusals():
@@ -120,10 +121,8 @@ def uploads_router(
                 partial(ingest.put_batch, recording_id, stream, number, data, sender),
                 limiter=admission.threads,
             )
-        metrics.ack_seconds.observe(time.perf_counter() - started)
-        metrics.batches.labels(str(receipt.replayed).lower()).inc()
+        metrics.count(receipt, num_bytes=len(data), took_s=time.perf_counter() - started)
         if not receipt.replayed:
-            metrics.bytes.inc(len(data))
             limits.add(recording_id, len(data))
         return receipt
 

@@ -188,7 +188,7 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])
-    first_ns = int(a.t_ns[0])
+    first_ns = a.t_ns[:1]
     t_a, mine = checked_signal("times: stream a", a.t_ns, a.velocity_rad_s, first_ns)
     t_b, other = checked_signal("times: stream b", b.t_ns, b.velocity_rad_s, first_ns)
     step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
