@@ -243,10 +243,9 @@ def _design(
         Q, _ = np.linalg.qr(J[:, :6])
         rows.append(columns - Q @ (Q.T @ columns))
     stacked = np.concatenate(rows)
-    ends = (10, 13, stacked.shape[1] - NUM_DRIFTING)
-    return _Design(
-        stacked[:, 0], stacked[:, 1:10], *np.split(stacked[:, 10:], [3, ends[2] - 10], axis=1)
-    )
+    ends = [1, 10, 13, stacked.shape[1] - NUM_DRIFTING]
+    residuals, *others = np.split(stacked, ends, axis=1)
+    return _Design(residuals[:, 0], *others)
 
 
 def _fields(places: np.ndarray) -> np.ndarray:
