@@ -31,8 +31,7 @@ from benchmarks.stages import Bar
 from dextouch.errors import LimitExceededError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import Side
-from services.alignment.retargeting.hand_profile import robot_bone_m
-from services.alignment.retargeting.hand_retargeter import warm_up
+from services.alignment.retargeting.hand_retargeter import robot_bone_m, warm_up
 
 SIDES: tuple[Side, Side] = ("left", "right")
 NATURAL, FULL = "natural range", "full range"

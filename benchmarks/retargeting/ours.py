@@ -8,8 +8,7 @@ from jaxtyping import Float64
 
 from benchmarks.simulated.hand_motions import Motion, cold_postures, motion_of, robot_motion
 from services.alignment.retargeting import RetargetOptions
-from services.alignment.retargeting.hand_profile import HandProfile
-from services.alignment.retargeting.hand_retargeter import HandRetargeter
+from services.alignment.retargeting.hand_retargeter import HandProfile, HandRetargeter
 from services.twin.hands import twin_hand
 
 OURS = "ours"

@@ -274,19 +274,19 @@ def marker_sheet(objects: SceneObjects) -> str:
     Raises:
         InvalidInputError: there is no marker, or one is larger than the page.
     """
-    wanted = {
+    printed = {
         (one.name, marker.id, marker.size_m): marker
         for listed in objects.tasks.values()
         for one in listed
         for marker in one.markers
     }
-    if not wanted:
+    if not printed:
         raise InvalidInputError("markers: the objects have none to print")
     cells = cells_of_markers(objects)
-    places, height_mm = _places([marker.size_m for marker in wanted.values()])
+    places, height_mm = _places([marker.size_m for marker in printed.values()])
     drawn = [
         part
-        for ((name, *_), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
+        for ((name, *_), marker), (x_mm, y_mm) in zip(printed.items(), places, strict=True)
         for part in _marker(name, marker, x_mm, y_mm, cells[marker.id])
     ]
     width_mm = PAGE_MM[0]

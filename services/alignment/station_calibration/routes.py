@@ -13,7 +13,7 @@ from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
 from dextouch.serving import RequireScope
-from services.alignment.retargeting.hand_profile import profile_name
+from services.alignment.retargeting.hand_retargeter import profile_name
 from services.alignment.station_calibration.judgement import Finding, entry_of, judge
 from services.alignment.station_calibration.record import (
     DETAILS_FILE,

@@ -53,6 +53,11 @@ from services.alignment.synchronization.resampling import (
 
 # Samples without which a stream is as if it were not there.
 MIN_USABLE = 2
+# What an episode takes over from its recording.
+SHARED_ATTRIBUTES = (
+    *("task", "instruction", "domain", "station", "operator", "trace_id"),
+    *("success", "recovered", "complete", "incomplete_cause"),
+)
 
 
 @dataclass(frozen=True)
@@ -216,10 +221,8 @@ def _find_stretch(
     if np.count_nonzero(gridded.valid[first:stop]) < options.min_num_steps:
         bad = {name: int((~mine).sum()) for name, mine in valid.items()}
         worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
-        latest, earliest = (
-            max(first_ns, key=first_ns.__getitem__),
-            min(last_ns, key=last_ns.__getitem__),
-        )
+        latest = max(first_ns, key=first_ns.__getitem__)
+        earliest = min(last_ns, key=last_ns.__getitem__)
         worst += f"; {latest} begins last and {earliest} ends first"
         raise InvalidInputError(
             f"{where}: the longest stretch without a gap has {stop - first} of {num_steps} steps, "
@@ -253,20 +256,12 @@ def _episode_attributes(
     source = recording.attributes
     origin = LineageEntry(kind="recording", id=source.recording_id, sha256=recording.content_sha256)
     return EpisodeAttributes(
+        **{name: getattr(source, name) for name in SHARED_ATTRIBUTES},
         episode_id=episode_id,
-        task=source.task,
-        instruction=source.instruction,
-        domain=source.domain,
         origin="recorded",
-        station=source.station,
-        operator=source.operator,
         anchor=StoredAnchor.from_poses(actions.anchor),
         K_head=source.calibration.get("K_head"),
         absent=actions.absent,
-        success=source.success,
-        recovered=source.recovered,
-        complete=source.complete,
-        incomplete_cause=source.incomplete_cause,
         lineage=(*source.lineage, origin),
         calibration=source.calibration
         | {name: rows for stream in streams.values() for name, rows in stream.calibration.items()},
@@ -274,7 +269,6 @@ def _episode_attributes(
         # What the station measured, too; of two figures with one name the aligned one counts.
         quality=source.quality | quality,
         created_at=source.started_at,
-        trace_id=source.trace_id,
     )
 
 

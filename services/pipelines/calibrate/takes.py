@@ -19,7 +19,7 @@ from services.alignment.calibration.time_offset import (
     estimate_tap_offset,
     estimate_time_offset,
 )
-from services.alignment.retargeting.hand_profile import profile_name
+from services.alignment.retargeting.hand_retargeter import profile_name
 from services.alignment.retargeting.wrist_frame import (
     calibrate_wrist,
     calibration_name,

@@ -9,7 +9,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, NODE_INDEX, chain_indices, mean_hand_m
 from services.alignment.retargeting import HandProfile, HandRetargeter
-from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
+from services.alignment.retargeting.hand_retargeter import calibrated_profile, profile_name
 
 NOISE_M = 1e-3
 

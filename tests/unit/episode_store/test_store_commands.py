@@ -15,7 +15,7 @@ from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttribute
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.cli.main import main
 from services.episode_store import command_line
-from services.episode_store.commands import readable_size, table
+from services.episode_store.command_line import readable_size, table
 from services.episode_store.parser import seconds_of
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
