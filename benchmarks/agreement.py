@@ -13,9 +13,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
 from benchmarks.stages import Amounts, Bar
 from services.evaluation.agreement import CORRELATIONS, FIGURES, figures_of_draws
 from services.evaluation.statistics import (

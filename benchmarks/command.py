@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.chart import draw
-from benchmarks.machine import refuse_shape_checks
-from benchmarks.report import StageReport, show, to_markdown
+from benchmarks.report import StageReport, refuse_shape_checks, show, to_markdown
 from benchmarks.stages import STAGES, load_stage
 from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.errors import UnknownNameError

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.figures import Figure, Requirement, at_least
+from benchmarks.figures import Figure, Requirement, at_least, every_round, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data

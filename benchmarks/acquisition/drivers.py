@@ -7,9 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.acquisition.families import make_families
-from benchmarks.figures import Figure
-from benchmarks.rounds import every_round, interleaved
+from benchmarks.acquisition.decoders import make_families
+from benchmarks.figures import Figure, every_round, interleaved
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera import CameraDecoder, camera_descriptor

@@ -1,22 +1,115 @@
-"""Comparison of hand-eye methods on the same scenes: time and errors, in turns."""
+"""Hand-eye methods compared on the same scenes, degenerate ones too, and calibrated cameras."""
 
 import gc
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
-from benchmarks.calibration.rivals import METHODS, Method
-from benchmarks.figures import Figure
-from benchmarks.rounds import interleaved
-from benchmarks.simulated.board_scenes import Scene, mount_difference
+from benchmarks.figures import Figure, interleaved
+from benchmarks.simulated.board_scenes import (
+    DISTORTION,
+    TURN_AXES,
+    K,
+    Motion,
+    Scene,
+    make_scene,
+    mount_difference,
+    simulated_boards,
+)
 from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError
-from dextouch.geometry import invert
-from services.alignment.calibration.motion import twist
+from dextouch.errors import DegenerateRotationError, InvalidInputError
+from dextouch.geometry import invert, transform
+from services.alignment.calibration.hand_eye import HandEyeNoise, solve_hand_eye
+from services.alignment.calibration.intrinsics import FoundBoards, calibrate_found
+from services.alignment.calibration.motion import DegenerateMotionError, park, twist
+
+OURS = "ours"
+OURS_POSES = "ours, poses only"
+# Its rivals rely on the size of the board that was entered.
+OURS_SIZE_KNOWN = "ours, size within 0.2 %"
+PARK = "park"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A mount, with the covariance of its twist where available."""
+
+    T_tracker_camera: Float64[np.ndarray, "4 4"]
+    covariance: Float64[np.ndarray, "6 6"] | None = None
+
+
+class Method(NamedTuple):
+    """A method that estimates the mount of a scene.
+
+    `solve` raises InvalidInputError: the method refuses the scene, or returns no finite mount.
+    """
+
+    name: str
+    solve: Callable[[Scene], Answer]
+
+
+def _ours(scene: Scene, *, with_corners: bool, noise: HandEyeNoise | None = None) -> Answer:
+    """Our weighted bundle adjustment, with the corners or with the board's poses alone."""
+    views = scene.views if with_corners else None
+    result = solve_hand_eye(scene.Ts_world_tracker, scene.Ts_camera_board, views=views, noise=noise)
+    return Answer(result.T_tracker_camera, result.covariance)
+
+
+def _opencv_hand_eye(scene: Scene, *, name: str) -> Answer:
+    """`cv2.calibrateHandEye` with one of its methods."""
+    tracker, board = scene.Ts_world_tracker, scene.Ts_camera_board
+    return Answer(_opencv("calibrateHandEye", "CALIB_HAND_EYE", name, tracker, board))
+
+
+def _opencv_robot_world(scene: Scene, *, name: str) -> Answer:
+    """`cv2.calibrateRobotWorldHandEye` with one of its methods, which finds the board, too."""
+    board, tracker = scene.Ts_camera_board, invert(scene.Ts_world_tracker)
+    solver, prefix = "calibrateRobotWorldHandEye", "CALIB_ROBOT_WORLD_HAND_EYE"
+    return Answer(invert(_opencv(solver, prefix, name, board, tracker)))
+
+
+METHODS = (
+    Method(OURS, partial(_ours, with_corners=True)),
+    Method(OURS_POSES, partial(_ours, with_corners=False)),
+    Method(
+        OURS_SIZE_KNOWN, partial(_ours, with_corners=True, noise=HandEyeNoise(board_scale=2e-3))
+    ),
+    # The solution that initializes our bundle adjustment.
+    Method(
+        "our closed form",
+        lambda scene: Answer(park(scene.Ts_world_tracker, scene.Ts_camera_board)),
+    ),
+    *(
+        Method(name, partial(_opencv_hand_eye, name=name))
+        for name in ("tsai", PARK, "horaud", "andreff", "daniilidis")
+    ),
+    *(Method(name, partial(_opencv_robot_world, name=name)) for name in ("shah", "li")),
+)
+
+
+def _opencv(
+    solver: str, prefix: str, name: str, first: np.ndarray, second: np.ndarray
+) -> Float64[np.ndarray, "4 4"]:
+    """The last transform that a solver of OpenCV gives for two series of poses."""
+    import cv2
+
+    # Failures are in the table.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    poses = [list(part) for Ts in (first, second) for part in (Ts[:, :3, :3], Ts[:, :3, 3])]
+    try:
+        # By keyword: the fifth positional argument is an output, not the method.
+        *_, R, t = getattr(cv2, solver)(*poses, method=getattr(cv2, f"{prefix}_{name.upper()}"))
+    except cv2.error as error:
+        raise InvalidInputError(f"{name}: OpenCV gives up ({error})") from error
+    T = transform(np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel())
+    if not np.isfinite(T).all():
+        raise DegenerateRotationError(f"{name}: OpenCV returns NaN without an error")
+    return T
 
 
 class Solved(NamedTuple):
@@ -118,3 +211,173 @@ def not_worse_share(
 
 
 Results = Mapping[str, MethodResult]
+
+
+Maker = Callable[[int], Scene]
+RIVALS = ("tsai", "park", "daniilidis", "li")
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """One kind of scene, and how ours and the other methods treat it.
+
+    Of `num_refused` refusals by ours, `num_named` name axes to add, and `cause` is the message of
+    the first; `rivals` has the median errors of the other methods, or that they refuse or return
+    NaN.
+    """
+
+    name: str
+    is_healthy: bool
+    num_seeds: int
+    num_refused: int
+    num_named: int
+    cause: str
+    rivals: dict[str, str]
+
+
+def scene_makers() -> dict[str, tuple[Maker, bool]]:
+    """Kind of scene → factory by seed, and whether it is healthy."""
+    makers: dict[str, tuple[Maker, bool]] = {"healthy": (make_scene, True)}
+    for axis, axes in TURN_AXES.items():
+        make = partial(make_scene, motion=Motion(tilt_deg=40.0, axes=axes))
+        makers[f"turns about the camera's {axis} only"] = (make, False)
+    small, none = (partial(make_scene, motion=Motion(tilt_deg=tilt)) for tilt in (4.0, 0.0))
+    makers["turns of 4 degrees at most"] = (small, False)
+    makers["no turns"] = (none, False)
+    makers["one view, repeated"] = (_repeating(1), False)
+    makers["two views, repeated"] = (_repeating(2), False)
+    return makers
+
+
+def try_scenes(num_seeds: int, num_healthy: int, bar: Bar) -> list[SceneResult]:
+    """Try every kind of scene, with seeds not used elsewhere in the stage."""
+    makers = scene_makers()
+    ours = next(method for method in METHODS if method.name == OURS)
+    results = []
+    with bar("refusals", len(makers)) as step:
+        for name, (make, is_healthy) in makers.items():
+            step(name)
+            num = num_healthy if is_healthy else num_seeds
+            scenes = [make(10_000 + seed) for seed in range(num)]
+            results.append(_try(name, scenes, ours, is_healthy=is_healthy))
+    return results
+
+
+def _try(name: str, scenes: list[Scene], ours: Method, *, is_healthy: bool) -> SceneResult:
+    causes: list[InvalidInputError] = []
+    for scene in scenes:
+        try:
+            ours.solve(scene)
+        except InvalidInputError as refusal:
+            causes.append(refusal)
+    named = [
+        cause
+        for cause in causes
+        if isinstance(cause, DegenerateMotionError) and cause.details["missing_axes"]
+    ]
+    return SceneResult(
+        name,
+        is_healthy,
+        len(scenes),
+        num_refused=len(causes),
+        num_named=len(named),
+        cause=causes[0].message if causes else "",
+        rivals={m.name: _what_it_does(m, scenes) for m in METHODS if m.name in RIVALS},
+    )
+
+
+def _what_it_does(method: Method, scenes: list[Scene]) -> str:
+    """Median error of a method, and how often it gives no result."""
+    solved = []
+    for scene in scenes:
+        try:
+            solved.append(score(method, scene))
+        except InvalidInputError:
+            continue
+    silent = len(scenes) - len(solved)
+    told = f"no answer in {silent} of {len(scenes)}" if silent else ""
+    if not solved:
+        return told
+    degrees = np.median([one.error_deg for one in solved])
+    millimetres = np.median([one.error_mm for one in solved])
+    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {told}" if told else "")
+
+
+def _repeating(num_views: int) -> Maker:
+    return lambda seed: make_scene(seed, Motion(num_views=4)).repeated(
+        [index % num_views for index in range(20)]
+    )
+
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+# Below this number of cameras the spread is too uncertain to compare.
+MIN_SEEDS = 10
+
+
+@dataclass(frozen=True)
+class CameraResult:
+    """Cameras calibrated from `num_views` views, in the order of the seeds.
+
+    `focal_error` is |df| / f, `centre_px` the distance of the principal point, `rms_px` the
+    residual, which is no measure of accuracy, `coverage` the share of the image that corners cover,
+    `ms` processor time of this thread. `sigma_over_spread` is, by parameter, the reported sigma
+    (RMS over the seeds) over the spread of the errors; ideally 1, empty for few seeds.
+    """
+
+    num_views: int
+    focal_error: Figure
+    centre_px: Figure
+    rms_px: Figure
+    coverage: Figure
+    ms: Figure
+    sigma_over_spread: dict[str, float]
+
+
+def measure_cameras(counts: tuple[int, ...], num_seeds: int, bar: Bar) -> list[CameraResult]:
+    """Cameras from each number of views, for each seed."""
+    with bar("intrinsics", len(counts) * num_seeds) as step:
+        results = []
+        for num_views in counts:
+            rows = []
+            for seed in range(num_seeds):
+                step(f"{num_views} views")
+                rows.append(_calibrate(simulated_boards(20_000 + seed, num_views)))
+            results.append(_result(num_views, np.array(rows)))
+        return results
+
+
+def _calibrate(boards: FoundBoards) -> Float64[np.ndarray, "21"]:
+    """Errors (9), sigmas (9), residual, coverage, time."""
+    begun_s = time.thread_time()
+    found = calibrate_found(boards)
+    ms = (time.thread_time() - begun_s) * 1e3
+    place = [0, 1, 0, 1], [0, 1, 2, 2]
+    return np.array(
+        [
+            *(found.K[place] - K[place]),
+            *(found.distortion - DISTORTION),
+            *found.sigma_fxfycxcy_px,
+            *found.sigma_distortion,
+            found.rms_px,
+            found.coverage,
+            ms,
+        ]
+    )
+
+
+def _result(num_views: int, rows: np.ndarray) -> CameraResult:
+    errors, sigmas = rows[:, :9], rows[:, 9:18]
+    ratios: dict[str, float] = {}
+    if len(rows) >= MIN_SEEDS:
+        shares = np.sqrt(np.square(sigmas).mean(axis=0)) / errors.std(axis=0)
+        ratios = dict(zip(NAMES, (float(share) for share in shares), strict=True))
+    focal = np.abs(errors[:, :2] / K[[0, 1], [0, 1]]).max(axis=1)
+    return CameraResult(
+        num_views,
+        focal_error=Figure.of(focal.tolist()),
+        centre_px=Figure.of(np.linalg.norm(errors[:, 2:4], axis=1).tolist()),
+        rms_px=Figure.of(rows[:, 18].tolist()),
+        coverage=Figure.of(rows[:, 19].tolist()),
+        ms=Figure.of(rows[:, 20].tolist()),
+        sigma_over_spread=ratios,
+    )

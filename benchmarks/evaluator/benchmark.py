@@ -11,20 +11,21 @@ from typing import Any, Final
 
 from benchmarks.evaluator.drawn import Line, Rolled
 from benchmarks.evaluator.keeping import KeptRows, Row
-from benchmarks.evaluator.kind_lines import VERDICTS
-from benchmarks.evaluator.kinds import NONE, STRENGTHS, KindsPlan
-from benchmarks.evaluator.lines import TaskFigures
+from benchmarks.evaluator.lines import VERDICTS, TaskFigures
+from benchmarks.evaluator.members import write_single_members
 from benchmarks.evaluator.page import write_page
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
+    NONE,
+    STRENGTHS,
     ClonedPolicy,
+    KindsPlan,
     OutsidePolicy,
     StudyPlan,
     trained_seeds,
 )
 from benchmarks.evaluator.repetition import read_lines, repetition
-from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar

@@ -9,13 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rollouts.crowd import Crowd, crowd
 from benchmarks.rollouts.watcher import listing_s, watched
-from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
+from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Crowd, Way, compared, crowd, opened
 from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
-from benchmarks.rounds import interleaved
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector

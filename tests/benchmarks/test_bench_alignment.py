@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.alignment import benchmark
+from benchmarks.alignment.benchmark import BOUNDS, requirements, tables
 from benchmarks.alignment.compare import (
     CALIBRATION,
     FITS,
@@ -22,7 +23,6 @@ from benchmarks.alignment.compare import (
     MethodResult,
     first_arrivals,
 )
-from benchmarks.alignment.tables import BOUNDS, requirements, tables
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from dextouch.errors import InvalidInputError

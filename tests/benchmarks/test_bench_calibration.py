@@ -13,11 +13,20 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import benchmark
-from benchmarks.calibration.cameras import CameraResult
-from benchmarks.calibration.compare import MethodResult, not_worse_share, score
-from benchmarks.calibration.refusals import SceneResult, scene_makers
-from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
-from benchmarks.calibration.tables import requirements
+from benchmarks.calibration.benchmark import requirements
+from benchmarks.calibration.compare import (
+    METHODS,
+    OURS,
+    OURS_POSES,
+    OURS_SIZE_KNOWN,
+    PARK,
+    CameraResult,
+    MethodResult,
+    SceneResult,
+    not_worse_share,
+    scene_makers,
+    score,
+)
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.simulated.board_scenes import Motion, board_points, make_scene

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clocks import benchmark
-from benchmarks.clocks.rivals import OFFLINE, ONLINE
+from benchmarks.clocks.compare import OFFLINE, ONLINE, score
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
@@ -21,7 +21,6 @@ from benchmarks.clocks.scenes import (
     Scene,
     simulate,
 )
-from benchmarks.clocks.scores import score
 from benchmarks.command import stage_parser
 from benchmarks.stages import named
 from dextouch.errors import InvalidInputError, UnknownNameError

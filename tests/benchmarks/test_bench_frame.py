@@ -11,10 +11,8 @@ import pytest
 from benchmarks import __main__ as entry_point
 from benchmarks import command
 from benchmarks.chart import Panel, Point, draw, linear_ticks, log_ticks
-from benchmarks.figures import Figure, Requirement
-from benchmarks.machine import NOT_INSTALLED, describe_machine
-from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
+from benchmarks.figures import Figure, Requirement, interleaved
+from benchmarks.report import NOT_INSTALLED, ResultTable, StageReport, describe_machine
 from benchmarks.stages import STAGES, StageEntry
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 

@@ -13,23 +13,26 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.retargeting import benchmark, compare, rival_process, rivals
+from benchmarks.retargeting.benchmark import requirements, tables, velocity_limit_deg, worst_ratio
 from benchmarks.retargeting.compare import (
     PINCH_INPUT,
     ROBOT_INPUT,
     Effort,
+    PinchScore,
+    RobotScore,
     Speed,
     compare_robot,
     compare_speed,
+    faulty_motions,
     scale_of,
+    score_robot,
+    try_faults,
 )
 from benchmarks.retargeting.hand_urdf import hand_urdf
 from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import RIVALS
-from benchmarks.retargeting.robustness import faulty_motions, try_faults
-from benchmarks.retargeting.scores import PinchScore, RobotScore, score_robot
-from benchmarks.retargeting.tables import requirements, tables, velocity_limit_deg, worst_ratio
 from benchmarks.simulated.hand_motions import cold_postures, robot_motion
 from dextouch.errors import (
     InvalidInputError,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.retargeting.compare import score_pinches, score_robot
 from benchmarks.retargeting.pinches import (
     BONE_SPREAD,
     PINCHED_M,
@@ -11,14 +12,14 @@ from benchmarks.retargeting.pinches import (
     people,
     pinch_motion,
 )
-from benchmarks.retargeting.scores import score_pinches, score_robot
 from benchmarks.simulated import hand_motions as sequences
-from benchmarks.simulated.finger_contact import segment_distance_m, touching
 from benchmarks.simulated.hand_motions import (
     MAX_SPEED_RAD_S,
     RATE_HZ,
     cold_postures,
     robot_motion,
+    segment_distance_m,
+    touching,
     with_dropouts,
     with_noise,
 )

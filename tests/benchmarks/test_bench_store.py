@@ -17,18 +17,18 @@ import simplejpeg
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.store import benchmark
-from benchmarks.store.compare import DesignResult, expected_window, image_psnr
+from benchmarks.store.benchmark import panels, requirements, rms_levels
+from benchmarks.store.compare import DesignResult, LiveResult, expected_window, image_psnr
 from benchmarks.store.designs import OpenStore
-from benchmarks.store.live import LiveResult
-from benchmarks.store.scene import NOISE_SIGMA_LEVELS, make_scene
-from benchmarks.store.tables import panels, requirements, rms_levels
-from benchmarks.store.take import make_take
 from benchmarks.store.workload import (
     CAMERAS,
     IMAGE_SHAPE,
+    NOISE_SIGMA_LEVELS,
     NUMERIC_RATES_HZ,
     TimedStream,
     Workload,
+    make_scene,
+    make_take,
 )
 from dextouch.errors import CorruptDataError, InvalidInputError, UnknownNameError
 

@@ -13,8 +13,15 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.twin import benchmark
-from benchmarks.twin.chunks import HEAD, HEAD_LAST, SELECTORS
-from benchmarks.twin.physics import AS_SERVED, SOLVERS, Played, contact_error
+from benchmarks.twin.benchmark import (
+    AS_SERVED,
+    HEAD,
+    HEAD_LAST,
+    SELECTORS,
+    SOLVERS,
+    Played,
+    contact_error,
+)
 from dextouch.errors import InvalidInputError
 
 

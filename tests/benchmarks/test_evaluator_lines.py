@@ -8,12 +8,17 @@ import pytest
 from benchmarks.evaluator.benchmark import interval_table, row_table
 from benchmarks.evaluator.drawn import Rolled
 from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.measuring import sharpness_of_chunks, wrong_action_figures
 from benchmarks.evaluator.members import refuse_unequal_tasks
 from benchmarks.evaluator.page import write_page
-from benchmarks.evaluator.playing import ImaginedRollout, TrueRollout
-from benchmarks.evaluator.restarts import chunks_that_move
-from benchmarks.evaluator.still_hand import StillRollout, still_figures
+from benchmarks.evaluator.playing import (
+    ImaginedRollout,
+    StillRollout,
+    TrueRollout,
+    chunks_that_move,
+    sharpness_of_chunks,
+    still_figures,
+    wrong_action_figures,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
 from dextouch.schemas import RolloutUncertainty
