@@ -97,7 +97,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 for (p, d), tallies in found.items()
                 for (method, name), tally in tallies.items()
             ],
-            "seconds": {name: list(figure.values) for name, figure in times_s.items()},
+            "seconds": times_s,
         },
         notes=[
             f"{NUM_STARTS} starts of one success or failure each; times are processor time of a "

@@ -91,11 +91,13 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
     console = Console()
     show(report, console if console.is_terminal else Console(width=WIDTH))
     write_json_text(options.json, report.to_json())
-    if options.out is not None:
-        write_json_text(options.out / f"bench_{report.stage}.json", report.to_json())
-        text = options.out / f"bench_{report.stage}.md"
-        text.write_text(to_markdown(report), encoding="utf-8")
-        chart = options.out / f"bench_{report.stage}.svg"
+    if options.out is None:
+        return
+    kept = options.out / f"bench_{report.stage}"
+    write_json_text(kept.with_suffix(".json"), report.to_json())
+    kept.with_suffix(".md").write_text(to_markdown(report), encoding="utf-8")
+    if report.panels:
+        chart = kept.with_suffix(".svg")
         chart.write_text(draw(report.panels, title=f"bench {report.stage}"), encoding="utf-8")
         print(f"\nchart: {chart}")
 

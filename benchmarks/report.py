@@ -8,12 +8,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -142,7 +143,18 @@ class StageReport:
             "notes": list(self.notes),
             **self.data,
         }
-        return json.dumps(content, indent=2, allow_nan=False)
+        return json.dumps(content, indent=2, allow_nan=False, default=_plain)
+
+
+def _plain(value: object) -> object:
+    """JSON of figures (every round), arrays, and the fields of dataclasses."""
+    if isinstance(value, Figure):
+        return value.values
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if is_dataclass(value):
+        return vars(value)
+    raise TypeError(f"report: got {type(value).__name__} in `data`, expected JSON or figures")
 
 
 def show(report: StageReport, console: Console) -> None:

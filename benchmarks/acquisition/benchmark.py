@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.acquisition.decoders import (
@@ -229,11 +228,11 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             starved_requirement(starved),
         ],
         data={
-            "line": asdict(LINE),
-            "judgements": [asdict(found) for found in judgements],
+            "line": LINE,
+            "judgements": judgements,
             "split_differences": splits,
             "us_a_packet": [
-                {"family": family, "way": way, "read_bytes": size, "rounds": list(figure.values)}
+                {"family": family, "way": way, "read_bytes": size, "rounds": figure}
                 for (family, way, size), figure in speeds.items()
             ],
             "drivers": [
@@ -241,7 +240,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                     "driver": talk.name,
                     "packet_bytes": talk.packet_bytes,
                     "packet_reads": talk.packet_reads,
-                    "us_a_packet": list(driver_us[talk.name].values),
+                    "us_a_packet": driver_us[talk.name],
                 }
                 for talk in talks
             ],

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.alignment.compare import METHODS, OURS, STEPS, MethodResult, compare, record
@@ -118,7 +117,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=tables(results),
         panels=panels(longest),
         requirements=requirements(longest),
-        data={"takes": [{name: asdict(one) for name, one in found.items()} for found in results]},
+        data={"takes": results},
         notes=[
             "processor time of all threads, so multiples of real time refer to one core; clock "
             "fits are timed separately after the alignment and subtracted from the calibration",

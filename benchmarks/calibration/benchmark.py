@@ -216,9 +216,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=panels(results),
         requirements=requirements(results, cameras, refusals),
         data={
-            "hand_eye": {name: asdict(result) for name, result in results.items()},
-            "cameras": [asdict(camera) for camera in cameras],
-            "refusals": [asdict(scene) for scene in refusals],
+            "hand_eye": results,
+            "cameras": cameras,
+            "refusals": refusals,
         },
         notes=notes(results),
     )

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -176,17 +175,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=tables(results, stampless),
         panels=panels(results),
         requirements=requirements(results, stampless),
-        data={
-            "results": [
-                {
-                    "scene": result.scene,
-                    "way": result.way,
-                    "rounds": [asdict(score) for score in result.scores],
-                    "us_per_sample": list(result.us_per_sample.values),
-                }
-                for result in (*results, *stampless)
-            ]
-        },
+        data={"results": [*results, *stampless]},
         notes=[
             f"online errors exclude the first {WARM_UP_S:g} s and, in scenes with a step, 1.2 s "
             "after it; each round is a take with a different seed"

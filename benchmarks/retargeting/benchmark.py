@@ -256,18 +256,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=panels(speeds, robot, pinches),
         requirements=requirements(speeds, robot, pinches, cold),
         data={
-            "speed": [asdict(speed) for speed in speeds],
-            "robot": {
-                name: {method: asdict(score) for method, score in scores.items()}
-                for name, scores in robot.items()
-            },
-            "pinches": {method: asdict(score) for method, score in pinches.items()},
-            "oblique_axes": {
-                f"{oblique_deg:g}": {method: asdict(score) for method, score in scores.items()}
-                for oblique_deg, scores in axes.items()
-            },
+            "speed": speeds,
+            "robot": robot,
+            "pinches": pinches,
+            "oblique_axes": {f"{oblique_deg:g}": scores for oblique_deg, scores in axes.items()},
             "cold_start": cold._asdict(),
-            "faults": [asdict(outcome) for outcome in outcomes],
+            "faults": outcomes,
         },
         notes=notes(chosen, left_out),
     )

@@ -119,7 +119,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             ),
         ],
         data={
-            "seconds": {name: list(figure.values) for name, figure in times_s.items()},
+            "seconds": times_s,
             "bytes": {_name(way): size for way, size in sizes.items()},
             "bare_step_seconds": {_name(way): bare_s[way.selector] for way in ways},
             "crowds": {world: found._asdict() for world, found in crowds.items()},

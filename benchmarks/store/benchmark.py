@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple
+from dataclasses import astuple
 from pathlib import Path
 
 from benchmarks.chart import Panel, Point
@@ -228,10 +228,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=tables(results, appends, live),
         panels=panels(results),
         requirements=requirements(results, appends, live),
-        data={
-            "designs": {name: asdict(result) for name, result in results.items()},
-            "appends": [asdict(append) for append in appends],
-            "live": [asdict(run) for run in live],
-        },
+        data={"designs": results, "appends": appends, "live": live},
         notes=notes,
     )

@@ -237,10 +237,7 @@ def _report(
         requirements=_requirements(plays[OURS]),
         data={
             "plays": {
-                name: [
-                    asdict(play) | {"latency_ms": play.latency_ms.tolist(), "cpu_ms": cpu}
-                    for play, cpu in found
-                ]
+                name: [asdict(play) | {"cpu_ms": cpu} for play, cpu in found]
                 for name, found in results.items()
             }
         },

@@ -220,12 +220,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=[Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)],
         requirements=requirements(times_ms, states_are_equal=chunk.states_are_equal()),
         data={
-            "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
-            "solver_ms": {name: list(figure.values) for name, figure in solver_ms.items()},
-            "contact_error": {
-                name: {"force_n": error.force_n, "object_mm": error.object_mm}
-                for name, error in errors.items()
-            },
+            "chunk_ms": times_ms,
+            "solver_ms": solver_ms,
+            "contact_error": errors,
         },
         notes=["times are processor time of the whole process, with one thread"],
     )

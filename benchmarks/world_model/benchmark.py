@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -229,10 +229,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=panels(times_ms, errors, served),
         requirements=requirements(times_ms, errors, served) + state_model_requirements(state_ms),
         data={
-            "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
-            "errors": {name: asdict(error) for name, error in errors.items()},
-            "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
-            "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
+            "chunk_ms": times_ms,
+            "errors": errors,
+            "asked_ms": costs_ms,
+            "state_model_ms": state_ms,
         },
         notes=[
             "times are processor time of the whole process; OMP_NUM_THREADS=1 gives one thread",

@@ -63,7 +63,7 @@ def test_a_quick_run_measures_ours_everywhere(run):
     assert {(one["method"], one["motion"]) for one in figures["speed"]} == {
         (method, motion) for method in (OURS, OURS_LIVE) for motion in (ROBOT_INPUT, PINCH_INPUT)
     }
-    assert all(min(one["cpu_us"]["values"]) > 0 for one in figures["speed"])
+    assert all(min(one["cpu_us"]) > 0 for one in figures["speed"])
     assert len(figures["robot"]) == 4
     assert all(list(scores) == [OURS, OURS_EXACT] for scores in figures["robot"].values())
     assert figures["pinches"][OURS]["num_pinched"] > 200
@@ -87,8 +87,8 @@ def test_promises_that_need_no_quiet_machine_are_kept(run):
 def test_the_chart_has_our_point_in_both_panels(run):
     folder, _ = run
     chart = ET.parse(folder / "bench_retargeting.svg").getroot()  # noqa: S314 (ours)
-    titles = [e.text for e in chart.iter("{http://www.w3.org/2000/svg}title")]
-    assert sum(title.startswith("ours: ") for title in titles) == 2
+    names = [g.get("id", "") for g in chart.iter("{http://www.w3.org/2000/svg}g")]
+    assert sum(one.endswith(": ours") for one in names) == 2
 
 
 def bones_m(hand):
