@@ -7,14 +7,16 @@ from pathlib import Path
 from benchmarks.acquisition.decoders import (
     READ_SIZES,
     WHOLE,
+    DeviceTalk,
     Judgement,
     Line,
     count_split_differences,
     judge,
     make_families,
+    make_talks,
+    measure_drivers,
     measure_speed,
 )
-from benchmarks.acquisition.drivers import DeviceTalk, make_talks, measure_drivers
 from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
 from benchmarks.acquisition.starved import Load, Way, run_starved
 from benchmarks.chart import Panel, Point

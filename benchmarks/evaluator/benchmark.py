@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.evaluator.drawn import Line, Rolled
-from benchmarks.evaluator.keeping import KeptRows, Row
+from benchmarks.evaluator.keeping import KeptRows, Row, read_lines, repetition
 from benchmarks.evaluator.lines import VERDICTS, TaskFigures
 from benchmarks.evaluator.members import write_single_members
-from benchmarks.evaluator.page import write_page
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
@@ -25,7 +24,6 @@ from benchmarks.evaluator.plan import (
     StudyPlan,
     trained_seeds,
 )
-from benchmarks.evaluator.repetition import read_lines, repetition
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
@@ -143,7 +141,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, tables, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
@@ -167,7 +164,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *(repetition(lines, earlier) if options.repeats else ()),
         ],
         data={name: value for name, value in content.items() if name != "notes"},
-        notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
+        notes=[*notes, f"rollouts and JSON: {plan.keep}"],
     )
 
 

@@ -19,15 +19,20 @@ from benchmarks.retargeting.compare import (
     NATURAL_NOISE,
     NODE_LOST,
     NODES_LOST,
+    OURS,
+    OURS_EXACT,
+    OURS_LIVE,
     PINCH_INPUT,
     ROBOT_INPUT,
     BoneScore,
+    ColdStart,
     Effort,
     Outcome,
     PinchScore,
     RobotScore,
     RobotScores,
     Speed,
+    cold_start,
     compare_axes,
     compare_pinches,
     compare_robot,
@@ -36,7 +41,6 @@ from benchmarks.retargeting.compare import (
     robot_sets,
     try_faults,
 )
-from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart, cold_start
 from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
 from benchmarks.retargeting.rivals import DEX, DEXI, INSTALL, RIVALS, VECTOR, Rival, missing_modules
 from benchmarks.simulated.hand_motions import RATE_HZ

@@ -4,22 +4,24 @@ A library that does not finish has no score or speed; results of the others are 
 """
 
 import gc
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.figures import Figure, interleaved
-from benchmarks.retargeting import ours
-from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, Timed
 from benchmarks.retargeting.pinches import PinchMotion, pinch_motions
 from benchmarks.retargeting.rival_process import RivalProcess
+from benchmarks.retargeting.rivals import Timed
 from benchmarks.simulated.hand_motions import (
     Motion,
+    cold_postures,
+    motion_of,
     oblique_motion,
     robot_motion,
     with_dropouts,
@@ -30,8 +32,81 @@ from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteErro
 from dextouch.hands import CHAINS, NODE_INDEX, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import Side
-from services.alignment.retargeting.hand_profile import robot_bone_m
-from services.alignment.retargeting.hand_retargeter import warm_up
+from services.alignment.retargeting import RetargetOptions
+from services.alignment.retargeting.hand_profile import HandProfile, robot_bone_m
+from services.alignment.retargeting.hand_retargeter import HandRetargeter, warm_up
+from services.twin.hands import twin_hand
+
+OURS = "ours"
+OURS_LIVE = "ours, live"
+OURS_EXACT = "ours, exact"
+# A finger counts as solved if its tip error is below this.
+FOUND_M = 1e-4
+
+
+def answer(name: str, motion: Motion) -> Float64[np.ndarray, "time 20"]:
+    """Joint angles of a recording of an unknown person; `OURS_EXACT` has no temporal term."""
+    options = RetargetOptions(temporal_weight_m2=0.0) if name == OURS_EXACT else RetargetOptions()
+    return HandRetargeter(motion.side, options=options).retarget(motion.keypoints_m).joints_rad
+
+
+def profile_of(motion: Motion) -> HandProfile:
+    """Hand profile measured before timing, as the scale is for rivals."""
+    return HandRetargeter(motion.side).measure(motion.keypoints_m)
+
+
+def time_batch(motion: Motion, profile: HandProfile) -> Timed:
+    """Time a whole recording with `retarget`."""
+    retargeter = HandRetargeter(motion.side, profile)
+    begun_s = time.process_time()
+    result = retargeter.retarget(motion.keypoints_m)
+    return Timed(result.joints_rad, time.process_time() - begun_s, np.empty(0))
+
+
+def time_live(motion: Motion, profile: HandProfile) -> Timed:
+    """Time sample by sample with `step`."""
+    retargeter = HandRetargeter(motion.side, profile)
+    samples = list(motion.keypoints_m)
+    results, calls_ns = [], [time.perf_counter_ns()]
+    begun_s = time.process_time()
+    for keypoints_m in samples:
+        results.append(retargeter.step(keypoints_m))
+        calls_ns.append(time.perf_counter_ns())
+    cpu_s = time.process_time() - begun_s
+    joints = np.concatenate([result.joints_rad for result in results])
+    return Timed(joints, cpu_s, np.diff(calls_ns) * 1e-9)
+
+
+class ColdStart(NamedTuple):
+    """Number of fingers in cold starts, and of those solved with one start and with retries."""
+
+    num_fingers: int
+    num_found_once: int
+    num_found: int
+
+
+def cold_start(num_postures: int, seed: int) -> ColdStart:
+    """Solve independent random postures of both hands within the joint limits."""
+    found = {1: 0, RetargetOptions().num_starts: 0}
+    num_fingers = 0
+    for side in ("left", "right"):
+        hand = twin_hand(side, "robot")
+        profile = profile_of(robot_motion(side, 240, seed, natural=False))
+        postures = cold_postures(side, num_postures, seed)
+        num_fingers += postures.tips_m[..., 0].size
+        for num_starts in found:
+            retargeter = HandRetargeter(side, profile, RetargetOptions(num_starts=num_starts))
+            joints = np.concatenate([_alone(retargeter, one) for one in postures.keypoints_m])
+            off_m = motion_of(hand, joints).tips_m - postures.tips_m
+            found[num_starts] += int((np.linalg.norm(off_m, axis=-1) < FOUND_M).sum())
+    once, retried = found.values()
+    return ColdStart(num_fingers, once, retried)
+
+
+def _alone(retargeter: HandRetargeter, keypoints_m: np.ndarray) -> Float64[np.ndarray, "1 20"]:
+    retargeter.reset()
+    return retargeter.step(keypoints_m).joints_rad
+
 
 # Other libraries return float32, which may exceed a limit by rounding.
 LIMIT_TOLERANCE_RAD = 1e-6
@@ -336,14 +411,14 @@ def compare_speed(effort: Effort, rivals: Rivals, bar: Bar) -> list[Speed]:
 
 def scale_of(motion: Motion) -> float:
     """Ratio of the robot's finger lengths to the tracked ones, the scale given to rivals."""
-    tracked_m = ours.profile_of(motion).bone_m.sum()
+    tracked_m = profile_of(motion).bone_m.sum()
     return float(robot_bone_m(RobotHand(motion.side)).sum() / tracked_m)
 
 
 def _answer(name: str, motion: Motion, rivals: Rivals) -> np.ndarray:
     if name in rivals:
         return rivals[name].run(motion, scale_of(motion)).joints_rad
-    return ours.answer(name, motion)
+    return answer(name, motion)
 
 
 def _timed_motions(input_name: str, effort: Effort) -> list[Motion]:
@@ -365,7 +440,7 @@ def _subjects(
     motions: Sequence[Motion], rivals: Rivals
 ) -> dict[str, Callable[[int], Timed | None]]:
     """Functions that time a method on a motion; they return None once a rival did not finish."""
-    profiles = [ours.profile_of(motion) for motion in motions]
+    profiles = [profile_of(motion) for motion in motions]
     scales = [scale_of(motion) for motion in motions]
 
     given_up = set()
@@ -379,8 +454,8 @@ def _subjects(
         return None
 
     return {
-        OURS: lambda index: ours.time_batch(motions[index], profiles[index]),
-        OURS_LIVE: lambda index: ours.time_live(motions[index], profiles[index]),
+        OURS: lambda index: time_batch(motions[index], profiles[index]),
+        OURS_LIVE: lambda index: time_live(motions[index], profiles[index]),
         **{name: partial(rival, process) for name, process in rivals.items()},
     }
 
@@ -435,7 +510,7 @@ def try_faults(seed: int, rivals: Rivals, bar: Bar) -> list[Outcome]:
 
 def _try(name: str, motion: Motion, whole: Motion, rivals: Rivals) -> str:
     if name not in rivals:
-        return _describe(motion, ours.answer(name, motion))
+        return _describe(motion, answer(name, motion))
     try:
         joints = rivals[name].run(motion, scale_of(whole)).joints_rad
     except LimitExceededError as error:

@@ -68,6 +68,14 @@ class Setup(NamedTuple):
     joint_names: list[str]
 
 
+class Timed(NamedTuple):
+    """Joint angles [T, 20], processor time of all samples, wall time of each sample's own call."""
+
+    joints_rad: Float64[np.ndarray, "time 20"]
+    cpu_s: float
+    call_s: Float64[np.ndarray, " calls"]
+
+
 def missing_modules(rival: Rival) -> list[str]:
     """Modules of a rival that are not installed, checked without importing."""
     return [module for module in _MODULES[rival.library] if find_spec(module) is None]

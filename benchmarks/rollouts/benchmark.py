@@ -12,8 +12,18 @@ from typing import Final
 from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.watcher import listing_s, watched
-from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Crowd, Way, compared, crowd, opened
-from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
+from benchmarks.rollouts.ways import (
+    MAX_CHUNKS,
+    MAX_STEPS,
+    Chunk,
+    Crowd,
+    StillWorld,
+    Way,
+    compared,
+    crowd,
+    opened,
+    resting_actions,
+)
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector

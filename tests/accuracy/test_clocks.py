@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.clocks.compare import arrivals, ours_offline, ours_online, score
+from benchmarks.clocks.benchmark import arrivals, ours_offline, ours_online, score
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,

@@ -16,11 +16,12 @@ from benchmarks.acquisition.decoders import (
     Judgement,
     Line,
     count_split_differences,
+    decode_all,
     disturb,
     judge,
     make_families,
+    make_talks,
 )
-from benchmarks.acquisition.drivers import decode_all, make_talks
 from benchmarks.command import stage_parser, usage
 from benchmarks.figures import Figure
 from benchmarks.stages import STAGES

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from benchmarks.alignment import benchmark
-from benchmarks.alignment.benchmark import BOUNDS, requirements, tables
-from benchmarks.alignment.compare import (
+from benchmarks.alignment.benchmark import (
+    BOUNDS,
     CALIBRATION,
     FITS,
     LINEAR,
@@ -22,6 +22,8 @@ from benchmarks.alignment.compare import (
     STEPS,
     MethodResult,
     first_arrivals,
+    requirements,
+    tables,
 )
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clocks import benchmark
-from benchmarks.clocks.compare import OFFLINE, ONLINE, score
+from benchmarks.clocks.benchmark import OFFLINE, ONLINE, score
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,

@@ -15,8 +15,12 @@ from benchmarks.figures import Figure
 from benchmarks.retargeting import benchmark, compare, rival_process, rivals
 from benchmarks.retargeting.benchmark import requirements, tables, velocity_limit_deg, worst_ratio
 from benchmarks.retargeting.compare import (
+    OURS,
+    OURS_EXACT,
+    OURS_LIVE,
     PINCH_INPUT,
     ROBOT_INPUT,
+    ColdStart,
     Effort,
     PinchScore,
     RobotScore,
@@ -29,7 +33,6 @@ from benchmarks.retargeting.compare import (
     try_faults,
 )
 from benchmarks.retargeting.hand_urdf import hand_urdf
-from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import RIVALS

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.world_model import benchmark
-from benchmarks.world_model.rollouts import (
+from benchmarks.world_model.benchmark import (
     Imagined,
     RolloutError,
     held_out,
