@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     options = parser.parse_args(rest)
     refuse_shape_checks()
     with _folder(options.out) as folder:
-        report = stage.measure(options, folder, _bar)
+        report: StageReport = stage.measure(options, folder, _bar)
     publish(report, options)
     return EXIT_MISSED if options.check and not report.is_met else 0
 

@@ -12,7 +12,6 @@ from typing import Any, Final
 from benchmarks.evaluator.drawn import Line, Rolled
 from benchmarks.evaluator.keeping import KeptRows, Row, read_lines, repetition
 from benchmarks.evaluator.lines import VERDICTS, TaskFigures
-from benchmarks.evaluator.members import write_single_members
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
@@ -24,7 +23,14 @@ from benchmarks.evaluator.plan import (
     StudyPlan,
     trained_seeds,
 )
-from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
+from benchmarks.evaluator.work import (
+    NEEDED,
+    Missing,
+    Study,
+    open_study,
+    unit_rows,
+    write_single_members,
+)
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError

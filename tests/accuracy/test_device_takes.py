@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.closure.methods import Method, retarget_take, robot_trajectory
+from benchmarks.closure.benchmark import Method, retarget_take, robot_trajectory
 from dextouch.episodes import EpisodeStore
 from dextouch.geometry import apply, interpolate_poses, invert, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle

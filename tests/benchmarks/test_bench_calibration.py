@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import benchmark
-from benchmarks.calibration.benchmark import requirements
-from benchmarks.calibration.compare import (
+from benchmarks.calibration.benchmark import (
     METHODS,
     OURS,
     OURS_POSES,
@@ -24,6 +23,7 @@ from benchmarks.calibration.compare import (
     MethodResult,
     SceneResult,
     not_worse_share,
+    requirements,
     scene_makers,
     score,
 )

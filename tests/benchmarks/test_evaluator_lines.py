@@ -8,7 +8,6 @@ import pytest
 from benchmarks.evaluator.benchmark import interval_table, row_table
 from benchmarks.evaluator.drawn import Rolled
 from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.members import refuse_unequal_tasks
 from benchmarks.evaluator.playing import (
     ImaginedRollout,
     StillRollout,
@@ -18,6 +17,7 @@ from benchmarks.evaluator.playing import (
     still_figures,
     wrong_action_figures,
 )
+from benchmarks.evaluator.work import refuse_unequal_tasks
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
 from dextouch.schemas import RolloutUncertainty
