@@ -17,8 +17,7 @@ from benchmarks.acquisition.decoders import (
     measure_drivers,
     measure_speed,
 )
-from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
-from benchmarks.acquisition.starved import Load, Way, run_starved
+from benchmarks.acquisition.starved import NUM_STREAMS, Load, Way, run_ptys, run_starved
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_most
 from benchmarks.report import ResultTable, StageReport, cells

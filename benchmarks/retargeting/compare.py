@@ -15,14 +15,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.figures import Figure, interleaved
-from benchmarks.retargeting.pinches import PinchMotion, pinch_motions
 from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import Timed
 from benchmarks.simulated.hand_motions import (
     Motion,
+    PinchMotion,
     cold_postures,
     motion_of,
     oblique_motion,
+    pinch_motions,
     robot_motion,
     with_dropouts,
     with_noise,

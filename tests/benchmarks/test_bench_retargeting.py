@@ -32,11 +32,9 @@ from benchmarks.retargeting.compare import (
     score_robot,
     try_faults,
 )
-from benchmarks.retargeting.hand_urdf import hand_urdf
-from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.retargeting.rival_process import RivalProcess
-from benchmarks.retargeting.rivals import RIVALS
-from benchmarks.simulated.hand_motions import cold_postures, robot_motion
+from benchmarks.retargeting.rivals import RIVALS, hand_urdf
+from benchmarks.simulated.hand_motions import cold_postures, people, pinch_motion, robot_motion
 from dextouch.errors import (
     InvalidInputError,
     LimitExceededError,

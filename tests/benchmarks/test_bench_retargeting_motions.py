@@ -4,19 +4,17 @@ import numpy as np
 import pytest
 
 from benchmarks.retargeting.compare import score_pinches, score_robot
-from benchmarks.retargeting.pinches import (
-    BONE_SPREAD,
-    PINCHED_M,
-    SIZES,
-    Person,
-    people,
-    pinch_motion,
-)
 from benchmarks.simulated import hand_motions as sequences
 from benchmarks.simulated.hand_motions import (
+    BONE_SPREAD,
     MAX_SPEED_RAD_S,
+    PINCHED_M,
     RATE_HZ,
+    SIZES,
+    Person,
     cold_postures,
+    people,
+    pinch_motion,
     robot_motion,
     segment_distance_m,
     touching,
