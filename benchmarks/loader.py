@@ -10,9 +10,8 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.figures import Figure, Requirement, at_least
+from benchmarks.figures import Figure, Requirement, at_least, every_round, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data
@@ -63,7 +62,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         options={**plan, "episodes": pace.num_episodes, "batch": pace.batch, "workers": workers},
         tables=[rate_table(rates, pace.num_episodes)],
         requirements=[requirement(rates)],
-        data={"windows_per_s": {name: list(figure.values) for name, figure in rates.items()}},
+        data={"windows_per_s": rates},
         notes=["the episodes are in the page cache, so disk latency is not included"],
     )
 

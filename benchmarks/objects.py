@@ -13,8 +13,7 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.figures import at_most
-from benchmarks.object_clicks import ClickErrors, click_errors
-from benchmarks.object_touch import TouchErrors, touch_errors
+from benchmarks.object_places import ClickErrors, TouchErrors, click_errors, touch_errors
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.geometry import invert, transform, transform_from_pose

@@ -22,7 +22,7 @@ import numpy as np
 
 import dextouch
 import services
-from benchmarks.rollouts.worlds import resting_actions
+from benchmarks.rollouts.ways import resting_actions
 from dextouch.clients import EpisodeStoreClient, PolicyStart, Rollout, RolloutClient
 from dextouch.clocks import OnlineClock
 from dextouch.command_line import add_json, write_result

@@ -17,6 +17,7 @@ from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutSt
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import ReconstructingWorld, World
 
+# Labels of what a pixel shows; hands and objects follow the table.
 BACKGROUND, TABLE, FIRST_BODY = 0, 1, 2
 # Depth of a pixel that shows nothing (m): the farthest that the twin renders.
 FAR_M: Final = 4.0

@@ -19,8 +19,6 @@ WarmupSteps = Annotated[int, Field(ge=1, description="warm-up steps of the learn
 WeightDecay = Annotated[float, Field(ge=0, description="AdamW weight decay")]
 MaxGradientNorm = Annotated[float, Field(gt=0, description="norm that gradients are clipped to")]
 AverageDecay = Annotated[float, Field(ge=0, lt=1, description="decay of the averaged weights")]
-ImageNoise = Annotated[float, Field(ge=0, description="noise on training images in 0 … 1")]
-Brightness = Annotated[float, Field(ge=0, description="brightness variation of training images")]
 # Side of the images that networks see, unless it is chosen otherwise.
 USUAL_IMAGE_PX = 64
 ImagePx = Annotated[

@@ -4,11 +4,11 @@ The mock gloves know their own tare and gain, and their script its path delay; a
 same as at a station, by a rest take, known pressures and answers to time requests, so that errors
 contain those of a calibration.
 
-`write_through_devices` and `write_as_recorded` make episodes of such takes in one process: the way
-from a person's hands to 67-D actions of the robot, without HTTP. Episodes have the errors of an
-ordinary station (clocks, delays, tracking, calibration, lost packets) and, as labels, what only the
-twin knows: object poses, milestones and success. Labels are on the episode's time axis: the clock
-of the simulated host is that of the simulation.
+`write_by_station` makes episodes of such takes in one process: the way from a person's hands to
+67-D actions of the robot, without HTTP. Episodes have the errors of an ordinary station (clocks,
+delays, tracking, calibration, lost packets) and, as labels, what only the twin knows: object poses,
+milestones and success. Labels are on the episode's time axis: the clock of the simulated host is
+that of the simulation.
 """
 
 import tempfile
@@ -218,46 +218,23 @@ def device_options(options: TakeOptions) -> TakeOptions:
     return replace(options, image_every=None, streams="all")
 
 
-def write_through_devices(
-    store: EpisodeStore, truth: TruthEpisode, *, episode_id: str, options: TakeOptions
-) -> None:
-    """Record a take of the twin with a mock station, align it and write it with the twin's labels.
-
-    Equal takes give equal episodes. The recording itself is not kept.
-
-    Args:
-        store: where the episode goes.
-        truth: recorded with `device_options`.
-        episode_id: of the new episode.
-        options: `streams` and `image_every` say what the episode has.
-
-    Raises:
-        ConflictError: the episode exists.
-        InvalidInputError: the take could not be aligned.
-        DeviceError: a mock device failed.
-    """
-    aligned, streams, origin_ns = _aligned(truth, ALIGNMENT, episode_id)
-    label = _label(truth.streams[LABELS], origin_ns, streams[0].t_ref_ns)
-    attributes = _with_truth(aligned, truth.attributes, origin_ns)
-    _write(store, attributes, [label, *streams], options)
-
-
-def write_as_recorded(
+def write_by_station(
     store: EpisodeStore,
     truth: TruthEpisode,
-    objects: SceneObjects,
+    objects: SceneObjects | None = None,
     *,
     episode_id: str,
     options: TakeOptions,
 ) -> None:
-    """Record a take with a mock station and write what alignment makes of it, and nothing else.
+    """Record a take of the twin with a mock station, and write what alignment makes of it.
 
-    Poses of objects are those of the markers in the images. Of the twin's truth the episode has
-    only the outcome, which an operator would see.
+    By default the episode also has the twin's labels, and equal takes give equal episodes. With
+    `objects`, poses of objects are those of the markers in the images, and of the twin's truth the
+    episode has only the outcome, which an operator would see. The recording itself is not kept.
 
     Args:
         store: where the episode goes.
-        truth: recorded with `device_options`, by a stage that shows the markers.
+        truth: recorded with `device_options`; with `objects` by a stage that shows the markers.
         objects: of the task, with their markers.
         episode_id: of the new episode.
         options: `streams` and `image_every` say what the episode has.
@@ -267,10 +244,14 @@ def write_as_recorded(
         InvalidInputError: the take could not be aligned.
         DeviceError: a mock device failed.
     """
-    alignment = ALIGNMENT.model_copy(update={"objects": objects})
-    attributes, streams, _ = _aligned(truth, alignment, episode_id)
-    # The recording is not kept, and the wall clock would differ each time.
-    attributes = attributes.model_copy(update={"created_at": None, "lineage": ()})
+    alignment = ALIGNMENT.model_copy(update={"objects": objects}) if objects else ALIGNMENT
+    attributes, streams, origin_ns = _aligned(truth, alignment, episode_id)
+    if objects is None:
+        streams = [_label(truth.streams[LABELS], origin_ns, streams[0].t_ref_ns), *streams]
+        attributes = _with_truth(attributes, truth.attributes, origin_ns)
+    else:
+        # The recording is not kept, and the wall clock would differ each time.
+        attributes = attributes.model_copy(update={"created_at": None, "lineage": ()})
     _write(store, attributes, streams, options)
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.retargeting.pinches import people, pinch_motion
-from benchmarks.simulated.hand_motions import robot_motion
+from benchmarks.simulated.hand_motions import people, pinch_motion, robot_motion
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, NODE_INDEX, chain_indices, mean_hand_m
