@@ -84,7 +84,7 @@ class Ending:
     """
 
     images: UInt8[np.ndarray, "3 h w 3"] | None
-    tactile_kpa: Float32[np.ndarray, "3 2 320"]
+    tactile_kpa: Float32[np.ndarray, "3 2 taxels"]
     task: str
     object_poses: Float32[np.ndarray, "3 objects 7"] | None = None
     imagined: bool = False
@@ -222,7 +222,7 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
 
 
 def _read_ending(
-    grid: EpisodeGrid, touch_kpa: Float32[np.ndarray, "steps 2 320"], end: int
+    grid: EpisodeGrid, touch_kpa: Float32[np.ndarray, "steps 2 taxels"], end: int
 ) -> Ending:
     steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
     return Ending(

@@ -145,12 +145,12 @@ class Future:
     """
 
     images: UInt8[np.ndarray, "shown h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     image_steps: tuple[int, ...]
     objects_m: Float64[np.ndarray, "objects 3"] | None = None
-    measured_taxels: Bool[np.ndarray, "steps 2 320"] | None = None
+    measured_taxels: Bool[np.ndarray, "steps 2 taxels"] | None = None
 
-    def is_measured(self) -> Bool[np.ndarray, "steps 2 320"]:
+    def is_measured(self) -> Bool[np.ndarray, "steps 2 taxels"]:
         """Taxels at steps whose pressure is known."""
         if self.measured_taxels is None:
             return np.ones(self.tactile_kpa.shape, dtype=np.bool_)

@@ -201,7 +201,7 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
     return ReplayStream(stream.descriptor, t_ns, np.repeat(values, NUM_TAXELS, axis=1))
 
 
-def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time 360"]]:
+def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
     """Counts of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)

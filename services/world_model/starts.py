@@ -39,7 +39,7 @@ class ObservedStart:
     """
 
     image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
+    tactile_kpa: Float32[np.ndarray, "2 taxels"]
     reached: Float64[np.ndarray, "67"]
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]

@@ -188,8 +188,8 @@ class ModelWorld(BatchWorld[ModelState]):
     def reconstruct(
         self,
         images: UInt8[np.ndarray, "steps h w 3"],
-        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
-    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        tactile_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode images and touch of 1 + 4k steps; gives those after the first."""
         codec, tokenizer, device = self._model.codec, self._model.tokenizer, self._model.device
         seen = codec.decode_future(

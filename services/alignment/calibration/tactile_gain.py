@@ -84,7 +84,7 @@ class TaxelPress:
     pressure_kpa: float
     sigma_kpa: float
     counts: np.ndarray
-    taxels: Bool[np.ndarray, "320"]
+    taxels: Bool[np.ndarray, " taxels"]
 
     def __post_init__(self) -> None:
         if not np.isfinite([self.pressure_kpa, self.sigma_kpa]).all():
@@ -110,10 +110,10 @@ class TaxelGain:
         residual_kpa: [press, 320] what each press is off the line, 0 where not used.
     """
 
-    gain_counts_per_kpa: Float64[np.ndarray, "320"]
-    sigma_counts_per_kpa: Float64[np.ndarray, "320"]
-    state: UInt8[np.ndarray, "320"]
-    residual_kpa: Float64[np.ndarray, "press 320"]
+    gain_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    sigma_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    state: UInt8[np.ndarray, " taxels"]
+    residual_kpa: Float64[np.ndarray, "press taxels"]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class GloveCalibration:
     tare: TaxelTare
     gain: TaxelGain | None
 
-    def matrices(self) -> dict[str, Float64[np.ndarray, "1 360"]]:
+    def matrices(self) -> dict[str, Float64[np.ndarray, "1 cells"]]:
         """Matrices by their names in recordings; all in scan order.
 
         A taxel whose gain was refused gets the median gain of its pad, so that counts of a faulty
@@ -184,7 +184,7 @@ def calibrate_glove(
     return found
 
 
-def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, "320"]:
+def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, " taxels"]:
     """Gains in which refused taxels have the median of their pad, or of the glove.
 
     Raises:
@@ -202,7 +202,7 @@ def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, "320"]:
     return filled
 
 
-def pad_taxels(names: str) -> Bool[np.ndarray, "320"]:
+def pad_taxels(names: str) -> Bool[np.ndarray, " taxels"]:
     """Which taxels belong to pads, named with + between them, such as `thumb+index`, or `all`.
 
     Raises:
@@ -266,10 +266,10 @@ class _Points:
 
     pressure_kpa: Float64[np.ndarray, "k 1"]
     sigma_kpa: Float64[np.ndarray, "k 1"]
-    counts: Float64[np.ndarray, "k 320"]
-    sigma_counts: Float64[np.ndarray, "k 320"]
-    used: Bool[np.ndarray, "k 320"]
-    saturated: Bool[np.ndarray, "k 320"]
+    counts: Float64[np.ndarray, "k taxels"]
+    sigma_counts: Float64[np.ndarray, "k taxels"]
+    used: Bool[np.ndarray, "k taxels"]
+    saturated: Bool[np.ndarray, "k taxels"]
 
 
 def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: float) -> _Points:
@@ -319,7 +319,7 @@ def _creep(press: TaxelPress, tare: TaxelTare) -> float:
     return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
 
 
-def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, "320"]:
+def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, " taxels"]:
     """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
 
     Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
@@ -389,7 +389,7 @@ def _check_direction(points: _Points) -> None:
         )
 
 
-def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, "320"]:
+def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
     """Taxels without response in every press to which the others respond."""
     response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
     usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
@@ -422,7 +422,7 @@ def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def _judge_lines(
     points: _Points, line: tuple[np.ndarray, np.ndarray, np.ndarray], state: np.ndarray
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     gain, sigma, excess = line
     good = state == OK
     P, num = points.pressure_kpa, points.used.sum(axis=0)

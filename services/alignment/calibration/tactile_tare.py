@@ -97,10 +97,10 @@ class Level:
     `noise_counts` the standard deviation of one reading; `clipped` the share of excluded readings.
     """
 
-    mean_counts: Float64[np.ndarray, "360"]
-    sigma_counts: Float64[np.ndarray, "360"]
-    noise_counts: Float64[np.ndarray, "360"]
-    clipped: Float64[np.ndarray, "360"]
+    mean_counts: Float64[np.ndarray, " cells"]
+    sigma_counts: Float64[np.ndarray, " cells"]
+    noise_counts: Float64[np.ndarray, " cells"]
+    clipped: Float64[np.ndarray, " cells"]
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class TaxelTare:
 
     side: Side
     level: Level
-    restless: Bool[np.ndarray, "320"]
+    restless: Bool[np.ndarray, " taxels"]
     num_samples: int
 
 
@@ -140,7 +140,7 @@ def measure_tare(rest_counts: np.ndarray, *, side: Side) -> TaxelTare:
     return TaxelTare(side, level, restless, len(counts))
 
 
-def steady_level(counts: Float64[np.ndarray, "time 360"]) -> Level:
+def steady_level(counts: Float64[np.ndarray, "time cells"]) -> Level:
     """Robust level, its sigma, and noise of each cell's readings; knocks are excluded."""
     median = np.median(counts, axis=0)
     spread = 1.4826 * np.median(np.abs(counts - median), axis=0)
@@ -167,7 +167,7 @@ def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
     return np.sqrt(terms.sum(axis=-1))
 
 
-def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "time 360"]:
+def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "time cells"]:
     """Counts as float64.
 
     Raises:
@@ -189,7 +189,7 @@ def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "tim
 
 def classify_taxels(
     takes: Sequence[np.ndarray], tare: TaxelTare, *, full_scale_counts: float = FULL_SCALE_COUNTS
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
 
     The takes are raw counts [T, 360] each; the rest take may be among them.
@@ -219,7 +219,7 @@ def classify_taxels(
     return states
 
 
-def kind_of_silence(takes: Sequence[np.ndarray], side: Side) -> UInt8[np.ndarray, "320"]:
+def kind_of_silence(takes: Sequence[np.ndarray], side: Side) -> UInt8[np.ndarray, " taxels"]:
     """`STUCK` for taxels that keep one value other than zero in all takes, else `DEAD`."""
     lowest, highest = (
         select_taxels(most([most(take, axis=0) for take in takes], axis=0), side=side)
@@ -242,7 +242,9 @@ def _slow_noise_factor(counts: np.ndarray, noise: np.ndarray) -> float:
     return max(1.0, float(np.sqrt(np.median(ratio))))
 
 
-def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.ndarray, "360"]:
+def _restless(
+    counts: Float64[np.ndarray, "time cells"], level: Level
+) -> Bool[np.ndarray, " cells"]:
     half = len(counts) // 2
     shift = np.abs(np.median(counts[:half], axis=0) - np.median(counts[half:], axis=0))
     # Differences of neighbours in time: a step between the halves does not widen them.
@@ -252,7 +254,7 @@ def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.
     return (shift > allowed) | (level.clipped > MAX_CLIPPED)
 
 
-def _neighbours() -> Int64[np.ndarray, "320 8"]:
+def _neighbours() -> Int64[np.ndarray, "taxels 8"]:
     """Taxels around each taxel on its own pad, anatomical order; −1 where there is none."""
     tables, first = [], 0
     for shape in [TIP_SHAPE] * NUM_FINGERTIPS + [PALM_SHAPE]:
@@ -267,7 +269,9 @@ _NEIGHBOURS = _neighbours()
 _NUM_NEIGHBOURS = (_NEIGHBOURS >= 0).sum(axis=1)
 
 
-def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarray, "time 320"]:
+def _least_neighbour(
+    moved: Float64[np.ndarray, "time taxels"],
+) -> Float64[np.ndarray, "time taxels"]:
     """Smallest change of the neighbours, excluding the quarter that changed least."""
     around = np.where(_NEIGHBOURS >= 0, moved[:, _NEIGHBOURS], np.inf)
     around.sort(axis=2)
@@ -293,10 +297,10 @@ class TactileCalibration:
 
     side: Side
     num_cells: int
-    cells: Int64[np.ndarray, "320"]
-    tare_counts: Float64[np.ndarray, "320"]
-    gain_counts_per_kpa: Float64[np.ndarray, "320"]
-    state: UInt8[np.ndarray, "320"]
+    cells: Int64[np.ndarray, " taxels"]
+    tare_counts: Float64[np.ndarray, " taxels"]
+    gain_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    state: UInt8[np.ndarray, " taxels"]
 
     def __post_init__(self) -> None:
         if not (self.state == OK).any():
@@ -350,7 +354,7 @@ class TactileCalibration:
 
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
-    ) -> Float32[np.ndarray, "time 320"]:
+    ) -> Float32[np.ndarray, "time taxels"]:
         """Pressures in anatomical order; zero below the tare, NaN where the reading is.
 
         Args:
@@ -366,7 +370,7 @@ class TactileCalibration:
         taxels[:, (self.state if refused is None else refused) != OK] = 0.0
         return taxels.astype(np.float32)
 
-    def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time 320"]:
+    def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time taxels"]:
         """Readings [T, cells] by taxel; where there is no cell, those of any other.
 
         Raises:
@@ -382,7 +386,7 @@ class TactileCalibration:
 
 def unusable_taxels(
     calibration: TactileCalibration, pieces: Iterable[np.ndarray]
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     In addition to those that the glove's calibration refuses: cells that are constant but not at
@@ -437,7 +441,7 @@ class _TaxelTake:
         zeros = np.zeros((6, NUM_TAXELS))
         self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros
 
-    def add(self, counts: Float64[np.ndarray, "time 320"]) -> None:
+    def add(self, counts: Float64[np.ndarray, "time taxels"]) -> None:
         """The next readings."""
         if not len(counts):
             return
@@ -455,7 +459,7 @@ class _TaxelTake:
         self._last = counts[-1]
         self.num_samples += len(counts)
 
-    def _note_equal(self, equal: Bool[np.ndarray, "time 320"]) -> None:
+    def _note_equal(self, equal: Bool[np.ndarray, "time taxels"]) -> None:
         """Count equal readings in a row: the longest row that ended, and the one that has not."""
         at = np.arange(len(equal))[:, None]
         # Of each reading the last one before or at it that was new; before this block if negative.
@@ -466,7 +470,7 @@ class _TaxelTake:
         np.maximum.at(self._longest, columns, ended)
         self._kept = runs[-1]
 
-    def _note_random(self, offsets: Float64[np.ndarray, "time 320"]) -> None:
+    def _note_random(self, offsets: Float64[np.ndarray, "time taxels"]) -> None:
         """Count taxels whose readings have nothing to do with those before, nor with others'."""
         if len(offsets) < MIN_SAMPLES_TO_JUDGE:
             return
@@ -498,7 +502,7 @@ class _TaxelTake:
                 fault="unit",
             )
 
-    def faults(self) -> dict[int, Bool[np.ndarray, "320"]]:
+    def faults(self) -> dict[int, Bool[np.ndarray, " taxels"]]:
         """Taxels by reason; of several reasons the first one counts."""
         n, offset = self.num_samples, self._last - self._glove.tare_counts
         silent = (self._low == self._high) & (np.abs(offset) > self._margin)
@@ -512,7 +516,7 @@ class _TaxelTake:
             STUCK: silent,
         }
 
-    def _ended(self) -> Bool[np.ndarray, "320"]:
+    def _ended(self) -> Bool[np.ndarray, " taxels"]:
         """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.
 
         A stream that is frozen as a whole, and readings at full scale, are none of these.
@@ -553,7 +557,7 @@ def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
     return matrix[0]
 
 
-def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.ndarray, "320"]:
+def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.ndarray, " taxels"]:
     """The cell map of the calibration, or the default of our own gloves."""
     name = f"{glove}_cells"
     if name not in record:

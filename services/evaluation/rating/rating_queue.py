@@ -221,7 +221,7 @@ class RolloutPictures:
 
 
 def side_by_side(
-    image: UInt8[np.ndarray, "h w 3"], tactile_kpa: Float32[np.ndarray, "2 320"]
+    image: UInt8[np.ndarray, "h w 3"], tactile_kpa: Float32[np.ndarray, "2 taxels"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The image, enlarged, beside the taxel maps of the left and the right hand."""
     height, width = image.shape[:2]

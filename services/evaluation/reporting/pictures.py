@@ -41,7 +41,7 @@ class EpisodePicture:
     title: str
     times_s: Float64[np.ndarray, " n"]
     images: UInt8[np.ndarray, "n h w 3"]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class PredictionPicture:
     times_s: Float64[np.ndarray, " n"]
     true_images: UInt8[np.ndarray, "n h w 3"]
     predicted_images: UInt8[np.ndarray, "n h w 3"]
-    true_tactile_kpa: Float32[np.ndarray, "n 2 320"]
-    predicted_tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    true_tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
+    predicted_tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
 
 
 @dataclass(frozen=True)

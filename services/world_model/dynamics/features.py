@@ -347,7 +347,9 @@ class TouchCodec(nn.Module):
         self.register_buffer("peak_kpa", torch.full((), 1e3))
 
     @torch.no_grad()
-    def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
+    def fit(
+        self, tactile_kpa: Float32[Tensor, "n taxels"], *, peak_kpa: float | None = None
+    ) -> None:
         """Fit axes, scale and peak to training touch of single hands.
 
         Args:
@@ -362,12 +364,12 @@ class TouchCodec(nn.Module):
         peak = float(tactile_kpa.max()) if peak_kpa is None else peak_kpa
         self.peak_kpa.fill_(max(peak, FREE_KPA))
 
-    def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
+    def encode(self, tactile_kpa: Float32[Tensor, "*b taxels"]) -> Float32[Tensor, "*b channels"]:
         """Latents; pressures are clipped to 0 … peak."""
         bounded = torch.minimum(tactile_kpa, self.peak_kpa)
         return (root_pressure(bounded) @ self.basis) / self.scale
 
-    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b 320"]:
+    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b taxels"]:
         """Pressures in kPa between zero and the peak."""
         roots = ((latents * self.scale) @ self.basis.T).clamp_min(0.0)
         return torch.minimum(roots.square(), self.peak_kpa)

@@ -117,7 +117,7 @@ def stillness(
 
 
 def by_pad(
-    tactile_kpa: Float[np.ndarray, "*batch 2 320"], reduce: Callable[..., np.ndarray]
+    tactile_kpa: Float[np.ndarray, "*batch 2 taxels"], reduce: Callable[..., np.ndarray]
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
@@ -131,7 +131,7 @@ def by_pad(
 def first_steps(
     images: Sequence[UInt8[np.ndarray, "px px 3"]],
     Ks_head: Sequence[Float64[np.ndarray, "3 3"]],
-    tactile_kpa: Sequence[Float32[np.ndarray, "2 320"]],
+    tactile_kpa: Sequence[Float32[np.ndarray, "2 taxels"]],
     hands: Sequence[HandMotion],
     tasks: Sequence[int],
 ) -> FirstStep:
@@ -162,7 +162,7 @@ class SceneMemory:
     state: CoreState
     poses: ObjectPoses
     disagreement_m: Float32[Tensor, " batch"]
-    tactile_kpa: Float32[Tensor, "batch 2 320"]
+    tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     success: Float32[Tensor, "members batch"]
     points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
@@ -173,7 +173,7 @@ class _Run:
     """Predictions for a run of latent steps; as `ImaginedSteps`."""
 
     poses: ObjectPoses
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
     disagreement_m: Float32[Tensor, "batch latents"]
     distance: Float32[Tensor, "batch latents"]
     success: Float32[Tensor, "members batch latents"]
@@ -212,7 +212,7 @@ class DynamicsModel(nn.Module):
     def begin(
         self,
         first: FirstStep,
-        tactile_kpa: Float32[Tensor, "batch 2 320"],
+        tactile_kpa: Float32[Tensor, "batch 2 taxels"],
         holding: Commands,
         commanded: Float32[Tensor, " batch"],
         instruction: Float32[Tensor, "batch features"],
@@ -318,8 +318,10 @@ class DynamicsModel(nn.Module):
         )
 
     def decode_touch(
-        self, touch: Float32[Tensor, "*batch 2 channels"], taxels: Float32[Tensor, "*batch 2 320"]
-    ) -> Float32[Tensor, "*batch 2 320"]:
+        self,
+        touch: Float32[Tensor, "*batch 2 channels"],
+        taxels: Float32[Tensor, "*batch 2 taxels"],
+    ) -> Float32[Tensor, "*batch 2 taxels"]:
         """Pressures in kPa from latents and from contact log odds of each taxel.
 
         Taxels in contact have at least the contact threshold pressure, all others have none.

@@ -170,7 +170,7 @@ class PredictionRequest:
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
-    first_tactile_kpa: Float32[np.ndarray, "2 320"]
+    first_tactile_kpa: Float32[np.ndarray, "2 taxels"]
     actions: Float64[np.ndarray, "time 67"]
     action_kind: ActionKind
     instruction: str
@@ -184,7 +184,7 @@ class ModelInputs:
     """Batched tensors of requests in physical units; normalized inside the network."""
 
     first_image: UInt8[Tensor, "batch px px 3"]
-    first_tactile_kpa: Float32[Tensor, "batch 2 320"]
+    first_tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     hands: Float32[Tensor, "batch time 2 29"]
     camera: Float32[Tensor, "batch time 2 9"]
     layout: Float32[Tensor, "batch 2 9"]

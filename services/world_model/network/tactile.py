@@ -57,26 +57,26 @@ class TactileTokenizer(nn.Module, ABC):
         self.register_buffer("peak_kpa", torch.full((), UNKNOWN_PEAK_KPA))
 
     @abstractmethod
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit what follows from training touch in closed form, including `peak_kpa`."""
 
     @abstractmethod
     def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
     ) -> Float32[Tensor, "*batch tokens channels"]:
         """Latents; pressures below zero count as zero."""
 
     @abstractmethod
     def decode(
         self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    ) -> Float32[Tensor, "*batch taxels"]:
         """Pressures in kPa, never below zero."""
 
     def bounded(
         self,
-        tactile_kpa: Float32[Tensor, "batch steps 2 320"],
-        first_kpa: Float32[Tensor, "batch 2 320"],
-    ) -> Float32[Tensor, "batch steps 2 320"]:
+        tactile_kpa: Float32[Tensor, "batch steps 2 taxels"],
+        first_kpa: Float32[Tensor, "batch 2 taxels"],
+    ) -> Float32[Tensor, "batch steps 2 taxels"]:
         """Clip decoded pressures to the larger of the training peak and the first touch's peak."""
         highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
@@ -96,20 +96,20 @@ class LearnedTokenizer(TactileTokenizer):
         self.register_buffer("root_scale", torch.ones(()))
 
     @abstractmethod
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of scaled root pressures."""
 
     @abstractmethod
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Scaled root pressures of latents; values may be below zero."""
 
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit the scale and `peak_kpa`; the weights are learned by gradient."""
         self.root_scale.copy_(root_pressure(tactile_kpa).square().mean().sqrt().clamp_min(1e-3))
         self.peak_kpa.copy_(tactile_kpa.max())
 
     def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
     ) -> Float32[Tensor, "*batch tokens channels"]:
         """Latents; pressures below zero count as zero."""
         roots = root_pressure(tactile_kpa).reshape(-1, NUM_TAXELS) / self.root_scale
@@ -118,13 +118,13 @@ class LearnedTokenizer(TactileTokenizer):
 
     def decode(
         self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    ) -> Float32[Tensor, "*batch taxels"]:
         """Pressures in kPa, never below zero."""
         return self.roots(latents).clamp_min(0.0).square()
 
     def roots(
         self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    ) -> Float32[Tensor, "*batch taxels"]:
         """Root pressures (√kPa), which the loss compares; values may be below zero."""
         flat = latents.reshape(-1, self.num_tokens * self.channels)
         return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
@@ -268,13 +268,13 @@ class GridTokenizer(LearnedTokenizer):
         self.encoder, self.decoder = MapEncoder(shape), MapDecoder(shape)
         self.register_buffer("_cells", torch.from_numpy(canvas_cells()), persistent=False)
 
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of the canvas."""
         canvas = roots.new_zeros(len(roots), CANVAS_SHAPE[0] * CANVAS_SHAPE[1])
         canvas[:, self._cells] = roots
         return self.encoder(canvas.reshape(-1, 1, *CANVAS_SHAPE)).flatten(1)
 
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Root pressures at the taxels' cells."""
         return self.decoder(latents[:, None]).flatten(1)[:, self._cells]
 
@@ -300,13 +300,13 @@ class SplitHandsTokenizer(LearnedTokenizer):
         self.tip_encoder, self.tip_decoder = MapEncoder(tip), MapDecoder(tip)
         self.palm_encoder, self.palm_decoder = MapEncoder(palm), MapDecoder(palm)
 
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of the five fingertips, then of the palm."""
         tips = split_axis(roots[:, :NUM_TIP_TAXELS], 1, (NUM_FINGERTIPS, *TIP_SHAPE))
         palm = split_axis(roots[:, NUM_TIP_TAXELS:], 1, (1, *PALM_SHAPE))
         return torch.cat([self.tip_encoder(tips), self.palm_encoder(palm)], dim=1).flatten(1)
 
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Root pressures of the five fingertips, then of the palm."""
         pads = split_axis(latents, 1, (NUM_PADS, -1))
         tips = self.tip_decoder(pads[:, :NUM_FINGERTIPS]).flatten(1)
@@ -330,7 +330,7 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         self.register_buffer("palm_basis", torch.eye(num_palm, config.palm_channels))
         self.register_buffer("palm_scale", torch.ones(config.palm_channels))
 
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit scales and palm axes to training touch (both hands alike)."""
         roots = root_pressure(tactile_kpa).double()
         palms = roots[..., NUM_TIP_TAXELS:].reshape(-1, NUM_TAXELS - NUM_TIP_TAXELS)
@@ -343,7 +343,7 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         self.peak_kpa.copy_(tactile_kpa.max())
 
     def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
     ) -> Float32[Tensor, "*batch 1 channels"]:
         """Latents; pressures below zero count as zero."""
         roots = root_pressure(tactile_kpa)
@@ -353,7 +353,7 @@ class PrincipalAxesTokenizer(TactileTokenizer):
 
     def decode(
         self, latents: Float32[Tensor, "*batch 1 channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    ) -> Float32[Tensor, "*batch taxels"]:
         """Pressures in kPa, never below zero."""
         tips = latents[..., 0, :NUM_TIP_TAXELS] * self.tip_scale
         palm = (latents[..., 0, NUM_TIP_TAXELS:] * self.palm_scale) @ self.palm_basis.T

@@ -61,7 +61,7 @@ class EpisodeArrays:
     instruction: str
     scene: str
     images: UInt8[np.ndarray, "steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     tactile_valid: Bool[np.ndarray, "steps 2"]
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
     anchor: AnchorPoses
@@ -72,7 +72,7 @@ class EpisodeArrays:
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
-    measured_taxels: Bool[np.ndarray, "2 320"] = field(
+    measured_taxels: Bool[np.ndarray, "2 taxels"] = field(
         default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
     )
 
@@ -140,9 +140,9 @@ class Window:
 
     request: PredictionRequest
     images: UInt8[np.ndarray, "time h w 3"]
-    tactile_kpa: Float32[np.ndarray, "time 2 320"]
+    tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
     tactile_valid: Bool[np.ndarray, "time 2"]
-    measured_taxels: Bool[np.ndarray, "2 320"]
+    measured_taxels: Bool[np.ndarray, "2 taxels"]
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class WindowBatch:
 
     requests: list[PredictionRequest]
     images: UInt8[Tensor, "batch time px px 3"]
-    tactile_kpa: Float32[Tensor, "batch time 2 320"]
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     tactile_valid: Bool[Tensor, "batch time 2"]
 
 

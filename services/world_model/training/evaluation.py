@@ -35,8 +35,8 @@ class Futures:
     """Images and pressures after the first step, for all windows."""
 
     images: UInt8[np.ndarray, "n steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
-    measured: Bool[np.ndarray, "n steps 2 320"] | None = None
+    tactile_kpa: Float32[np.ndarray, "n steps 2 taxels"]
+    measured: Bool[np.ndarray, "n steps 2 taxels"] | None = None
 
 
 def evaluate_prediction(

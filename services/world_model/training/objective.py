@@ -117,7 +117,7 @@ def losses(
 
 
 def contact_or_changing(
-    tactile_kpa: Float32[Tensor, "batch time 2 320"], num_tokens: int
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"], num_tokens: int
 ) -> Bool[Tensor, "batch time 2 tokens"]:
     """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
 

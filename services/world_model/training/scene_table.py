@@ -82,11 +82,11 @@ class SceneTable:
     commanded: Bool[Tensor, " episodes"]
     Ts_world_camera: Float32[Tensor, "episodes steps 4 4"]
     objects: ObjectPoses
-    tactile_kpa: Float16[Tensor, "episodes steps 2 320"]
+    tactile_kpa: Float16[Tensor, "episodes steps 2 taxels"]
     pads_kpa: Float32[Tensor, "episodes steps 12"]
     in_contact: Bool[Tensor, "episodes steps 12"]
     felt: Bool[Tensor, "episodes steps 2"]
-    measured_taxels: Bool[Tensor, "episodes 2 320"]
+    measured_taxels: Bool[Tensor, "episodes 2 taxels"]
     images: UInt8[Tensor, "episodes images px px 3"]
     shown: Bool[Tensor, "episodes images"]
     image_steps: tuple[int, ...]
@@ -336,7 +336,7 @@ def _filled(
 
 def _touch(
     episodes: Sequence[EpisodeGrid], num_steps: int
-) -> tuple[Float16[np.ndarray, "episodes steps 2 320"], Bool[np.ndarray, "episodes steps 2"]]:
+) -> tuple[Float16[np.ndarray, "episodes steps 2 taxels"], Bool[np.ndarray, "episodes steps 2"]]:
     """Pressures (kPa) at every step, those of unmeasured taxels filled, and which hands count."""
     tactile, felt = [], []
     for one in episodes:
@@ -350,7 +350,7 @@ def _touch(
 
 def filled_touch(
     episode: EpisodeGrid,
-) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
     """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
 
     They have the pressure of the nearest one of their pad that was measured, or none.
@@ -362,7 +362,7 @@ def filled_touch(
     return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known, is_sampled
 
 
-def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:
+def _nearest_measured(measured: Bool[np.ndarray, " taxels"]) -> Int64[np.ndarray, " taxels"]:
     """For each taxel the nearest measured one in rows and columns of its pad, or itself."""
     nearest = np.arange(NUM_TAXELS)
     if measured.all():

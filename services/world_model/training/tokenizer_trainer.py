@@ -58,7 +58,7 @@ class TactileHands:
     `data_hash` is that of their episodes.
     """
 
-    tactile_kpa: Float32[np.ndarray, "hands 320"]
+    tactile_kpa: Float32[np.ndarray, "hands taxels"]
     scenes: tuple[str, ...]
     data_hash: str
 
@@ -207,7 +207,10 @@ def _learn(
 
 
 def reconstruction_loss(
-    tokenizer: LearnedTokenizer, tactile_kpa: Float32[Tensor, "hands 320"], *, contact_weight: float
+    tokenizer: LearnedTokenizer,
+    tactile_kpa: Float32[Tensor, "hands taxels"],
+    *,
+    contact_weight: float,
 ) -> Float32[Tensor, ""]:
     """Weighted mean squared error of root pressures (kPa).
 
@@ -240,8 +243,8 @@ def reconstruction(
 
 @torch.no_grad()
 def _through(
-    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands 320"]
-) -> Float32[np.ndarray, "hands 320"]:
+    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands taxels"]
+) -> Float32[np.ndarray, "hands taxels"]:
     return tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa))).numpy()
 
 

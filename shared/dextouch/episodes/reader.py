@@ -74,7 +74,7 @@ class Window:
 
     images: dict[str, UInt8[np.ndarray, "n h w c"]]
     image_dt_ns: dict[str, Int64[np.ndarray, " n"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
     tactile_valid: Bool[np.ndarray, "n 2"]
     actions: Float64[np.ndarray, "n 67"]
     action_kind: ActionKind
@@ -83,7 +83,7 @@ class Window:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"] | None
     actions_measured: Bool[np.ndarray, "n 67"]
-    taxels_measured: Bool[np.ndarray, "2 320"]
+    taxels_measured: Bool[np.ndarray, "2 taxels"]
 
     def __len__(self) -> int:
         return len(self.t_ref_ns)
@@ -371,7 +371,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
 
     def touch(
         self, start: int, num_steps: int
-    ) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+    ) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
         """Mean pressures (kPa) of steps, and where there was a sample; as in `window`."""
         self._check_steps(start, num_steps)
         left, right = (self._tactile(side, start, start + num_steps) for side in SIDES)

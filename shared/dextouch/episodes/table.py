@@ -286,12 +286,12 @@ class EpisodeGrid:
             return self.measured
         return self.reader.read("action_commanded").values.astype(np.float64)
 
-    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
         """Mean pressures (kPa) of each step, and where there was a sample."""
         return self.reader.touch(0, len(self))
 
     @property
-    def measured_taxels(self) -> Bool[np.ndarray, "2 320"]:
+    def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
         return measured_taxels(self.about.calibration)
 

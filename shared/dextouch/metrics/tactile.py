@@ -17,7 +17,7 @@ PEAK_KPA = 40.0
 SSIM_WINDOW_TAXELS = 4
 
 
-Measured = Bool[np.ndarray, "*batch 320"] | None
+Measured = Bool[np.ndarray, "*batch taxels"] | None
 
 
 def _pair(

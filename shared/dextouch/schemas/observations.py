@@ -90,7 +90,7 @@ class Observation:
 
     first_step: int
     images: dict[str, UInt8[np.ndarray, "n h w 3"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
     action_reached: Float64[np.ndarray, "n 67"]
     reached_is_measured: bool
     success: bool | None = None

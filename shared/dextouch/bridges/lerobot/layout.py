@@ -294,7 +294,7 @@ def _at(
 
 def _tactile(
     reader: EpisodeReader, t_ns: np.ndarray
-) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
     kpa = np.zeros((len(t_ns), 2, NUM_TAXELS), dtype=np.float32)
     valid = np.zeros((len(t_ns), 2), dtype=bool)
     for hand, side in enumerate(SIDES):
