@@ -84,7 +84,7 @@ def imagine_episode(
             "quality": attributes.quality | rollout_uncertainty(seen).to_quality(),
         }
     )
-    write_rollout(store, imagined, seen, actions)
+    write_rollout(store, imagined, seen, actions, layout=description.tactile_layout)
     return name
 
 

@@ -275,4 +275,10 @@ def keep_rollout(
             ),
         ),
     )
-    write_rollout(store, attributes, played.observations, played.commanded)
+    write_rollout(
+        store,
+        attributes,
+        played.observations,
+        played.commanded,
+        layout=world.tactile_layout,
+    )
