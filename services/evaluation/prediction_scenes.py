@@ -15,6 +15,7 @@ from dextouch.metrics import geometry as depth_metrics
 from dextouch.metrics import trajectory as trajectory_metrics
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from dextouch.worlds import ReconstructingWorld, World
 
 BACKGROUND, TABLE, FIRST_BODY = 0, 1, 2
@@ -162,7 +163,7 @@ class Scene:
     """Start at a step of an episode, its actions from there, and the true future.
 
     `geometry` is that of the true images, if it is known, and `first_objects_m` are the positions
-    of the objects at the start, as in `Future`.
+    of the objects at the start, as in `Future`. `layout` is that of the taxels.
     """
 
     episode_id: str
@@ -173,6 +174,7 @@ class Scene:
     first_step: int = 0
     geometry: SceneGeometry | None = None
     first_objects_m: Float64[np.ndarray, "objects 3"] | None = None
+    layout: TactileLayout = DEXTOUCH_V1
 
     @property
     def first(self) -> Observation:
@@ -253,6 +255,7 @@ def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: in
         about.model_rate_hz,
         first_step,
         first_objects_m=_objects_m(grid, first_step),
+        layout=grid.tactile_layout,
     )
 
 

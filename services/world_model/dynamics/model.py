@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.dynamics.core import (
     NUM_PADS,
     CoreState,
@@ -117,15 +117,16 @@ def stillness(
 
 
 def by_pad(
-    tactile_kpa: Float[np.ndarray, "*batch 2 taxels"], reduce: Callable[..., np.ndarray]
+    tactile_kpa: Float[np.ndarray, "*batch 2 taxels"],
+    reduce: Callable[..., np.ndarray],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    `reduce` takes the taxels of a pad and an axis, such as `np.mean`.
+    `reduce` takes the taxels of a pad and an axis, such as `np.mean`. A part of the hand without
+    taxels has the pressure 0.
     """
-    tips, palm = split_pads(tactile_kpa)
-    pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
-    return np.concatenate(pads, axis=-1).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
+    return layout.by_part(tactile_kpa, reduce).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
 
 
 def first_steps(
@@ -134,6 +135,7 @@ def first_steps(
     tactile_kpa: Sequence[Float32[np.ndarray, "2 taxels"]],
     hands: Sequence[HandMotion],
     tasks: Sequence[int],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> FirstStep:
     """A batch of observed steps as inputs of the readers; `hands` are of one step each."""
     return FirstStep(
@@ -141,7 +143,7 @@ def first_steps(
         torch.from_numpy(np.stack(Ks_head)).float(),
         torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
         torch.from_numpy(np.concatenate([one.points_m for one in hands])),
-        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean)),
+        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean, layout)),
         torch.tensor(tasks),
     )
 
@@ -199,7 +201,7 @@ class DynamicsModel(nn.Module):
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
         super().__init__()
         self.config = config
-        self.codec = TouchCodec(config.touch_channels)
+        self.codec = TouchCodec(config.touch_channels, config.tactile_layout.num_taxels)
         self.eyes = nn.ModuleList(StartReader(config) for _ in range(num_members))
         self.core = RecurrentCore(config, num_members)
         self._predict: Callable[..., tuple[CoreState, _Run]] = self._predicted
@@ -455,7 +457,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         state=state,
         poses=poses(1),
         disagreement_m=zeros(1),
-        tactile_kpa=zeros(1, 2, NUM_TAXELS),
+        tactile_kpa=zeros(1, 2, config.tactile_layout.num_taxels),
         success=zeros(members, 1),
         points_m=zeros(1, 2, NUM_POINTS, 3),
         num_still=zeros(1, dtype=torch.int64),
