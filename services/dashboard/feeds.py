@@ -118,7 +118,8 @@ def pose_message(ages_s: Mapping[str, float | None], arrays: Mapping[str, np.nda
 
 logger = structlog.get_logger(__name__)
 
-MAX_LIVE_BYTES = 64 * 1024
+# Pressures of two gloves of 4096 taxels, and their layouts as JSON.
+MAX_LIVE_BYTES = 256 * 1024
 MAX_HISTORY_BYTES = 1024 * 1024
 # Of the small plots: two minutes, two rows a point.
 TREND_ROWS = 120

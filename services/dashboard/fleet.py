@@ -16,7 +16,8 @@ from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import CameraLive, HealthLevel, HoursByField, StationOverview, first_problems
 from dextouch.streams import unpack
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, TactileLayout
+from dextouch.tactile import LayoutDescription
+from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.dashboard.feeds import MAX_LIVE_BYTES, Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import trouble
@@ -48,7 +49,7 @@ class Tile(FrozenModel):
     disk_free_bytes: float | None = None
     camera: CameraLive | None = None
     gloves: tuple[str, ...] = ()
-    layouts: dict[str, TactileLayout] = Field(default={}, exclude_if=not_)
+    layouts: dict[str, LayoutDescription] = Field(default={}, exclude_if=not_)
 
 
 class WatchedStation:

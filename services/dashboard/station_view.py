@@ -22,7 +22,7 @@ from dextouch.schemas import (
     TaxelState,
     UploadStatus,
 )
-from dextouch.tactile.layout import TactileLayout
+from dextouch.tactile import LayoutDescription
 from services.dashboard.upstream import Upstream
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
@@ -100,7 +100,7 @@ class GloveView(FrozenModel):
 
     taxels: dict[TaxelState, tuple[int, ...]]
     tare_age_s: float | None
-    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
 class StationView(FrozenModel):

@@ -103,7 +103,9 @@ class ModelWorld(BatchWorld[ModelState]):
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
             predicts_touch=config.use_touch,
-            tactile_layout=config.layout if isinstance(config, GloveNetworkConfig) else None,
+            tactile_layout=(
+                config.tactile_layout if isinstance(config, GloveNetworkConfig) else None
+            ),
         )
 
     @property

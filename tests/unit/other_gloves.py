@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from dextouch.tactile.layout import RawCells, TactileLayout, TactilePad
+from dextouch.tactile import RawCells, TactilePad
+from dextouch.tactile.layout import TactileLayout
 
 TIP_AREA_M2, PALM_AREA_M2 = 12e-6, 80e-6
 ORIGINS = ((7, 20), (2, 13), (0, 8), (2, 3), (5, 0))

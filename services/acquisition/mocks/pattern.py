@@ -12,7 +12,8 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
-from dextouch.tactile.layout import DEXTOUCH_V1, PADS, SIDES, Side, TactileLayout
+from dextouch.tactile import PADS
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, Side, TactileLayout
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64

@@ -24,6 +24,7 @@ from dextouch.schemas import (
     WorldDescription,
     matrix_rows,
 )
+from dextouch.tactile.layout import TactileLayout
 from services.evaluation.closed_loop import PlayedRollout
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
@@ -280,5 +281,5 @@ def keep_rollout(
         attributes,
         played.observations,
         played.commanded,
-        layout=world.tactile_layout,
+        layout=TactileLayout.of(world.tactile_layout),
     )

@@ -18,7 +18,8 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
-from dextouch.tactile.layout import DEXTOUCH_V1, MAX_CELLS, NUM_TAXELS, TactileLayout
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
 from services.networks.principal_axes import principal_axes, root_pressure
 from services.networks.subwords import subwords
 from services.world_model.dynamics.trees import mapped

@@ -1,15 +1,18 @@
 """Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
-from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from dextouch.tactile import LayoutDescription
 
 if TYPE_CHECKING:
     import torch
+
+    from dextouch.tactile.layout import TactileLayout
 
 
 Sampler = Literal["euler", "unipc"]
@@ -220,12 +223,16 @@ class NetworkConfig(FrozenModel):
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
 
     @property
-    def tactile_layout(self) -> TactileLayout:
+    def tactile_layout(self) -> "TactileLayout":
         """Layout of the taxels that the network feels."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
         return DEXTOUCH_V1
 
-    def with_layout(self, layout: TactileLayout) -> "NetworkConfig":
+    def with_layout(self, layout: "TactileLayout") -> "NetworkConfig":
         """The configuration of a network for the taxels of another glove."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
         if layout == self.tactile_layout:
             return self
         known = {name: getattr(self, name) for name in NetworkConfig.model_fields}
@@ -307,9 +314,11 @@ def num_latents(num_steps: int) -> int:
 class GloveNetworkConfig(NetworkConfig):
     """Shape of a joint model of a glove other than `dextouch_v1`; training data say its layout."""
 
-    layout: TactileLayout
+    layout: LayoutDescription
 
-    @property
-    def tactile_layout(self) -> TactileLayout:
+    @cached_property
+    def tactile_layout(self) -> "TactileLayout":
         """Layout of the taxels that the network feels."""
-        return self.layout
+        from dextouch.tactile.layout import TactileLayout  # not for a parser
+
+        return TactileLayout.model_validate(self.layout.model_dump())

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from dextouch.tactile.layout import PADS, TactileLayout
+from dextouch.tactile import PADS
+from dextouch.tactile.layout import TactileLayout
 from services.networks.principal_axes import principal_axes, root_pressure, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,

@@ -9,7 +9,7 @@ from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
-from dextouch.tactile.layout import TactileLayout
+from dextouch.tactile import LayoutDescription
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
@@ -246,7 +246,7 @@ class PlayedStream(FrozenModel):
     gaps_ns: tuple[tuple[int, int], ...] = ()
     interpolated: tuple[InterpolatedSpan, ...] = ()
     unmeasured_taxels: tuple[int, ...] = ()
-    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
 class Playback(FrozenModel):

@@ -38,7 +38,8 @@ from dextouch.schemas.rollouts import (
     Uncertainty,
 )
 from dextouch.streams import pack, unpack
-from dextouch.tactile.layout import MAX_CELLS, NUM_TAXELS
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import NUM_TAXELS
 
 # Tolerance of the norm of a unit quaternion in float32.
 QUATERNION_TOLERANCE: Final = 1e-3

@@ -9,11 +9,13 @@ from pydantic import ConfigDict, Field, model_validator
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION
-from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from dextouch.tactile import LayoutDescription
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
+# Of one hand of a `dextouch_v1`.
+_USUAL_TAXELS: Final = 320
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
 # policies, models in the paper's form and comparisons have.
 CHUNK_STEPS: Final = 16
@@ -74,12 +76,14 @@ class WorldDescription(FrozenModel):
     object_names: dict[str, tuple[str, ...]] = Field(default={})
     predicts_touch: bool = Field(default=True, exclude_if=bool)
     scales_images: bool = Field(default=False, exclude_if=not_)
-    tactile_layout: TactileLayout | None = Field(default=None, exclude_if=lambda one: one is None)
+    tactile_layout: LayoutDescription | None = Field(
+        default=None, exclude_if=lambda one: one is None
+    )
 
     @property
     def num_taxels(self) -> int:
         """Taxels of one hand in observations."""
-        return (self.tactile_layout or DEXTOUCH_V1).num_taxels
+        return _USUAL_TAXELS if self.tactile_layout is None else self.tactile_layout.num_taxels
 
 
 class WorldList(FrozenModel):

@@ -8,7 +8,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
-from dextouch.tactile.layout import TactileLayout
+from dextouch.tactile import LayoutDescription
 
 RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
@@ -215,7 +215,7 @@ class StreamHealth(FrozenModel):
     clock_residual_ms: float | None = None
     taxels: dict[TaxelState, tuple[int, ...]] = Field(default_factory=dict)
     tare_age_s: float | None = None
-    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
     following: RobotFollowing | None = None
 
 
@@ -304,7 +304,7 @@ class StationOverview(FrozenModel):
     disk_left_s: float | None = None
     disk_free_bytes: float | None = None
     cameras: tuple[CameraLive, ...] = ()
-    layouts: dict[str, TactileLayout] = Field(default={}, exclude_if=not_)
+    layouts: dict[str, LayoutDescription] = Field(default={}, exclude_if=not_)
 
 
 class HealthEvent(FrozenModel):
