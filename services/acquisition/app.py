@@ -8,7 +8,9 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.episodes import disk_errors
+from dextouch.errors import InvalidInputError
 from dextouch.serving import create_service_app, serve
+from dextouch.tactile import read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.follow_watch import MakeFollowCheck
@@ -46,17 +48,24 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
     from services.acquisition.mocks.faults import FaultScript
     from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 
-    streams, known = pattern_streams(), pattern_calibration()
+    links = settings.mock_links
+    layout = None if links.layout is None else read_layout(links.layout)
+    streams, known = pattern_streams(layout=layout), pattern_calibration()
     if settings.mock_store is not None and settings.mock_episode_id is not None:
         from dextouch.episodes import EpisodeStore
         from services.acquisition.mocks.replay import replay_calibration, replay_streams
 
+        if layout is not None:
+            raise InvalidInputError(
+                f"mock station: got layout {layout.name!r} and an episode to play, expected one of "
+                "them: an episode says the layout of its gloves"
+            )
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
     elif settings.mock_practice:
         from services.acquisition.mocks.pattern import practice_streams
 
-        streams, known = practice_streams(settings.seed), {}
+        streams, known = practice_streams(settings.seed, layout=layout), {}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
@@ -66,7 +75,7 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
         spool_root=settings.spool,
         name=settings.station,
         calibration={**known, **load_calibration(settings.calibration)},
-        links=settings.mock_links,
+        links=links,
         safety=settings,
         follow=follow,
     )

@@ -1,5 +1,6 @@
 """Settings of a mock station's connections: links and protocols of its devices."""
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, field_validator
@@ -13,6 +14,9 @@ class MockLinks(FrozenModel):
 
     gloves: str = Field(
         default="tactile_glove", description="kind of both gloves, built in or of another package"
+    )
+    layout: Path | None = Field(
+        default=None, description="file with the layout of both gloves, of a pattern that is played"
     )
     trackers: Literal["hid", "bridge"] = Field(
         default="hid", description="connection of finger and pose trackers"

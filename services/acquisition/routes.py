@@ -171,7 +171,7 @@ def live_router(station: Station) -> APIRouter:
 
     @router.get("/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
     async def taxels() -> Response:
-        """Newest pressures (kPa, float32 [320]) of the gloves that are heard, packed."""
+        """Newest pressures (kPa, float32 [taxels]) of the gloves that are heard, packed."""
         pressures = station.live.pressures_kpa(station.clock.now_ns())
         return Response(pack({}, pressures), media_type=MSGPACK)
 
@@ -213,6 +213,13 @@ def station_overview(station: Station) -> StationOverview:
         disk_left_s=health.figures.get("disk_left_seconds"),
         disk_free_bytes=health.figures.get("disk_free_bytes"),
         cameras=tuple(station.live.cameras(station.clock.now_ns())),
+        layouts={
+            stream.hand: stream.layout
+            for stream in health.streams
+            if stream.layout is not None
+            and stream.hand
+            and stream.stream == f"tactile_{stream.hand}"
+        },
     )
 
 

@@ -180,7 +180,7 @@ class LiveView:
             self._newest[name] = samples[-1]
             self._num_images[name] = self._num_images.get(name, 0) + len(samples)
 
-    def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
+    def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, " taxels"]]:
         """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones.
 
         Taxels that the glove has not, or from which it has no reading, are 0.

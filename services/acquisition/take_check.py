@@ -19,7 +19,6 @@ from dextouch.schemas import (
     TakeProblem,
 )
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.follow_watch import FollowCounts, FollowWatch
@@ -148,7 +147,7 @@ class StreamFacts:
         side, low, high = self.descriptor.side, self.counters.low_counts, self.counters.high_counts
         if side is None or low is None or high is None or not is_ours(self.descriptor):
             return {}
-        return count_taxels(low, high, side=side)
+        return count_taxels(low, high, side=side, layout=self.descriptor.tactile_layout)
 
     def problems(self) -> Iterator[TakeProblem]:
         """What is wrong with the stream's samples."""
@@ -176,7 +175,8 @@ class StreamFacts:
         for event, count in self.taxels().items():
             if count:
                 text = f"{count} {event.replace('_', ' ')} during the whole take"
-                is_error = count >= CODES["taxels_dead"].error * NUM_TAXELS
+                num_taxels = self.descriptor.tactile_layout.num_taxels
+                is_error = count >= CODES["taxels_dead"].error * num_taxels
                 yield _problem(name, event, "ERROR" if is_error else "WARN", text)
 
 

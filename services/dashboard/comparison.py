@@ -297,7 +297,7 @@ def compared(real: Observation, imagined: Observation) -> tuple[dict[str, tuple[
     """Errors of every step, and the message with both worlds' images and touch.
 
     The message is laid out as that of `steps_message`, with the real world first in every array:
-    touch [2, steps, 2, 320] and images [2, steps, height, width, 3].
+    touch [2, steps, 2, num_taxels] and images [2, steps, height, width, 3].
     """
     images = [seen.images[HEAD_CAMERA] for seen in (real, imagined)]
     touch = [seen.tactile_kpa for seen in (real, imagined)]
@@ -317,7 +317,7 @@ def compared(real: Observation, imagined: Observation) -> tuple[dict[str, tuple[
     }
     _, height, width, _ = images[0].shape
     header = {"first_step": real.first_step, "num_steps": len(real)}
-    header |= {"height": height, "width": width}
+    header |= {"height": height, "width": width, "num_taxels": touch[0].shape[-1]}
     parts = [np.ascontiguousarray(np.stack(touch), "<f4").tobytes(), np.stack(images).tobytes()]
     return errors, packed_message(COMPARISON_MESSAGE, header, parts)
 

@@ -31,8 +31,8 @@ from dextouch.schemas import (
     UploadStatus,
 )
 from dextouch.streams import unpack
-from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, SIDES, Side, raw_indices
+from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, Side
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import (
     RecorderView,
@@ -61,18 +61,32 @@ def skeleton_bones() -> list[tuple[int, int]]:
 
 
 def heatmap_layout() -> dict[str, object]:
-    """Positions of the 320 taxels and the colour map, from `dextouch.tactile`."""
-    taxels = np.arange(NUM_TAXELS, dtype=np.float32)
-    canvases = {side: hand_canvas(taxels, side=side) for side in SIDES}
+    """Positions of the taxels of `dextouch_v1` and the colour map, from `dextouch.tactile`.
+
+    Those of other gloves the page finds from their layout (`static/layouts.js`).
+    """
+    layout = DEXTOUCH_V1
+    taxels = np.arange(layout.num_taxels, dtype=np.float32)
+    canvases = {side: layout.hand_canvas(taxels, side=side) for side in SIDES}
     rows, columns = canvases["right"].shape
     pressures_kpa = np.linspace(0.0, FULL_SCALE_KPA, RAMP_STEPS)
     return {
         "rows": rows,
         "columns": columns,
-        # NaN sorts last: the first 320 are the cells of the taxels in their order.
-        "cells": {s: np.argsort(c.ravel())[:NUM_TAXELS].tolist() for s, c in canvases.items()},
-        "num_raw_cells": NUM_RAW_TAXELS,
-        "raw_cells": {s: raw_indices(side=s).tolist() for s in SIDES},
+        # NaN sorts last: the first ones are the cells of the taxels in their order.
+        "cells": {s: np.argsort(c.ravel())[: len(taxels)].tolist() for s, c in canvases.items()},
+        "pads": [
+            {
+                "part": pad.part,
+                "start": start,
+                "rows": pad.rows,
+                "columns": pad.columns,
+                "taxel_area_mm2": 1e6 * pad.taxel_area_m2,
+            }
+            for pad, start in zip(layout.pads, layout.starts, strict=True)
+        ],
+        "num_raw_cells": layout.num_raw_cells,
+        "raw_cells": {s: layout.raw_indices(s).tolist() for s in SIDES},
         "ramp": colour(pressures_kpa, full_scale_kpa=FULL_SCALE_KPA).tolist(),
         "full_scale_kpa": FULL_SCALE_KPA,
         "contact_kpa": CONTACT_THRESHOLD_KPA,
@@ -104,7 +118,8 @@ def pose_message(ages_s: Mapping[str, float | None], arrays: Mapping[str, np.nda
 
 logger = structlog.get_logger(__name__)
 
-MAX_LIVE_BYTES = 64 * 1024
+# Pressures of two gloves of 4096 taxels, and their layouts as JSON.
+MAX_LIVE_BYTES = 256 * 1024
 MAX_HISTORY_BYTES = 1024 * 1024
 # Of the small plots: two minutes, two rows a point.
 TREND_ROWS = 120

@@ -171,8 +171,8 @@ def steps_message(topic: str, response: bytes) -> bytes:
     """Encode the steps of a response for the page.
 
     uint8 kind, three bytes of padding, uint32 size of the header, the header as JSON, then touch,
-    float32 [steps, 2, 320] in kPa, and per camera uint8 [steps, height, width, 3], RGB; little
-    endian, the header padded to a multiple of four bytes.
+    float32 [steps, 2, num_taxels] in kPa, and per camera uint8 [steps, height, width, 3], RGB;
+    little endian, the header padded to a multiple of four bytes.
 
     Raises:
         InvalidInputError: not a response of a rollout.
@@ -195,6 +195,7 @@ def steps_message(topic: str, response: bytes) -> bytes:
         "num_steps": num_steps,
         "steps": (fields["observation"]["first_step"] + kept).tolist(),
         "has_touch": touch is not None,
+        "num_taxels": 0 if touch is None else touch.shape[-1],
         "cameras": [
             {"name": name, "height": array.shape[1], "width": array.shape[2]}
             for name, array in images.items()

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 from urllib.parse import quote
 
+from pydantic import Field
+
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
@@ -20,6 +22,7 @@ from dextouch.schemas import (
     TaxelState,
     UploadStatus,
 )
+from dextouch.tactile import LayoutDescription
 from services.dashboard.upstream import Upstream
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
@@ -90,10 +93,14 @@ class RecorderView(FrozenModel):
 
 
 class GloveView(FrozenModel):
-    """Taxels of a glove that are out of order, by their state, and the age of its tare."""
+    """Taxels of a glove that are out of order, by their state, and the age of its tare.
+
+    `layout` is that of its taxels, None of `dextouch_v1`.
+    """
 
     taxels: dict[TaxelState, tuple[int, ...]]
     tare_age_s: float | None
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
 class StationView(FrozenModel):
@@ -159,7 +166,7 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
         streams=streams,
         recorder=recorder_view(recorder),
         gloves={
-            item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s)
+            item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s, layout=item.layout)
             for item in station.streams
             if item.hand is not None and item.stream == f"tactile_{item.hand}"
         },

@@ -57,6 +57,7 @@ GAP_PERIODS = 1.5
 MAX_GAPS = 50
 MAX_IMAGES = 240
 QUALITY = 85
+TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 Reader = EpisodeReader | RecordingReader
 # Limits of one request: signals, and bytes of samples that are read for it.
 MAX_SIGNALS = 16
@@ -367,12 +368,12 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     steps_ns = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
     longest = np.sort(gaps[np.argsort(steps_ns[gaps], kind="stable")[-MAX_GAPS:]])
-    calibration = reader.attributes.calibration
+    calibration, num_taxels = reader.attributes.calibration, stream.tactile_layout.num_taxels
     spans = interpolated_spans(calibration) if stream.name.startswith("action") else []
     taxels = np.zeros(0, dtype=np.int64)
-    for side, measured in zip(SIDES, measured_taxels(calibration), strict=True):
-        if stream.name == f"tactile_{side}":
-            taxels = np.flatnonzero(~measured)
+    if stream.name in TOUCH_STREAMS:
+        measured = measured_taxels(calibration, num_taxels)
+        taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
     return PlayedStream(
         name=stream.name,
         kind=stream.kind,
@@ -391,6 +392,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
+        layout=stream.layout,
     )
 
 

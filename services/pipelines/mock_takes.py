@@ -36,7 +36,7 @@ from dextouch.schemas import (
     matrix_rows,
     object_stream,
 )
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.faults import FaultScript
@@ -155,10 +155,11 @@ def measure_gloves(
         take = station.run_take(CALIBRATION)
         if not isinstance(clock, VirtualClock):
             found = _path_delays(station, [f"tactile_{side}" for side in gloves])
-    for side in gloves:
+    for side, glove in gloves.items():
         rest, *pressed = _parts(take, side)
-        tare = measure_tare(rest, side=side)
-        everywhere = np.ones(NUM_TAXELS, dtype=np.bool_)
+        layout = glove.descriptor.tactile_layout
+        tare = measure_tare(rest, side=side, layout=layout)
+        everywhere = np.ones(layout.num_taxels, dtype=np.bool_)
         presses = [
             TaxelPress(kpa, PRESSURE_SIGMA * kpa, counts, everywhere)
             for kpa, counts in zip(PRESSURES_KPA, pressed, strict=True)
@@ -198,10 +199,11 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
     per_part = round(PART_S * 1e9 / period_ns)
     values = np.repeat(true_kpa.astype(np.float32), per_part)[:, None]
     t_ns = np.arange(len(values), dtype=np.int64) * period_ns
-    return ReplayStream(stream.descriptor, t_ns, np.repeat(values, NUM_TAXELS, axis=1))
+    (num_taxels,) = stream.descriptor.shape
+    return ReplayStream(stream.descriptor, t_ns, np.repeat(values, num_taxels, axis=1))
 
 
-def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time 360"]]:
+def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
     """Counts of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)

@@ -13,6 +13,7 @@ from dextouch.episodes import Split, scene_fraction, scene_of, split_of_scene
 from dextouch.errors import ConflictError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, EpisodeAttributes
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.networks.weight_files import (
     MAX_FILE_BYTES,
     available_memory,
@@ -28,7 +29,11 @@ from services.networks.weight_files import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.network.configuration import NetworkConfig, TokenizerName
+from services.world_model.network.configuration import (
+    GloveNetworkConfig,
+    NetworkConfig,
+    TokenizerName,
+)
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
 from services.world_model.rendering.configuration import RendererConfig
@@ -77,7 +82,7 @@ class CheckpointMetadata(FrozenModel):
 
     format_version: int = 1
     name: str
-    network: NetworkConfig
+    network: GloveNetworkConfig | NetworkConfig
     tasks: tuple[str, ...]
     command: str
     seed: int
@@ -312,7 +317,8 @@ class TokenizerMetadata(FrozenModel):
     """Provenance and measured accuracy of a tokenizer.
 
     `train_scenes` are the scenes of the episodes trained on (`dextouch.episodes.scene_of`). `curve`
-    begins with the untrained network and ends with the stored one.
+    begins with the untrained network and ends with the stored one. `layout` is that of the taxels,
+    None of `dextouch_v1`.
     """
 
     format_version: int = 1
@@ -328,6 +334,7 @@ class TokenizerMetadata(FrozenModel):
     num_heldout_hands: int
     train_scenes: tuple[str, ...]
     data_hash: str
+    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
     curve: tuple[Reconstruction, ...] = Field(min_length=1)
 
     def network(self, config: NetworkConfig) -> NetworkConfig:
@@ -345,7 +352,7 @@ class TokenizerMetadata(FrozenModel):
                 "training: the tokenizer's file has other network settings (stored, requested): "
                 f"{others}; leave them out"
             )
-        return config.model_copy(update=ours)
+        return config.model_copy(update=ours).with_layout(self.layout or DEXTOUCH_V1)
 
 
 @dataclass(frozen=True)

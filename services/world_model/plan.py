@@ -18,7 +18,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import (
@@ -278,7 +277,7 @@ def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
     cells = config.raster_cells
     return ModelInputs(
         first_image=torch.zeros(1, config.image_px, config.image_px, 3, dtype=torch.uint8),
-        first_tactile_kpa=torch.zeros(1, 2, NUM_TAXELS),
+        first_tactile_kpa=torch.zeros(1, 2, config.tactile_layout.num_taxels),
         hands=torch.zeros(1, num_steps, 2, HAND_DIM),
         camera=torch.zeros(1, num_steps, 2, CAMERA_DIM),
         layout=torch.zeros(1, 2, CAMERA_DIM),

@@ -128,6 +128,7 @@ class StateWorld(BatchWorld[StateRollout]):
             max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
             scales_images=True,
+            tactile_layout=config.layout,
         )
 
     @property
@@ -144,7 +145,10 @@ class StateWorld(BatchWorld[StateRollout]):
             InvalidInputError: missing or invalid observation, anchor or K_head.
         """
         first = observed_start(
-            start, tasks=self._description.tasks, image_px=self._metadata.dynamics.image_px
+            start,
+            tasks=self._description.tasks,
+            layout=self._metadata.dynamics.tactile_layout,
+            image_px=self._metadata.dynamics.image_px,
         )
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
@@ -155,6 +159,7 @@ class StateWorld(BatchWorld[StateRollout]):
                 [first.tactile_kpa],
                 [motion],
                 [self._description.tasks.index(start.task)],
+                self._metadata.dynamics.tactile_layout,
             ),
             torch.from_numpy(first.tactile_kpa)[None],
             Commands.holding([motion]),
@@ -185,7 +190,9 @@ class StateWorld(BatchWorld[StateRollout]):
             anchor=first.anchor,
             K_head=first.K_head,
         )
-        build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
+        config = self._metadata.dynamics
+        limits = NetworkConfig(image_px=config.image_px).with_layout(config.tactile_layout)
+        build_inputs([request], limits)
 
     @torch.inference_mode()
     def step_batch(

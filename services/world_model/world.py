@@ -26,7 +26,7 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     read_state_checkpoint,
 )
-from services.world_model.network.configuration import Precision, Sampler
+from services.world_model.network.configuration import GloveNetworkConfig, Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Sampling, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
@@ -103,6 +103,9 @@ class ModelWorld(BatchWorld[ModelState]):
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
             predicts_touch=config.use_touch,
+            tactile_layout=(
+                config.tactile_layout if isinstance(config, GloveNetworkConfig) else None
+            ),
         )
 
     @property
@@ -118,7 +121,9 @@ class ModelWorld(BatchWorld[ModelState]):
             InvalidInputError: missing or invalid observation, anchor or K_head; an instruction that
                 the full size neither knows nor can encode.
         """
-        first = observed_start(start, tasks=self._description.tasks)
+        first = observed_start(
+            start, tasks=self._description.tasks, layout=self._model.config.tactile_layout
+        )
         state = ModelState(
             **vars(first),
             instruction=start.instruction,
@@ -188,8 +193,8 @@ class ModelWorld(BatchWorld[ModelState]):
     def reconstruct(
         self,
         images: UInt8[np.ndarray, "steps h w 3"],
-        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
-    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        tactile_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode images and touch of 1 + 4k steps; gives those after the first."""
         codec, tokenizer, device = self._model.codec, self._model.tokenizer, self._model.device
         seen = codec.decode_future(

@@ -20,7 +20,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, TypeAdapter, model_
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
-from dextouch.tactile.layout import Side
+from dextouch.tactile.layout import Side, TactileLayout, read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, hand_name
 from services.acquisition.hid_process import HidProcessTransport
@@ -118,10 +118,22 @@ class GloveSettings(SerialLineSettings):
 
     Without a label it gives the stream that episodes need (`tactile_left`). With one it is a
     further glove or patch of cells; its stream (`tactile_left_LABEL`) and calibration are named so.
+    `layout` is the file with the layout of its taxels (docs/stations.md#layout-of-a-glove); by
+    default they are those of `dextouch_v1`.
     """
 
     side: Side
     label: str | None = Field(default=None, pattern=r"^[a-z0-9][a-z0-9_]{0,31}$")
+    layout: Path | None = None
+
+    def read_layout(self) -> TactileLayout | None:
+        """Layout of the file; None where the settings name none.
+
+        Raises:
+            NotFoundError, StorageError, LimitExceededError, InvalidInputError: as
+                `dextouch.tactile.read_layout`.
+        """
+        return None if self.layout is None else read_layout(self.layout)
 
     @property
     def device(self) -> str:

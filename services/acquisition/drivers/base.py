@@ -8,8 +8,8 @@ from typing import Any, Generic
 
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix
-from dextouch.streams import Sample, StreamDescriptor
-from dextouch.tactile.layout import Side
+from dextouch.streams import TAXEL_UNIT, Sample, StreamDescriptor
+from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.images import ImageQuality
 from services.acquisition.drivers.packets import (
@@ -45,6 +45,24 @@ class CellLayout:
 
     full_scale: float
     grid: tuple[int, int] | None
+
+
+def raw_unit(layout: TactileLayout) -> str:
+    """Unit of the raw stream of a glove, which is never that of taxels in anatomical order."""
+    return "raw" if layout.unit == TAXEL_UNIT else layout.unit
+
+
+def check_raw_cells(layout: TactileLayout, num_cells: int, *, device: str) -> None:
+    """Check that a layout is one of a device that sends so many numbers.
+
+    Raises:
+        InvalidInputError: it is not.
+    """
+    if layout.num_raw_cells != num_cells:
+        raise InvalidInputError(
+            f"{device}: got layout {layout.name!r} with num_raw_cells {layout.num_raw_cells}, "
+            f"expected {num_cells}, the numbers that this glove sends in each sample"
+        )
 
 
 class Decoder(ABC):

@@ -157,6 +157,7 @@ class _WatchedStream(_Watched):
             clock_residual_ms=None if residual_s is None else residual_s * 1e3,
             taxels={} if stale else self.latest.taxels,
             tare_age_s=None if self.tared_unix_s is None else time.time() - self.tared_unix_s,
+            layout=descriptor.layout,
         )
 
     def _stale_words(self, stale: StaleCode, age_ns: int | None) -> str:
@@ -378,7 +379,7 @@ def _value_judges(
     if descriptor.kind == "tactile":
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
         cells = (
-            TaxelCheck(record, refused_taxels(descriptor, calibration))
+            TaxelCheck(record, refused_taxels(descriptor, calibration), descriptor.tactile_layout)
             if record
             else cell_judge(driver.decoder, calibration)
         )

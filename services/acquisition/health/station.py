@@ -12,8 +12,8 @@ import numpy as np
 
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
+from services.acquisition.glove_record import is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     CountWindow,
@@ -175,9 +175,12 @@ def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:
     for descriptor in descriptors:
         if descriptor.name == "camera_head":
             needed.append("K_head")
-        if descriptor.kind == "tactile" and descriptor.unit == "counts":
-            needed += [f"{descriptor.name}_tare_counts", f"{descriptor.name}_gain_counts_per_kpa"]
-            if descriptor.shape != (NUM_RAW_TAXELS,):
+        has_layout = descriptor.layout is not None
+        if descriptor.kind == "tactile" and (descriptor.unit == "counts" or has_layout):
+            needed.append(f"{descriptor.name}_tare_counts")
+            if not (has_layout and descriptor.tactile_layout.nominal_kpa_per_unit is not None):
+                needed.append(f"{descriptor.name}_gain_counts_per_kpa")
+            if not (has_layout or is_ours(descriptor)):
                 needed.append(f"{descriptor.name}_cells")
     return needed
 

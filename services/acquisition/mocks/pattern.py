@@ -12,7 +12,8 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side, join_pads
+from dextouch.tactile import PADS
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, Side, TactileLayout
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64
@@ -40,8 +41,16 @@ TILTS_RAD = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5), (0.0, 0.0))
 PAPER, INK, WALL = 225.0, 30.0, 125.0
 
 
-def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
-    """All human streams of one round; the end meets the beginning."""
+def pattern_streams(
+    round_s: float = ROUND_S, *, layout: TactileLayout | None = None
+) -> list[ReplayStream]:
+    """All human streams of one round; the end meets the beginning.
+
+    Args:
+        round_s: how long it takes.
+        layout: of the gloves; None for `dextouch_v1`.
+    """
+    glove = layout or DEXTOUCH_V1
 
     def turns_rad(rate_hz: float) -> Float64[np.ndarray, " n"]:
         count = round(rate_hz * round_s)
@@ -51,10 +60,12 @@ def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
     head = _poses(0.2 * np.sin(poses_rad), np.array([0.0, -0.2, 1.5]))
     streams = []
     for index, side in enumerate(SIDES):
-        pressures = _pressures(turns_rad(60.0) + np.pi * index)
+        pressures = _pressures(turns_rad(glove.nominal_rate_hz) + np.pi * index, glove)
         wrist = _poses(poses_rad, np.array([0.4 * index - 0.2, 0.3, 1.0]))
         streams += [
-            _stream(f"tactile_{side}", "tactile", (60.0, "kPa"), pressures),
+            _stream(
+                f"tactile_{side}", "tactile", (glove.nominal_rate_hz, "kPa"), pressures, layout
+            ),
             _stream(
                 f"keypoints_{side}", "keypoints", (120.0, "m"), _keypoints(turns_rad(120.0), side)
             ),
@@ -73,7 +84,11 @@ def pattern_calibration() -> dict[str, Matrix]:
 
 
 def _stream(
-    name: str, kind: StreamKind, rate_and_unit: tuple[float, str], values: np.ndarray
+    name: str,
+    kind: StreamKind,
+    rate_and_unit: tuple[float, str],
+    values: np.ndarray,
+    layout: TactileLayout | None = None,
 ) -> ReplayStream:
     rate_hz, unit = rate_and_unit
     t_ns = np.rint(np.arange(len(values)) * (1e9 / rate_hz)).astype(np.int64)
@@ -85,24 +100,29 @@ def _stream(
             "dtype": values.dtype.name,
             "unit": unit,
             "nominal_rate_hz": rate_hz,
+            "layout": layout,
         }
     )
     return ReplayStream(descriptor, t_ns, values)
 
 
-def _pressures(turn_rad: np.ndarray) -> Float32[np.ndarray, "n 320"]:
+def _pressures(turn_rad: np.ndarray, layout: TactileLayout) -> Float32[np.ndarray, "n taxels"]:
     """Fingers press one after the other; a bump wanders around the palm."""
     finger_rad = turn_rad[:, None] - np.arange(5) * (2 * np.pi / 5)
     force = np.maximum(0.0, np.cos(finger_rad)) ** 2
-    rows, columns = np.mgrid[0:4, 0:4]
-    tip = np.exp(-((rows - 1.5) ** 2 + (columns - 1.5) ** 2) / 3.0)
-    tips = force[..., None, None] * tip
-    rows, columns = np.mgrid[0:15, 0:16]
-    centre_row = 7 + 4 * np.cos(turn_rad)[:, None, None]
-    centre_column = 7.5 + 5 * np.sin(turn_rad)[:, None, None]
-    palm = np.exp(-((rows - centre_row) ** 2 + (columns - centre_column) ** 2) / 6.0)
-    pressures = PEAK_KPA * join_pads(tips, palm)
-    return pressures.reshape(len(turn_rad), NUM_TAXELS).astype(np.float32)
+    pads = []
+    for pad in layout.pads:
+        rows, columns = np.mgrid[0 : pad.rows, 0 : pad.columns]
+        centre_row, centre_column = (pad.rows - 1) / 2, (pad.columns - 1) / 2
+        if pad.part == "palm":
+            across = centre_column + 5 / 16 * pad.columns * np.sin(turn_rad)[:, None, None]
+            along = centre_row + 4 / 15 * pad.rows * np.cos(turn_rad)[:, None, None]
+            bump = np.exp(-((rows - along) ** 2 + (columns - across) ** 2) / 6.0)
+        else:
+            tip = np.exp(-((rows - centre_row) ** 2 + (columns - centre_column) ** 2) / 3.0)
+            bump = force[:, PADS.index(pad.part), None, None] * tip
+        pads.append(bump.reshape(len(turn_rad), -1))
+    return (PEAK_KPA * np.concatenate(pads, axis=1)).astype(np.float32)
 
 
 def _keypoints(turn_rad: np.ndarray, side: Side) -> Float64[np.ndarray, "n 25 3"]:
@@ -143,7 +163,7 @@ def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
     return np.stack([red, np.where(ball, 120, ground), ground], axis=-1).astype(np.uint8)
 
 
-def practice_streams(seed: int = 0) -> list[ReplayStream]:
+def practice_streams(seed: int = 0, *, layout: TactileLayout | None = None) -> list[ReplayStream]:
     """All human streams, with a board before the head camera and gloves at rest."""
     images = board_images(seed)
     board = ReplayStream(
@@ -159,7 +179,8 @@ def practice_streams(seed: int = 0) -> list[ReplayStream]:
         images,
     )
     # One round for all: a shorter stream would pause until the board is done.
-    others = [s for s in pattern_streams(len(images) / RATE_HZ) if s.descriptor.kind != "image"]
+    pattern = pattern_streams(len(images) / RATE_HZ, layout=layout)
+    others = [stream for stream in pattern if stream.descriptor.kind != "image"]
     return [*(_at_rest(stream) for stream in others), board]
 
 

@@ -94,8 +94,8 @@ class MockSlot:
 
     Attributes:
         name: of the device, such as `glove_left`.
-        stream: what it plays; of a glove the pressures, float32 [n, 320] in kPa in anatomical order
-            (`dextouch.tactile.layout`); `at_rate` resamples them to the rate of a glove.
+        stream: what it plays; of a glove the pressures, float32 [n, taxels] in kPa in anatomical
+            order of the layout of its descriptor; `at_rate` resamples them to the rate of a glove.
         faults: what disturbs the device. Its source sees to `dead_taxels`, raw cells that read 0.
         seed: of everything random.
         clock: of the station.

@@ -14,15 +14,17 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from jaxtyping import Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dextouch.clients import HttpLink, Reply
 from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.streams import SampleBatch
+from dextouch.streams import TAXEL_UNIT
+from dextouch.tactile.layout import TactileLayout
 from services.alignment.calibration.tactile_gain import (
     TaxelGain,
     TaxelPress,
@@ -30,7 +32,13 @@ from services.alignment.calibration.tactile_gain import (
     fit_gain,
     pad_taxels,
 )
-from services.alignment.calibration.tactile_tare import OK, STATES, TaxelTare, measure_tare
+from services.alignment.calibration.tactile_tare import (
+    OK,
+    STATES,
+    TaxelTare,
+    measure_tare,
+    reading_step,
+)
 from services.alignment.station_calibration.camera_views import glove_picture
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
@@ -140,23 +148,45 @@ def parse_press(words: str, relative_sigma: float) -> PressRow:
     return row.known_to(relative_sigma)
 
 
-def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
-    """Raw counts of one glove from a spool folder, or from a recording of the store."""
+class GloveTake(NamedTuple):
+    """Raw readings of one glove in counts (of other units: in steps of `reading_step`)."""
+
+    t_host_ns: Int64[np.ndarray, " time"]
+    counts: Float64[np.ndarray, "time cells"]
+    layout: TactileLayout
+
+
+def read_take(take: str, options: argparse.Namespace) -> GloveTake:
+    """Raw readings of one glove from a spool folder, or from a recording of the store."""
     taken = read_stream(take, f"tactile_{options.side}", options.store)
-    if taken.descriptor.unit != "counts":
+    about = taken.descriptor
+    if about.unit != "counts" and (about.layout is None or about.unit == TAXEL_UNIT):
         raise InvalidInputError(
-            f"take {take!r}: {taken.descriptor.name} is in {taken.descriptor.unit}, expected raw "
-            "counts"
+            f"take {take!r}: {about.name} is in {about.unit}, expected raw counts, or a glove "
+            "whose settings name its layout"
         )
-    return taken.batch
+    counts = np.asarray(taken.batch.values) / reading_step(about.tactile_layout)
+    return GloveTake(taken.batch.t_host_ns, counts, about.tactile_layout)
 
 
 def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     """The readings of one press."""
-    batch = read_take(row.take, options)
-    t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
-    counts = batch.values[(t_s >= row.start_s) & (t_s < row.stop_s)]
-    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, pad_taxels(row.pads))
+    taken = read_take(row.take, options)
+    t_s = (taken.t_host_ns - taken.t_host_ns[:1]) * 1e-9
+    counts = taken.counts[(t_s >= row.start_s) & (t_s < row.stop_s)]
+    taxels = pad_taxels(row.pads, taken.layout)
+    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, taxels)
+
+
+def tare_of(take: str, options: argparse.Namespace) -> TaxelTare:
+    """The tare of a rest take."""
+    taken = read_take(take, options)
+    return measure_tare(taken.counts, side=options.side, layout=taken.layout)
+
+
+def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> float:
+    """The largest count: that of the options, or of the layout if that is less."""
+    return min(options.full_scale, layout.full_scale / reading_step(layout))
 
 
 class Guide:
@@ -199,7 +229,7 @@ class Guide:
                     next(self._names),
                     f"{side} glove at rest, untouched",
                     REST_S,
-                    lambda take: measure_tare(read_take(take, self._options).values, side=side),
+                    lambda take: tare_of(take, self._options),
                 )
             except InvalidInputError as error:
                 self.say(f"Once more: {error.message}")
@@ -236,7 +266,7 @@ class Guide:
         def check(take: str) -> tuple[PressRow, TaxelPress]:
             row = wanted.model_copy(update={"take": take})
             press = press_of(row, self._options)
-            fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+            fit_gain(tare, [press], full_scale_counts=self._full_scale(tare))
             return row, press
 
         return self.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
@@ -244,15 +274,18 @@ class Guide:
     def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
         try:
             found = calibrate_glove(
-                tare, presses, full_scale_counts=self._options.full_scale
+                tare, presses, full_scale_counts=self._full_scale(tare)
             ).num_by_state()
         except InvalidInputError as error:
             return f"{len(presses)} presses, not enough yet: {error.message}"
         others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
         return (
-            f"{len(presses)} presses: {found['ok']} of 320 taxels known"
+            f"{len(presses)} presses: {found['ok']} of {tare.layout.num_taxels} taxels known"
             f"{f' ({others})' if others else ''}; more pressures show bends"
         )
+
+    def _full_scale(self, tare: TaxelTare) -> float:
+        return full_scale_counts(tare.layout, self._options)
 
     def _answer(self, question: str) -> str:
         try:
@@ -353,9 +386,11 @@ def calibrate(
     """
     side = options.side
     rest, rows = _takes(options, guide)
-    tare = measure_tare(read_take(rest, options).values, side=side)
+    tare = tare_of(rest, options)
     presses = [press_of(row, options) for row in progress(rows, "reading presses", len(rows))]
-    found = calibrate_glove(tare, presses, full_scale_counts=options.full_scale)
+    found = calibrate_glove(
+        tare, presses, full_scale_counts=full_scale_counts(tare.layout, options)
+    )
     picture = write_picture(options.to, f"glove_{side}.svg", glove_picture(found))
     facts: dict[str, object] = {"side": side, "rest_take": rest, **_tare_facts(tare, say)}
     if found.gain is not None:

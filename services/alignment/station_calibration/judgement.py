@@ -166,6 +166,8 @@ def _gain_sigma(gain: np.ndarray, sigma: np.ndarray, num_faulty: int) -> Sigma:
     relative = float(np.median(sigma[known] / gain[known]))
     wrong = f"gain known to {relative:.1%}, expected {MAX_GAIN_SIGMA:.0%}; press harder"
     problems = [("WARN", wrong)] * (relative > MAX_GAIN_SIGMA)
-    levels = [level for level, share in MAX_TAXEL_FAULTS.items() if num_faulty / 320 > share]
-    problems += [(level, f"{num_faulty} of 320 taxels faulty") for level in levels[-1:]]
+    # Faulty taxels, and cells without one, have the sigma 0.
+    num_taxels = int(known.sum()) + num_faulty
+    levels = [level for level, share in MAX_TAXEL_FAULTS.items() if num_faulty / num_taxels > share]
+    problems += [(level, f"{num_faulty} of {num_taxels} taxels faulty") for level in levels[-1:]]
     return f"gain {relative:.2%}", problems

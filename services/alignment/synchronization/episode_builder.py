@@ -10,7 +10,7 @@ from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor, check_camera_matrix
-from dextouch.tactile import pad_forces_n
+from dextouch.tactile.layout import common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.grid_actions import (
@@ -197,7 +197,8 @@ def _find_stretch(
     for number, name in enumerate(names):
         on_progress(progress_within("placing", number / len(names), name))
         # Pressures of an hour do not fit in memory, the forces of its pads do.
-        of = pad_forces_n if name in TOUCH_STREAMS else np.asarray
+        layout = streams[name].descriptor.tactile_layout
+        of = layout.pad_forces_n if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
         if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
             # Such as a hand that was never seen.
@@ -279,6 +280,15 @@ def check_complete(recording: RecordingReader) -> None:
         InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
     _check_hands(recording, recording.streams)
+    # One window holds both hands.
+    common_layout(
+        [
+            stream.tactile_layout
+            for name, stream in recording.streams.items()
+            if name in TOUCH_STREAMS
+        ],
+        what=f"recording {recording.attributes.recording_id!r}",
+    )
     _check_lenses(recording)
 
 

@@ -73,7 +73,7 @@ class Moment:
     """Image and touch at one step."""
 
     image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
+    tactile_kpa: Float32[np.ndarray, "2 taxels"]
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from dextouch.schemas import (
     matrix_rows,
 )
 from services.evaluation.bundled_policies import BUNDLED, BundledName, checkpoint_of
+from dextouch.tactile.layout import TactileLayout
 from services.evaluation.closed_loop import PlayedRollout
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
@@ -416,4 +417,10 @@ def keep_rollout(
             ),
         ),
     )
-    write_rollout(store, attributes, played.observations, played.commanded)
+    write_rollout(
+        store,
+        attributes,
+        played.observations,
+        played.commanded,
+        layout=TactileLayout.of(world.tactile_layout),
+    )

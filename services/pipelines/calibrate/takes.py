@@ -161,7 +161,11 @@ def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
         raise InvalidInputError(f"stream {stream.name!r}: has no side")
     if stream.unit != "kPa":
         known = TactileCalibration.from_record(
-            glove.calibration, stream.side, num_cells=stream.shape[0], stream=stream.name
+            glove.calibration,
+            stream.side,
+            num_cells=stream.shape[0],
+            stream=stream.name,
+            layout=stream.layout,
         )
         readings = known.to_kpa(readings)
     pressure_kpa = readings.astype(np.float64)

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.features import (
     BOX_AXES,
     MAX_DISTANCE_M,
@@ -216,7 +215,7 @@ class RecurrentCore(nn.Module):
         self.touch = linear(160, STEPS_PER_LATENT * channels)
         self.contact = linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
         self.pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
-        self.taxels = linear(NUM_PATTERNS, NUM_TAXELS)
+        self.taxels = linear(NUM_PATTERNS, config.tactile_layout.num_taxels)
         # A person's skin and a robot's differ; where a pad meets an object does not.
         self.human = (
             nn.ModuleDict(

@@ -18,7 +18,8 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
 from services.networks.principal_axes import principal_axes, root_pressure
 from services.networks.subwords import subwords
 from services.world_model.dynamics.trees import mapped
@@ -147,6 +148,7 @@ class DynamicsConfig(FrozenModel):
     objects fill the first slots in the order of the episode's `object_names`. With the domain
     `human`, cores are given whose hands act, and predict the touch of either by heads of its own.
     With `instructions`, the sentences of training, cores read the instruction of a rollout.
+    `layout` is that of the taxels, None of `dextouch_v1`.
     """
 
     tasks: tuple[str, ...] = Field(min_length=1)
@@ -155,11 +157,17 @@ class DynamicsConfig(FrozenModel):
     reader_channels: int = Field(default=32, ge=8, le=256)
     reader_keypoints: int = Field(default=40, ge=4, le=256)
     width: int = Field(default=192, ge=8, le=1024)
-    touch_channels: int = Field(default=96, ge=4, le=320)
+    touch_channels: int = Field(default=96, ge=4, le=MAX_CELLS)
     domains: tuple[Domain, ...] = Field(
         default=_ROBOT_ALONE, exclude_if=lambda domains: domains == _ROBOT_ALONE
     )
     instructions: tuple[str, ...] = Field(default=(), exclude_if=not_)
+    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+
+    @property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels that the model feels."""
+        return DEXTOUCH_V1 if self.layout is None else self.layout
 
     @property
     def instruction_size(self) -> int:
@@ -177,6 +185,12 @@ class DynamicsConfig(FrozenModel):
             raise ValueError(
                 f"got {len(self.tasks)} tasks and {len(self.num_objects)} numbers of objects, "
                 "expected one number for every task and no task twice"
+            )
+        num_taxels = self.tactile_layout.num_taxels
+        if self.touch_channels > num_taxels:
+            raise ValueError(
+                f"touch_channels: got {self.touch_channels}, expected at most {num_taxels}, the "
+                f"taxels of layout {self.tactile_layout.name!r}"
             )
         if any(not 1 <= count <= MAX_OBJECTS for count in self.num_objects):
             raise ValueError(
@@ -340,14 +354,16 @@ class TouchCodec(nn.Module):
     scale: Tensor
     peak_kpa: Tensor
 
-    def __init__(self, num_channels: int) -> None:
+    def __init__(self, num_channels: int, num_taxels: int = NUM_TAXELS) -> None:
         super().__init__()
-        self.register_buffer("basis", torch.eye(NUM_TAXELS, num_channels))
+        self.register_buffer("basis", torch.eye(num_taxels, num_channels))
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("peak_kpa", torch.full((), 1e3))
 
     @torch.no_grad()
-    def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
+    def fit(
+        self, tactile_kpa: Float32[Tensor, "n taxels"], *, peak_kpa: float | None = None
+    ) -> None:
         """Fit axes, scale and peak to training touch of single hands.
 
         Args:
@@ -362,12 +378,12 @@ class TouchCodec(nn.Module):
         peak = float(tactile_kpa.max()) if peak_kpa is None else peak_kpa
         self.peak_kpa.fill_(max(peak, FREE_KPA))
 
-    def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
+    def encode(self, tactile_kpa: Float32[Tensor, "*b taxels"]) -> Float32[Tensor, "*b channels"]:
         """Latents; pressures are clipped to 0 … peak."""
         bounded = torch.minimum(tactile_kpa, self.peak_kpa)
         return (root_pressure(bounded) @ self.basis) / self.scale
 
-    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b 320"]:
+    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b taxels"]:
         """Pressures in kPa between zero and the peak."""
         roots = ((latents * self.scale) @ self.basis.T).clamp_min(0.0)
         return torch.minimum(roots.square(), self.peak_kpa)

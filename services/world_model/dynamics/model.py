@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.dynamics.core import (
     NUM_PADS,
     CoreState,
@@ -117,23 +117,25 @@ def stillness(
 
 
 def by_pad(
-    tactile_kpa: Float[np.ndarray, "*batch 2 320"], reduce: Callable[..., np.ndarray]
+    tactile_kpa: Float[np.ndarray, "*batch 2 taxels"],
+    reduce: Callable[..., np.ndarray],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    `reduce` takes the taxels of a pad and an axis, such as `np.mean`.
+    `reduce` takes the taxels of a pad and an axis, such as `np.mean`. A part of the hand without
+    taxels has the pressure 0.
     """
-    tips, palm = split_pads(tactile_kpa)
-    pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
-    return np.concatenate(pads, axis=-1).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
+    return layout.by_part(tactile_kpa, reduce).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
 
 
 def first_steps(
     images: Sequence[UInt8[np.ndarray, "px px 3"]],
     Ks_head: Sequence[Float64[np.ndarray, "3 3"]],
-    tactile_kpa: Sequence[Float32[np.ndarray, "2 320"]],
+    tactile_kpa: Sequence[Float32[np.ndarray, "2 taxels"]],
     hands: Sequence[HandMotion],
     tasks: Sequence[int],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> FirstStep:
     """A batch of observed steps as inputs of the readers; `hands` are of one step each."""
     return FirstStep(
@@ -141,7 +143,7 @@ def first_steps(
         torch.from_numpy(np.stack(Ks_head)).float(),
         torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
         torch.from_numpy(np.concatenate([one.points_m for one in hands])),
-        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean)),
+        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean, layout)),
         torch.tensor(tasks),
     )
 
@@ -162,7 +164,7 @@ class SceneMemory:
     state: CoreState
     poses: ObjectPoses
     disagreement_m: Float32[Tensor, " batch"]
-    tactile_kpa: Float32[Tensor, "batch 2 320"]
+    tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     success: Float32[Tensor, "members batch"]
     points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
@@ -173,7 +175,7 @@ class _Run:
     """Predictions for a run of latent steps; as `ImaginedSteps`."""
 
     poses: ObjectPoses
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
     disagreement_m: Float32[Tensor, "batch latents"]
     distance: Float32[Tensor, "batch latents"]
     success: Float32[Tensor, "members batch latents"]
@@ -199,7 +201,7 @@ class DynamicsModel(nn.Module):
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
         super().__init__()
         self.config = config
-        self.codec = TouchCodec(config.touch_channels)
+        self.codec = TouchCodec(config.touch_channels, config.tactile_layout.num_taxels)
         self.eyes = nn.ModuleList(StartReader(config) for _ in range(num_members))
         self.core = RecurrentCore(config, num_members)
         self._predict: Callable[..., tuple[CoreState, _Run]] = self._predicted
@@ -212,7 +214,7 @@ class DynamicsModel(nn.Module):
     def begin(
         self,
         first: FirstStep,
-        tactile_kpa: Float32[Tensor, "batch 2 320"],
+        tactile_kpa: Float32[Tensor, "batch 2 taxels"],
         holding: Commands,
         commanded: Float32[Tensor, " batch"],
         instruction: Float32[Tensor, "batch features"],
@@ -318,8 +320,10 @@ class DynamicsModel(nn.Module):
         )
 
     def decode_touch(
-        self, touch: Float32[Tensor, "*batch 2 channels"], taxels: Float32[Tensor, "*batch 2 320"]
-    ) -> Float32[Tensor, "*batch 2 320"]:
+        self,
+        touch: Float32[Tensor, "*batch 2 channels"],
+        taxels: Float32[Tensor, "*batch 2 taxels"],
+    ) -> Float32[Tensor, "*batch 2 taxels"]:
         """Pressures in kPa from latents and from contact log odds of each taxel.
 
         Taxels in contact have at least the contact threshold pressure, all others have none.
@@ -453,7 +457,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         state=state,
         poses=poses(1),
         disagreement_m=zeros(1),
-        tactile_kpa=zeros(1, 2, NUM_TAXELS),
+        tactile_kpa=zeros(1, 2, config.tactile_layout.num_taxels),
         success=zeros(members, 1),
         points_m=zeros(1, 2, NUM_POINTS, 3),
         num_still=zeros(1, dtype=torch.int64),

@@ -1,14 +1,18 @@
 """Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.tactile import LayoutDescription
 
 if TYPE_CHECKING:
     import torch
+
+    from dextouch.tactile.layout import TactileLayout
 
 
 Sampler = Literal["euler", "unipc"]
@@ -218,6 +222,25 @@ class NetworkConfig(FrozenModel):
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
 
+    @property
+    def tactile_layout(self) -> "TactileLayout":
+        """Layout of the taxels that the network feels."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
+        return DEXTOUCH_V1
+
+    def with_layout(self, layout: "TactileLayout") -> "NetworkConfig":
+        """The configuration of a network for the taxels of another glove."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
+        if layout == self.tactile_layout:
+            return self
+        known = {name: getattr(self, name) for name in NetworkConfig.model_fields}
+        if layout == DEXTOUCH_V1:
+            return NetworkConfig.model_construct(self.model_fields_set - {"layout"}, **known)
+        fields_set = self.model_fields_set | {"layout"}
+        return GloveNetworkConfig.model_construct(fields_set, **known, layout=layout)
+
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
         if (self.max_steps - 1) % FRAMES_PER_LATENT:
@@ -286,3 +309,16 @@ class NetworkConfig(FrozenModel):
 def num_latents(num_steps: int) -> int:
     """Latent frames of 1 + 4k steps: the first step alone, then groups of four."""
     return 1 + (num_steps - 1) // FRAMES_PER_LATENT
+
+
+class GloveNetworkConfig(NetworkConfig):
+    """Shape of a joint model of a glove other than `dextouch_v1`; training data say its layout."""
+
+    layout: LayoutDescription
+
+    @cached_property
+    def tactile_layout(self) -> "TactileLayout":
+        """Layout of the taxels that the network feels."""
+        from dextouch.tactile.layout import TactileLayout  # not for a parser
+
+        return TactileLayout.model_validate(self.layout.model_dump())

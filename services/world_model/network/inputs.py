@@ -30,7 +30,7 @@ from dextouch.hands.actions import (
 )
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, ActionKind
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import (
     SAMPLE_OFFSETS,
     SLOT_SIZE,
@@ -170,7 +170,7 @@ class PredictionRequest:
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
-    first_tactile_kpa: Float32[np.ndarray, "2 320"]
+    first_tactile_kpa: Float32[np.ndarray, "2 taxels"]
     actions: Float64[np.ndarray, "time 67"]
     action_kind: ActionKind
     instruction: str
@@ -184,7 +184,7 @@ class ModelInputs:
     """Batched tensors of requests in physical units; normalized inside the network."""
 
     first_image: UInt8[Tensor, "batch px px 3"]
-    first_tactile_kpa: Float32[Tensor, "batch 2 320"]
+    first_tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     hands: Float32[Tensor, "batch time 2 29"]
     camera: Float32[Tensor, "batch time 2 9"]
     layout: Float32[Tensor, "batch 2 9"]
@@ -236,7 +236,9 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
     )
     return ModelInputs(
         first_image=torch.from_numpy(np.stack([_checked_image(r, config) for r in requests])),
-        first_tactile_kpa=torch.from_numpy(np.stack([_checked_tactile(r) for r in requests])),
+        first_tactile_kpa=torch.from_numpy(
+            np.stack([_checked_tactile(r, config.tactile_layout) for r in requests])
+        ),
         hands=_float_tensor(hand_features(actions)),
         camera=_float_tensor(camera_features(actions)),
         layout=_float_tensor(_hand_layout(anchors)),
@@ -342,10 +344,13 @@ def _checked_image(request: PredictionRequest, config: NetworkConfig) -> np.ndar
     return image
 
 
-def _checked_tactile(request: PredictionRequest) -> np.ndarray:
+def _checked_tactile(request: PredictionRequest, layout: TactileLayout) -> np.ndarray:
     tactile = np.asarray(request.first_tactile_kpa, dtype=np.float32)
-    if tactile.shape != (2, NUM_TAXELS):
-        raise ShapeError(f"first touch: got shape {tactile.shape}, expected [2, {NUM_TAXELS}]")
+    if tactile.shape != (2, layout.num_taxels):
+        raise ShapeError(
+            f"first touch: got shape {tactile.shape}, expected [2, {layout.num_taxels}] of the "
+            f"glove layout {layout.name!r}, which the model was trained with"
+        )
     if not np.isfinite(tactile).all():
         raise NonFiniteError("first touch: contains NaN or infinity; mask the faulty taxels first")
     if tactile.max() > MAX_PRESSURE_KPA:

@@ -97,7 +97,7 @@ class Prediction:
     """Future after the first step; images of all its steps, or of the last four only."""
 
     images: Float32[Tensor, "batch shown px px 3"]
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
 
 
 class JointWorldModel(nn.Module):
@@ -184,7 +184,7 @@ class JointWorldModel(nn.Module):
     def targets(
         self,
         images: UInt8[Tensor, "batch time px px 3"],
-        tactile_kpa: Float32[Tensor, "batch time 2 320"],
+        tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
     ) -> JointLatents:
         """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
 
@@ -196,7 +196,7 @@ class JointWorldModel(nn.Module):
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
 
     def tactile_targets(
-        self, tactile_kpa: Float32[Tensor, "batch time 2 320"]
+        self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
         """Clean tactile latents; as `targets`."""
         tactile = self.tokenizer.encode(tactile_kpa)

@@ -265,7 +265,9 @@ def core_loss(
         core.taxels(future.pattern[few, 1:]), pressed.float(), reduction="none"
     )
     felt, taxels = table.felt[rows][:, steps], table.measured_taxels[rows]
-    pads = torch.from_numpy(by_pad(taxels.float().numpy(), np.max) > 0)[:, None, None]
+    pads = torch.from_numpy(by_pad(taxels.float().numpy(), np.max, core.config.tactile_layout) > 0)[
+        :, None, None
+    ]
     pads = pads & felt.repeat_interleave(NUM_PADS // 2, dim=-1)
     taxels = taxels[few, None, None] & felt[few, ..., None]
     touch_error = (future.touch[:, 1:] - touch).square().sum(-1)

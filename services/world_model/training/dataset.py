@@ -29,7 +29,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # What an episode must have for windows to be cut from it.
@@ -61,7 +61,7 @@ class EpisodeArrays:
     instruction: str
     scene: str
     images: UInt8[np.ndarray, "steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     tactile_valid: Bool[np.ndarray, "steps 2"]
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
     anchor: AnchorPoses
@@ -72,9 +72,10 @@ class EpisodeArrays:
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
-    measured_taxels: Bool[np.ndarray, "2 320"] = field(
+    measured_taxels: Bool[np.ndarray, "2 taxels"] = field(
         default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
     )
+    tactile_layout: TactileLayout = DEXTOUCH_V1
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -140,9 +141,9 @@ class Window:
 
     request: PredictionRequest
     images: UInt8[np.ndarray, "time h w 3"]
-    tactile_kpa: Float32[np.ndarray, "time 2 320"]
+    tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
     tactile_valid: Bool[np.ndarray, "time 2"]
-    measured_taxels: Bool[np.ndarray, "2 320"]
+    measured_taxels: Bool[np.ndarray, "2 taxels"]
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ class WindowBatch:
 
     requests: list[PredictionRequest]
     images: UInt8[Tensor, "batch time px px 3"]
-    tactile_kpa: Float32[Tensor, "batch time 2 320"]
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     tactile_valid: Bool[Tensor, "batch time 2"]
 
 
@@ -199,6 +200,7 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         boxes_m=boxes_m,
         interpolated=grid.interpolated if grid.interpolated.any() else None,
         measured_taxels=grid.measured_taxels,
+        tactile_layout=grid.tactile_layout,
     )
 
 
@@ -223,6 +225,7 @@ class StoredEpisode:
     model_rate_hz: float
     image_px: int | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
+    tactile_layout: TactileLayout = DEXTOUCH_V1
 
     def __len__(self) -> int:
         return self.num_steps
@@ -398,6 +401,7 @@ def index_episodes(
                 model_rate_hz=arrays.model_rate_hz,
                 image_px=image_px,
                 interpolated=arrays.interpolated,
+                tactile_layout=arrays.tactile_layout,
             )
         )
     return indexed

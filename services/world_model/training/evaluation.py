@@ -14,6 +14,7 @@ from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import ActionKind
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
@@ -35,8 +36,9 @@ class Futures:
     """Images and pressures after the first step, for all windows."""
 
     images: UInt8[np.ndarray, "n steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
-    measured: Bool[np.ndarray, "n steps 2 320"] | None = None
+    tactile_kpa: Float32[np.ndarray, "n steps 2 taxels"]
+    measured: Bool[np.ndarray, "n steps 2 taxels"] | None = None
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 def evaluate_prediction(
@@ -86,6 +88,7 @@ def evaluate_prediction(
         np.stack([w.images[1:] for w in windows]),
         np.stack([w.tactile_kpa[1:] for w in windows]),
         np.stack([w.tactile_valid[1:, :, None] & w.measured_taxels for w in windows]),
+        model.config.tactile_layout,
     )
     first = Futures(
         np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
@@ -99,13 +102,14 @@ def evaluate_prediction(
         predicted_kpa=np.zeros_like(truth.tactile_kpa),
         true_kpa=truth.tactile_kpa,
         measured=truth.measured,
+        layout=model.config.tactile_layout,
     )
     others = _actions_of_other_takes(places, requests, action_kind)
     if others:
         kept = [index for index, _ in others]
         wrong = predict_all(model, [request for _, request in others])
         measured = None if truth.measured is None else truth.measured[kept]
-        right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured)
+        right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured, truth.layout)
         figures |= _figures(wrong, right, "_other_take")
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
         still = [_standing_still(request, head_moves=head_moves) for request in requests]
@@ -212,6 +216,7 @@ def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]
         "predicted_kpa": predicted.tactile_kpa,
         "true_kpa": true.tactile_kpa,
         "measured": true.measured,
+        "layout": true.layout,
     }
     return {
         f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),

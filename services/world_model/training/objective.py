@@ -17,9 +17,8 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TIP_TAXELS
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.dynamics.trees import combined, mapped
-from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
     add_noise,
@@ -108,7 +107,9 @@ def losses(
     valid = batch.tactile_valid.to(device)
     counted = (valid & valid[:, :1])[:, 1:, :, None]
     if options.touch_loss == "contact_or_changing":
-        tokens = contact_or_changing(tactile_kpa, clean.tactile.shape[3])
+        tokens = contact_or_changing(
+            tactile_kpa, clean.tactile.shape[3], model.config.tactile_layout
+        )
         counted = counted & tokens[:, 1:]
     weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
     error = (guess.tactile - target.tactile)[:, 1:].square() * weights
@@ -117,7 +118,9 @@ def losses(
 
 
 def contact_or_changing(
-    tactile_kpa: Float32[Tensor, "batch time 2 320"], num_tokens: int
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
+    num_tokens: int,
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> Bool[Tensor, "batch time 2 tokens"]:
     """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
 
@@ -129,8 +132,8 @@ def contact_or_changing(
     taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
     if num_tokens == 1:
         return taxels.any(dim=-1, keepdim=True)
-    tips = split_axis(taxels[..., :NUM_TIP_TAXELS], -1, (num_tokens - 1, -1)).any(dim=-1)
-    return torch.cat([tips, taxels[..., NUM_TIP_TAXELS:].any(dim=-1, keepdim=True)], dim=-1)
+    pads = torch.split(taxels, [pad.num_taxels for pad in layout.pads], dim=-1)
+    return torch.stack([pad.any(dim=-1) for pad in pads], dim=-1)
 
 
 def _with_noise(

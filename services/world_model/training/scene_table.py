@@ -13,7 +13,7 @@ from torch import Tensor
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import (
     FREE_KPA,
     MAX_DISTANCE_M,
@@ -82,11 +82,11 @@ class SceneTable:
     commanded: Bool[Tensor, " episodes"]
     Ts_world_camera: Float32[Tensor, "episodes steps 4 4"]
     objects: ObjectPoses
-    tactile_kpa: Float16[Tensor, "episodes steps 2 320"]
+    tactile_kpa: Float16[Tensor, "episodes steps 2 taxels"]
     pads_kpa: Float32[Tensor, "episodes steps 12"]
     in_contact: Bool[Tensor, "episodes steps 12"]
     felt: Bool[Tensor, "episodes steps 2"]
-    measured_taxels: Bool[Tensor, "episodes 2 320"]
+    measured_taxels: Bool[Tensor, "episodes 2 taxels"]
     images: UInt8[Tensor, "episodes images px px 3"]
     shown: Bool[Tensor, "episodes images"]
     image_steps: tuple[int, ...]
@@ -281,7 +281,7 @@ def scene_table(
     for one in episodes:
         measured.append(hand_motion(_filled(one.measured, one, num_steps), one.anchor))
         sent.append(hand_motion(_filled(one.sent, one, num_steps), one.anchor))
-    tactile, felt = _touch(episodes, num_steps)
+    layout, (tactile, felt) = config.tactile_layout, _touch(episodes, num_steps)
     tracked = list(zip(episodes, tracks, strict=True))
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
@@ -295,8 +295,8 @@ def scene_table(
         Ts_world_camera=torch.from_numpy(np.stack([m.Ts_world_camera for m in measured])).float(),
         objects=stacked(objects),
         tactile_kpa=torch.from_numpy(tactile),
-        pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean)),
-        in_contact=torch.from_numpy(by_pad(tactile, np.max) >= FREE_KPA),
+        pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean, layout)),
+        in_contact=torch.from_numpy(by_pad(tactile, np.max, layout) >= FREE_KPA),
         felt=torch.from_numpy(felt),
         measured_taxels=torch.from_numpy(np.stack([e.measured_taxels for e in episodes])),
         images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
@@ -336,7 +336,7 @@ def _filled(
 
 def _touch(
     episodes: Sequence[EpisodeGrid], num_steps: int
-) -> tuple[Float16[np.ndarray, "episodes steps 2 320"], Bool[np.ndarray, "episodes steps 2"]]:
+) -> tuple[Float16[np.ndarray, "episodes steps 2 taxels"], Bool[np.ndarray, "episodes steps 2"]]:
     """Pressures (kPa) at every step, those of unmeasured taxels filled, and which hands count."""
     tactile, felt = [], []
     for one in episodes:
@@ -350,25 +350,26 @@ def _touch(
 
 def filled_touch(
     episode: EpisodeGrid,
-) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
     """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
 
     They have the pressure of the nearest one of their pad that was measured, or none.
     """
     touch_kpa, is_sampled = episode.touch()
     measured = episode.measured_taxels
-    nearest = np.stack([_nearest_measured(hand) for hand in measured])
+    nearest = np.stack([_nearest_measured(hand, episode.tactile_layout) for hand in measured])
     is_known = np.take_along_axis(measured, nearest, axis=-1)
     return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known, is_sampled
 
 
-def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:
+def _nearest_measured(
+    measured: Bool[np.ndarray, " taxels"], layout: TactileLayout
+) -> Int64[np.ndarray, " taxels"]:
     """For each taxel the nearest measured one in rows and columns of its pad, or itself."""
-    nearest = np.arange(NUM_TAXELS)
+    nearest = np.arange(layout.num_taxels)
     if measured.all():
         return nearest
-    tips, palm = split_pads(nearest)
-    for pad in (*tips, palm):
+    for pad in [pad for stack in layout.split(nearest) for pad in stack]:
         if measured[pad].any():
             places = distance_transform_edt(
                 ~measured[pad], return_distances=False, return_indices=True

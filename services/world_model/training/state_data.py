@@ -38,6 +38,7 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
+from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
@@ -406,6 +407,8 @@ def configured(
         raise InvalidInputError(
             f"state model: got episodes with images of {sorted(sides)} px, expected one size"
         )
+    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
+    usual = DynamicsConfig.model_fields["touch_channels"].default
     return DynamicsConfig(
         tasks=tasks,
         num_objects=num_objects,
@@ -413,6 +416,8 @@ def configured(
         width=settings.width,
         domains=("robot", "human") if data.has_both_domains else ("robot",),
         instructions=_instructions(episodes, settings, base),
+        touch_channels=min(usual, layout.num_taxels),
+        layout=None if layout == DEXTOUCH_V1 else layout,
     )
 
 

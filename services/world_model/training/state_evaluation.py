@@ -10,6 +10,7 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, batched
 from services.world_model.training.reader_training import reader_errors
@@ -51,7 +52,7 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
     for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
         imagined = _imagined(dynamics, table, start)
-        figures |= _chunk_figures(imagined, table, start)
+        figures |= _chunk_figures(imagined, table, start, dynamics.config.tactile_layout)
         if start == 0:
             figures |= _episode_figures(imagined, table, dynamics)
         within = table.within(torch.arange(len(table)), start)
@@ -76,7 +77,9 @@ def chunk_peaks(
     return torch.cat([chunk.amax(1)[inside.all(1)] for chunk, inside in pairs])
 
 
-def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> dict[str, float]:
+def _chunk_figures(
+    imagined: ImaginedSteps, table: SceneTable, start: int, layout: TactileLayout
+) -> dict[str, float]:
     figures: dict[str, float] = {}
     place = "" if start == 0 else f"from_{start}_"
     for index, first in enumerate(range(start, table.num_steps - 1, CHUNK_STEPS)):
@@ -98,8 +101,8 @@ def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> di
             if not measured.any():
                 continue
             pair = {"predicted_kpa": guess, "true_kpa": true, "measured": measured.numpy()}
-            figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
-            figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
+            figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair, layout=layout)
+            figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair, layout=layout)
         off_mm, there = _object_errors(
             imagined.poses.position_m[:, end - start - 1], table, start, end
         )

@@ -301,7 +301,7 @@ def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
 
 def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> TouchCodec:
     """The base's touch codec, or one fitted to the training episodes."""
-    codec = TouchCodec(config.touch_channels)
+    codec = TouchCodec(config.touch_channels, config.tactile_layout.num_taxels)
     if base is None:
         touch_kpa = table.tactile_kpa[:, ::4][table.felt[:, ::4]].float()
         codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
@@ -366,7 +366,7 @@ def _table(work: _Work) -> tuple[SceneTable, TouchCodec]:
     """The training data as kept for the processes of the parts."""
     torch.set_num_threads(1)
     flat = load_file(work.parts / "table.safetensors")
-    codec = TouchCodec(work.config.touch_channels)
+    codec = TouchCodec(work.config.touch_channels, work.config.tactile_layout.num_taxels)
     codec.load_state_dict(
         {k.removeprefix("codec/"): flat.pop(k) for k in list(flat) if k.startswith("codec/")}
     )

@@ -24,6 +24,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout, common_layout
 from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
@@ -58,9 +59,10 @@ class TactileHands:
     `data_hash` is that of their episodes.
     """
 
-    tactile_kpa: Float32[np.ndarray, "hands 320"]
+    tactile_kpa: Float32[np.ndarray, "hands taxels"]
     scenes: tuple[str, ...]
     data_hash: str
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 def load_hands(
@@ -72,12 +74,14 @@ def load_hands(
     not measured are filled.
 
     Raises:
-        InvalidInputError: either side has no scene.
+        InvalidInputError: either side has no scene, or the episodes are of several gloves.
         NotFoundError, ConflictError: as `select_episodes`.
     """
     sides: tuple[_Side, _Side] = ({}, {})
+    layouts = []
     for reader in select_episodes([EpisodeStore(url) for url in urls], splits=splits):
         grid = EpisodeGrid(reader)
+        layouts.append(grid.tactile_layout)
         touch_kpa, is_measured = filled_touch(grid)
         side = sides[scene_fraction(grid.scene) < heldout_share]
         side.setdefault(grid.scene, []).append((touch_kpa[is_measured], grid.content_sha256))
@@ -86,13 +90,15 @@ def load_hands(
             f"tokenizer: got {len(sides[0])} scenes to train on and {len(sides[1])} held out, "
             "expected at least one each; add episodes or change --heldout-share"
         )
-    training, heldout = (_hands(side) for side in sides)
+    layout = common_layout(layouts, what="tokenizer: episodes")
+    training, heldout = (_hands(side, layout) for side in sides)
     return training, heldout
 
 
-def _hands(side: _Side) -> TactileHands:
+def _hands(side: _Side, layout: TactileLayout) -> TactileHands:
     touch_kpa, contents = zip(*chain(*side.values()), strict=True)
-    return TactileHands(np.concatenate(touch_kpa), tuple(sorted(side)), data_hash(contents))
+    together = np.concatenate(touch_kpa)
+    return TactileHands(together, tuple(sorted(side)), data_hash(contents), layout)
 
 
 @dataclass(frozen=True)
@@ -121,7 +127,7 @@ def train_tokenizer(
     )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        tokenizer = build_tokenizer(settings.network())
+        tokenizer = build_tokenizer(settings.network().with_layout(training.layout))
     tokenizer.fit(torch.from_numpy(training.tactile_kpa)[:, None].expand(-1, 2, -1))
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
     curve: list[Reconstruction] = []
@@ -147,6 +153,7 @@ def train_tokenizer(
         num_heldout_hands=len(heldout.tactile_kpa),
         train_scenes=training.scenes,
         data_hash=training.data_hash,
+        layout=None if training.layout == DEXTOUCH_V1 else training.layout,
         curve=(
             Reconstruction(step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0),
         ),
@@ -207,7 +214,10 @@ def _learn(
 
 
 def reconstruction_loss(
-    tokenizer: LearnedTokenizer, tactile_kpa: Float32[Tensor, "hands 320"], *, contact_weight: float
+    tokenizer: LearnedTokenizer,
+    tactile_kpa: Float32[Tensor, "hands taxels"],
+    *,
+    contact_weight: float,
 ) -> Float32[Tensor, ""]:
     """Weighted mean squared error of root pressures (kPa).
 
@@ -227,21 +237,21 @@ def reconstruction(
         _through(tokenizer, hands.tactile_kpa[begin : begin + _EVALUATION_BATCH])
         for begin in range(0, len(hands.tactile_kpa), _EVALUATION_BATCH)
     ]
-    predicted, true = np.concatenate(decoded), hands.tactile_kpa
+    both = {"predicted_kpa": np.concatenate(decoded), "true_kpa": hands.tactile_kpa}
     return Reconstruction(
         step=budget.step,
         cpu_s=round(budget.cpu_s, 2),
-        mse_kpa2=tactile_metrics.mse(predicted_kpa=predicted, true_kpa=true),
-        mae_kpa=tactile_metrics.mae(predicted_kpa=predicted, true_kpa=true),
-        contact_iou=tactile_metrics.contact_iou(predicted_kpa=predicted, true_kpa=true),
-        contact_f1=tactile_metrics.contact_f1(predicted_kpa=predicted, true_kpa=true),
+        mse_kpa2=tactile_metrics.mse(**both, layout=hands.layout),
+        mae_kpa=tactile_metrics.mae(**both, layout=hands.layout),
+        contact_iou=tactile_metrics.contact_iou(**both, layout=hands.layout),
+        contact_f1=tactile_metrics.contact_f1(**both, layout=hands.layout),
     )
 
 
 @torch.no_grad()
 def _through(
-    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands 320"]
-) -> Float32[np.ndarray, "hands 320"]:
+    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands taxels"]
+) -> Float32[np.ndarray, "hands taxels"]:
     return tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa))).numpy()
 
 

@@ -15,6 +15,7 @@ from pydantic import JsonValue
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
+from dextouch.tactile.layout import common_layout
 from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
@@ -176,7 +177,11 @@ class TrainingRun:
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
         """
-        sampling = {"sampling_steps", "sampler", "sampling_time_shift"}
+        common_layout(
+            [checkpoint.metadata.network.tactile_layout, self.settings.network.tactile_layout],
+            what="--init and the training episodes",
+        )
+        sampling = {"sampling_steps", "sampler", "sampling_time_shift", "layout"}
         requested = self.settings.network.model_dump(exclude=sampling)
         there = checkpoint.metadata.network.model_dump(exclude=sampling)
         others = {
@@ -356,6 +361,7 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     settings, tokenizer = with_tokenizer(settings)
+    settings = _with_layout(settings, (*trained, *heldout), tokenizer)
     if tokenizer is not None:
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
@@ -420,6 +426,24 @@ def train_on(
         metrics=metrics,
         log=log,
     )
+
+
+def _with_layout(
+    settings: TrainSettings,
+    episodes: Sequence[TrainingEpisode],
+    tokenizer: StoredTokenizer | None,
+) -> TrainSettings:
+    """The settings with a network for the taxels of all episodes.
+
+    Raises:
+        InvalidInputError: episodes of several gloves, or a tokenizer of another one.
+    """
+    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
+    if tokenizer is not None:
+        known = settings.network.tactile_layout
+        common_layout([known, layout], what="--tokenizer and the training episodes")
+    network = settings.network.with_layout(layout)
+    return settings.model_copy(update={"network": network})
 
 
 def _data_hash(

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
+from dextouch.tactile.layout import common_layout
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
 from services.world_model.dynamics.features import DynamicsConfig
@@ -38,9 +39,13 @@ class Base:
         With `keeps_tasks`, they stay the base's, of which the episodes have some.
 
         Raises:
-            InvalidInputError: images of another size.
+            InvalidInputError: images of another size, or another glove.
         """
         own = self.checkpoint.metadata.dynamics
+        common_layout(
+            [own.tactile_layout, config.tactile_layout],
+            what=f"--init {self._path.name} and the episodes",
+        )
         if own.image_px != config.image_px:
             raise InvalidInputError(
                 f"--init {self._path.name}: reads images of {own.image_px} px, the episodes have "

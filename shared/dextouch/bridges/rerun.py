@@ -16,9 +16,9 @@ from dextouch.bridges.exporting import Block, Reader, blocks, new_file
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
-from dextouch.streams import HEAD_CAMERA, StreamDescriptor
-from dextouch.tactile import colour, hand_canvas
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, select_taxels
+from dextouch.streams import HEAD_CAMERA, TAXEL_UNIT, StreamDescriptor
+from dextouch.tactile import colour
+from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 APPLICATION: Final = "dextouch"
 FULL_SCALE_KPA: Final = 40.0
@@ -165,11 +165,17 @@ def _touch(
     stream: rr.RecordingStream, entity: str, reader: Reader, descriptor: StreamDescriptor
 ) -> _Columns:
     full_scale = FULL_SCALE_KPA
-    if descriptor.unit != "kPa":
+    if descriptor.unit != TAXEL_UNIT:
         # Raw counts have no absolute scale; the strongest reading of the take is the brightest.
         largest = [block.values.max() for block in blocks(reader, descriptor.name)]
         full_scale = float(max(largest, default=1)) or 1.0
-    draw = partial(heat_map, side=_side(descriptor) or "left", full_scale=full_scale)
+    draw = partial(
+        heat_map,
+        side=_side(descriptor) or "left",
+        full_scale=full_scale,
+        layout=descriptor.tactile_layout,
+        is_raw=_is_raw(descriptor),
+    )
     _log_format(stream, entity, draw(np.zeros(descriptor.shape)).shape)
     return lambda block: {entity: _pixels(np.stack([draw(row) for row in block.values]))}
 
@@ -208,21 +214,36 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
     return {entity: columns.partition([rows.shape[1]] * len(block))}
 
 
-def heat_map(row: np.ndarray, *, side: Side, full_scale: float) -> UInt8[np.ndarray, "28 26 3"]:
+def heat_map(
+    row: np.ndarray,
+    *,
+    side: Side,
+    full_scale: float,
+    layout: TactileLayout = DEXTOUCH_V1,
+    is_raw: bool = False,
+) -> UInt8[np.ndarray, "rows columns 3"]:
     """One reading of a glove as a small RGB picture of the hand.
 
     Args:
-        row: 320 taxels or the 360 raw cells.
+        row: taxels, or the raw cells.
         side: of the hand.
         full_scale: reading shown at full brightness, in the unit of the row.
+        layout: of the glove.
+        is_raw: whether the row holds raw cells.
     """
-    taxels = select_taxels(row, side=side) if row.shape == (NUM_RAW_TAXELS,) else row
-    return colour(hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
+    taxels = layout.select(row, side=side) if is_raw else row
+    return colour(layout.hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
+
+
+def _is_raw(descriptor: StreamDescriptor) -> bool:
+    return descriptor.unit != TAXEL_UNIT and descriptor.shape == (
+        descriptor.tactile_layout.num_raw_cells,
+    )
 
 
 def _side(descriptor: StreamDescriptor) -> Side | None:
     """Side of a tactile stream; None if it cannot be drawn as a hand."""
-    if descriptor.shape not in {(NUM_TAXELS,), (NUM_RAW_TAXELS,)}:
+    if not (_is_raw(descriptor) or descriptor.shape == (descriptor.tactile_layout.num_taxels,)):
         return None
     if descriptor.side is not None:
         return descriptor.side

@@ -39,7 +39,7 @@ ResultT = TypeVar("ResultT")
 class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     """One task in one served world; an action is `chunk_steps` model steps.
 
-    The observation is that of the newest step: `tactile_kpa` [2, 320], `action_reached` [67] and
+    The observation is that of the newest step: `tactile_kpa` [2, taxels], `action_reached` [67] and
     one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends the
     episode, `max_chunks` truncates it. A world without a success check never terminates. A world
     that cannot continue a rollout truncates it: the observation is then the last one again, and
@@ -255,7 +255,8 @@ def _observation_space(description: WorldDescription) -> spaces.Space[SeenNow]:
     parts: dict[str, spaces.Space[Any]] = {
         camera: spaces.Box(0, 255, shape, np.uint8) for camera in description.cameras
     }
-    parts["tactile_kpa"] = spaces.Box(-MAX_TACTILE_KPA, MAX_TACTILE_KPA, (2, 320), np.float32)
+    touch = (2, description.num_taxels)
+    parts["tactile_kpa"] = spaces.Box(-MAX_TACTILE_KPA, MAX_TACTILE_KPA, touch, np.float32)
     parts["action_reached"] = spaces.Box(-MAX_REACHED, MAX_REACHED, (ACTION_DIM,), np.float64)
     return spaces.Dict(parts)
 

@@ -57,7 +57,7 @@ from dextouch.schemas import (
     Review,
 )
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor, StreamKind
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile.layout import SIDES, TactileLayout
 
 if TYPE_CHECKING:
     from dextouch.episodes.object_storage import ObjectStorage
@@ -366,6 +366,8 @@ def write_rollout(
     attributes: EpisodeAttributes,
     observations: Sequence[Observation],
     commanded: np.ndarray,
+    *,
+    layout: TactileLayout | None = None,
 ) -> None:
     """Write a rollout as an episode on the model grid.
 
@@ -378,6 +380,7 @@ def write_rollout(
         attributes: of the episode, without `streams`.
         observations: of step 0 and of every chunk; at least one has images of the head camera.
         commanded: [T, 67] actions, row 0 the poses of step 0.
+        layout: of the taxels, as the world describes it; None of `dextouch_v1`.
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])
@@ -409,6 +412,7 @@ def write_rollout(
                         "unit": unit,
                         "nominal_rate_hz": rate_hz,
                         "frame": "world" if kind == "pose" else None,
+                        "layout": layout if kind == "tactile" else None,
                     }
                 )
             )

@@ -20,13 +20,14 @@ from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.validity import interpolated_actions, measured_actions, measured_taxels
+from dextouch.episodes.validity import interpolated_actions, measured_actions
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
 from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import TactileLayout
 
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 
@@ -269,14 +270,19 @@ class EpisodeGrid:
             return self.measured
         return self.reader.read("action_commanded").values.astype(np.float64)
 
-    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
         """Mean pressures (kPa) of each step, and where there was a sample."""
         return self.reader.touch(0, len(self))
 
     @property
-    def measured_taxels(self) -> Bool[np.ndarray, "2 320"]:
+    def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
-        return measured_taxels(self.about.calibration)
+        return self.reader.measured_taxels
+
+    @property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels."""
+        return self.reader.tactile_layout
 
     @cached_property
     def image_steps(self) -> Int64[np.ndarray, " shown"]:

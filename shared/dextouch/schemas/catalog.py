@@ -9,6 +9,7 @@ from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
+from dextouch.tactile import LayoutDescription
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
@@ -229,7 +230,7 @@ class PlayedStream(FrozenModel):
     """A stream on the item's clock; `gaps_ns` are the longest gaps in order of time.
 
     `interpolated` are the spans of actions that nothing measured, `unmeasured_taxels` those that
-    alignment refused.
+    alignment refused. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`.
 
     A gap is an interval of more than one and a half nominal periods between samples. Times are
     those of the reference clock for episodes, of the host's arrivals for recordings; None if the
@@ -250,6 +251,7 @@ class PlayedStream(FrozenModel):
     gaps_ns: tuple[tuple[int, int], ...] = ()
     interpolated: tuple[InterpolatedSpan, ...] = ()
     unmeasured_taxels: tuple[int, ...] = ()
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
 class Playback(_ItemFields):

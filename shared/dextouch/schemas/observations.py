@@ -38,6 +38,8 @@ from dextouch.schemas.rollouts import (
     Uncertainty,
 )
 from dextouch.streams import pack, unpack
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import NUM_TAXELS
 
 # Tolerance of the norm of a unit quaternion in float32.
 QUATERNION_TOLERANCE: Final = 1e-3
@@ -90,7 +92,7 @@ class Observation:
 
     first_step: int
     images: dict[str, UInt8[np.ndarray, "n h w 3"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
     action_reached: Float64[np.ndarray, "n 67"]
     reached_is_measured: bool
     success: bool | None = None
@@ -170,7 +172,11 @@ def check_observation_arrays(
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
         raise ShapeError(f"{where}: got 0 steps, expected at least 1")
-    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, 320)), where)
+    # How many taxels there are is a fact of the glove; worlds check it by their layout.
+    num_taxels = tactile_kpa.shape[-1] if tactile_kpa.ndim == 3 else NUM_TAXELS
+    if not 1 <= num_taxels <= MAX_CELLS:
+        raise ShapeError(f"{where}: got {num_taxels} taxels, expected 1 … {MAX_CELLS}")
+    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, num_taxels)), where)
     _check_array("action_reached", action_reached, ("float64", (num_steps, ACTION_DIM)), where)
     size_px = next((array.shape[1:3] for array in images.values() if array.ndim == 4), (0, 0))
     for camera, array in images.items():

@@ -149,8 +149,8 @@ class ReconstructingWorld(World[State], Protocol[State]):
     def reconstruct(
         self,
         images: UInt8[np.ndarray, "steps h w 3"],
-        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
-    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        tactile_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode head images and touch of 1 + 4k consecutive steps.
 
         Returns:

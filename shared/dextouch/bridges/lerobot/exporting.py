@@ -29,6 +29,7 @@ from dextouch.bridges.lerobot.layout import (
 from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
+from dextouch.tactile.layout import common_layout
 
 # Rows of the table of episodes that are written together.
 ROWS_AT_ONCE: Final = 100
@@ -163,7 +164,13 @@ class _Dataset:
         _check_cameras(first, self._cameras)
         self._has_measured = "action_commanded" in streams
         shapes = {name: streams[name].shape for name in self._cameras}
-        self._features = layout.dataset_features(shapes, self.fps, has_measured=self._has_measured)
+        self._tactile_layout = first.tactile_layout
+        self._features = layout.dataset_features(
+            shapes,
+            self.fps,
+            has_measured=self._has_measured,
+            num_taxels=self._tactile_layout.num_taxels,
+        )
         self.num_frames = self._num_episodes = 0
         self._tasks: dict[str, int] = {}
         self._total: dict[str, Statistics] = {}
@@ -186,6 +193,7 @@ class _Dataset:
                 f"{where}: got {frames.action_kind} actions; export episodes with commanded "
                 "actions and those without into different datasets"
             )
+        common_layout([self._tactile_layout, reader.tactile_layout], what=f"dataset, {where}")
         row: dict[str, Any] = {"episode_index": self._num_episodes, "length": len(frames)}
         row["tasks"] = [attributes.instruction or attributes.task]
         task_index = self._tasks.setdefault(row["tasks"][0], len(self._tasks))

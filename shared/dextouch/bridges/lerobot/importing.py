@@ -29,16 +29,17 @@ from dextouch.schemas import (
     first_problems,
 )
 from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
-from dextouch.tactile.layout import NUM_TAXELS, SIDES
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout
 
 ImageUnit = Literal["h264", "jpeg", "rgb8"]
 HEAD = "camera_head"
+TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 _CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
-# Usual feature of a role, and the shape of its rows.
+# Usual feature of a role, and the shape of its rows; -1 is the number of taxels.
 _ROLES = {
     "action": (layout.ACTION, (ACTION_DIM,)),
     "state": (layout.STATE, (ACTION_DIM,)),
-    "tactile": (layout.TACTILE, (2, NUM_TAXELS)),
+    "tactile": (layout.TACTILE, (2, -1)),
 }
 # What our own exports keep beside LeRobot's features; None: one number a camera.
 _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
@@ -88,7 +89,8 @@ def import_lerobot(
         ConflictError: an id exists already.
     """
     source = LeRobotFolder(folder)
-    features = _map_features(source.info, options.mapping)
+    first = source.sidecar(source.episodes[0]) if source.episodes else None
+    features = _map_features(source.info, options.mapping, _tactile_layout(first))
     ids: list[str] = []
     for entry in source.episodes:
         sidecar = source.sidecar(entry)
@@ -113,7 +115,16 @@ def import_lerobot(
     return ids
 
 
-def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
+def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
+    """Layout of the taxels of an episode of ours; datasets of other origin have `dextouch_v1`."""
+    streams = () if sidecar is None else sidecar.attributes.streams
+    touch = [one.tactile_layout for one in streams if one.name in TOUCH_STREAMS]
+    return touch[0] if touch else DEXTOUCH_V1
+
+
+def _map_features(
+    info: DatasetInfo, names: Mapping[str, str], tactile: TactileLayout
+) -> dict[str, str]:
     """The dataset's features by role; roles and cameras that it has no feature for are absent."""
     for ours, theirs in names.items():
         if ours not in _ROLES and not _CAMERA_NAME.fullmatch(ours):
@@ -122,7 +133,8 @@ def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]
             raise UnknownNameError("feature of the dataset", theirs, list(info.features))
     roles: dict[str, str] = {}
     problems = []
-    for ours, (usual, shape) in _ROLES.items():
+    for ours, (usual, sizes) in _ROLES.items():
+        shape = tuple(tactile.num_taxels if size < 0 else size for size in sizes)
         name = names.get(ours, usual)
         got = info.features.get(name)
         if got is not None and got.dtype in {"float32", "float64"} and got.numbers() == shape:
@@ -177,6 +189,7 @@ class _Content:
     t_ref_ns: Int64[np.ndarray, " n"]
     numbers: dict[str, tuple[StreamKind, str, np.ndarray, Bool[np.ndarray, " n"]]]
     cameras: dict[str, tuple[VideoSpan, Int64[np.ndarray, " n"]]]
+    tactile_layout: TactileLayout
 
 
 def _content(
@@ -198,7 +211,7 @@ def _content(
     if (np.diff(t_ns) <= 0).any():
         raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
     measured, commanded, anchor = _actions(columns, features, sidecar, where)
-    content = _Content(t_ns, {}, {})
+    content = _Content(t_ns, {}, {}, _tactile_layout(sidecar))
     if "tactile" in features:
         valid = columns.get(layout.VALID, np.ones((entry.length, 2))).astype(bool)
         kpa = columns[features["tactile"]].astype(np.float32)
@@ -230,7 +243,10 @@ def _store(
             writer.add_stream(StreamDescriptor.model_validate(known))
 
         for name, (kind, unit, values, keep) in content.numbers.items():
-            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit)
+            more = {}
+            if kind == "tactile" and content.tactile_layout != DEXTOUCH_V1:
+                more["layout"] = content.tactile_layout
+            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit, **more)
             writer.append(name, values=values[keep], t_ref_ns=content.t_ref_ns[keep])
         for name, (span, stamps_ns) in content.cameras.items():
             add(name, kind="image", shape=span.shape, dtype="uint8", unit=images)

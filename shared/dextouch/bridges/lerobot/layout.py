@@ -113,7 +113,11 @@ def _video_feature(shape: Sequence[int], fps: int) -> Feature:
 
 
 def dataset_features(
-    cameras: Mapping[str, Sequence[int]], fps: int, *, has_measured: bool
+    cameras: Mapping[str, Sequence[int]],
+    fps: int,
+    *,
+    has_measured: bool,
+    num_taxels: int = NUM_TAXELS,
 ) -> Features:
     """Every feature of an export, by name, for cameras with images of shape [height, width, 3].
 
@@ -123,7 +127,7 @@ def dataset_features(
     pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
     features = {IMAGES + name: _video_feature(shape, fps) for name, shape in cameras.items()}
     features[STATE] = pose
-    features[TACTILE] = _feature("float32", [2, NUM_TAXELS], ["hand", "taxel_kpa"])
+    features[TACTILE] = _feature("float32", [2, num_taxels], ["hand", "taxel_kpa"])
     features[ACTION] = pose
     if has_measured:
         features[MEASURED] = pose
@@ -176,7 +180,7 @@ class EpisodeFrames:
 
     `columns` [n, …] are those of `dataset_features`: STATE float32 [67] holds absolute
     measured poses and joints; ACTION and MEASURED float32 [67] are relative to the measured poses
-    of the episode's step 0; TACTILE float32 [2, 320] in kPa, VALID bool [2], STAMP int64 and
+    of the episode's step 0; TACTILE float32 [2, taxels] in kPa, VALID bool [2], STAMP int64 and
     IMAGE_DT int64 [cameras], the image's stamp minus the frame's, in ns.
     """
 
@@ -285,8 +289,8 @@ def _at(
 
 def _tactile(
     reader: EpisodeReader, t_ns: np.ndarray
-) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
-    kpa = np.zeros((len(t_ns), 2, NUM_TAXELS), dtype=np.float32)
+) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
+    kpa = np.zeros((len(t_ns), 2, reader.tactile_layout.num_taxels), dtype=np.float32)
     valid = np.zeros((len(t_ns), 2), dtype=bool)
     for hand, side in enumerate(SIDES):
         name = f"tactile_{side}"
