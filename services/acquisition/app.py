@@ -2,11 +2,13 @@
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
+from dextouch.data_folder import practice_spool
 from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
@@ -15,6 +17,7 @@ from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.health import HealthCollector
 from services.acquisition.health.metrics import RecorderCollector
 from services.acquisition.memory import keep_for_life
+from services.acquisition.practice import PRACTICE_PATH, Practice
 from services.acquisition.recorder import Recorder
 from services.acquisition.retention import DeletedTakes, OperatorNames
 from services.acquisition.routes import live_router, recorder_router, station_router, uploads_router
@@ -40,6 +43,34 @@ def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
     )
 
 
+def practice_app(settings: AcquisitionSettings) -> FastAPI:
+    """A mock station to practise calibration with; its takes are not uploaded."""
+    from services.acquisition.mock_station import MockStation
+    from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+    from services.acquisition.mocks.pattern import PRACTICE_DELAYS_MS, practice_streams
+
+    delays = {n: DeviceFaults(path_delay_ms=ms) for n, ms in PRACTICE_DELAYS_MS.items()}
+    spool = practice_spool(settings.spool)
+    practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
+    with disk_errors(f"make the spool {spool}"):
+        spool.mkdir(parents=True, exist_ok=True)
+    recover_spool(spool)
+    mock = MockStation(
+        practice_streams(settings.seed),
+        FaultScript(devices=delays),
+        settings.seed,
+        StationClock(),
+        spool_root=spool,
+        name=f"{settings.station} practice",
+        links=settings.mock_links,
+        safety=settings,
+        knows_delays=False,
+    )
+    return _station_app(
+        practice, mock.station, mock, _make_uploader(practice, mock.station.recorder)
+    )
+
+
 def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> "MockStation":
     """A station whose mock devices play an episode, or a pattern."""
     from services.acquisition.mock_station import MockStation
@@ -53,10 +84,6 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
 
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
-    elif settings.mock_practice:
-        from services.acquisition.mocks.pattern import practice_streams
-
-        streams, known = practice_streams(settings.seed), {}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
@@ -119,6 +146,18 @@ def create_app(
     mock = _mock_station(settings, follow) if settings.mock else None
     station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
+    practice = Practice(partial(practice_app, settings) if settings.mock else None)
+    return _station_app(settings, station, mock, uploads, practice)
+
+
+def _station_app(
+    settings: AcquisitionSettings,
+    station: Station,
+    mock: "MockStation | None",
+    uploads: Uploader,
+    practice: Practice | None = None,
+) -> FastAPI:
+    """The application around a station; `practice` is what runs below its `/practice`."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -136,6 +175,8 @@ def create_app(
         try:
             yield
         finally:
+            if practice is not None:
+                await practice.stop()
             await run_in_threadpool(uploads.stop)
             await run_in_threadpool((mock or station).stop)
             for collector in collectors:
@@ -154,11 +195,14 @@ def create_app(
             station_router(station, uploads),
             uploads_router(uploads),
             live_router(station),
+            *([practice.router()] if practice is not None else []),
         ],
         lifespan=lifespan,
         readiness=missing,
     )
     app.state.is_working = station.is_working
+    if practice is not None:
+        app.mount(PRACTICE_PATH, practice)
     return app
 
 

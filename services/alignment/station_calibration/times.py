@@ -1,7 +1,7 @@
 """Command `dextouch station calibrate time`: path delays of everything that was shaken together."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -32,14 +32,15 @@ from services.alignment.station_calibration.record import (
     write_entry,
 )
 from services.alignment.synchronization.stream_clock import time_stream
-from services.pipelines.calibrate.takes import poses_of
 
 # Images that are decoded at once, so that ten seconds of a camera need no gigabyte.
 _IMAGES_AT_ONCE: Final = 32
 _COMMANDED: Final = "_commanded"
 
+Say = Callable[[str], None]
 
-def measure_times(options: argparse.Namespace) -> dict[str, object]:
+
+def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Measure the delays of all streams of a take that turned together, after a reference.
 
     Raises:
@@ -77,7 +78,7 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
         raise InvalidInputError(f"{options.reference} {left_out[options.reference]}")
     reference = options.reference or _best_known(turnings, cameras)
     known = _Known(dict(reader.attributes.calibration), cameras)
-    return _written(options, shared_times(turnings, reference), known, left_out)
+    return _written(options, shared_times(turnings, reference), known, left_out, say)
 
 
 def _reader(take: str, store: str | None) -> SpoolReader | RecordingReader:
@@ -135,7 +136,7 @@ def _turning(
         return _camera_turning(reader, name, cameras)
     stream = read_stream(options.take, name, options.store)
     if descriptor.kind == "pose":
-        t_ns, poses = poses_of(stream)
+        t_ns, poses = stream.poses()
         return turning_of_rotations(t_ns, transform_from_pose(poses)[:, :3, :3])
     t_ns, points_m = stream.timed()
     palm_m = points_m[:, PALM_NODES].astype(np.float64)
@@ -199,7 +200,11 @@ class _Known:
 
 
 def _written(
-    options: argparse.Namespace, found: SharedTimes, known: _Known, left_out: dict[str, str]
+    options: argparse.Namespace,
+    found: SharedTimes,
+    known: _Known,
+    left_out: dict[str, str],
+    say: Say,
 ) -> dict[str, object]:
     reference = found.reference
     reference_ms, sigma_ref_ns = known.best_ns(reference) * 1e-6, known.sigma_ns(reference)
@@ -226,16 +231,16 @@ def _written(
         matrices = {f"{entry}_ns": float(latency_ns), f"{entry}_sigma_ns": sigma_ns}
         write_entry(options.to, entry, matrices, facts)
         rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
-        print(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
-    print(
+        say(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
+    say(
         f"relative to {reference}, which has {reference_ms:.2f} ms; "
         f"{len(found.pairs)} pairs of streams, loops close within {found.loop_sigmas:.1f} standard "
         "deviations"
     )
     for name, reason in left_out.items():
-        print(f"left out: {name} {reason}")
+        say(f"left out: {name} {reason}")
     for (a, b), reason in found.unusable.items():
-        print(f"not used: {a} and {b}: {reason}")
+        say(f"not used: {a} and {b}: {reason}")
     return {
         "reference": reference,
         "streams": rows,
@@ -250,4 +255,5 @@ def _written(
         ],
         "loop_sigmas": found.loop_sigmas,
         "left_out": left_out,
+        "unusable": [[a, b, reason] for (a, b), reason in found.unusable.items()],
     }
