@@ -46,25 +46,24 @@ def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
 def practice_app(settings: AcquisitionSettings) -> FastAPI:
     """A mock station to practise calibration with; its takes are not uploaded."""
     from services.acquisition.mock_station import MockStation
-    from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-    from services.acquisition.mocks.pattern import PRACTICE_DELAYS_MS, practice_streams
+    from services.acquisition.mocks import pattern
+    from services.acquisition.mocks.faults import FaultScript
 
-    delays = {n: DeviceFaults(path_delay_ms=ms) for n, ms in PRACTICE_DELAYS_MS.items()}
     spool = practice_spool(settings.spool)
     practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
     with disk_errors(f"make the spool {spool}"):
         spool.mkdir(parents=True, exist_ok=True)
     recover_spool(spool)
     mock = MockStation(
-        practice_streams(settings.seed),
-        FaultScript(devices=delays),
+        pattern.practice_streams(settings.seed),
+        FaultScript(devices=pattern.PRACTICE_FAULTS),
         settings.seed,
         StationClock(),
         spool_root=spool,
         name=f"{settings.station} practice",
         links=settings.mock_links,
         safety=settings,
-        knows_delays=False,
+        unknown_delays=(*pattern.T_HEAD_WRISTS, "camera_head"),
     )
     return _station_app(
         practice, mock.station, mock, _make_uploader(practice, mock.station.recorder)

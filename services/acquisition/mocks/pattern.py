@@ -13,6 +13,7 @@ from dextouch.hands import CHAINS, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side, join_pads
+from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64
@@ -50,16 +51,22 @@ T_WORLD_BOARD: Final = transform(
 )
 # Of the practice trackers at each place, per axis (rad, m): a good room-scale tracker.
 PLACE_SIGMA: Final = (np.deg2rad(0.03), 3e-4)
-# All practice trackers are strapped together; delays of their paths, which `time` has to find out.
+# All practice trackers are strapped together.
 T_HEAD_WRISTS: Final = {
     "wrist_left": transform(
-        rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([-0.1, 0, 0])
+        rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([-0.1, 0.0, 0.0])
     ),
     "wrist_right": transform(
-        rotation_from_vector(np.array([-0.4, 0.6, 1.1])), np.array([0.1, 0, 0])
+        rotation_from_vector(np.array([-0.4, 0.6, 1.1])), np.array([0.1, 0.0, 0.0])
     ),
 }
-PRACTICE_DELAYS_MS: Final = {"pose_tracker_wrist_left": 12.0, "pose_tracker_wrist_right": 5.0}
+# Delays of their paths, which calibration has to find out, and the noise of each pose.
+PRACTICE_FAULTS: Final = {
+    f"pose_tracker_{name}": DeviceFaults(
+        path_delay_ms=delay_ms, position_noise_m=1e-4, rotation_noise_rad=float(np.deg2rad(0.02))
+    )
+    for name, delay_ms in (("head", 0.0), ("wrist_left", 12.0), ("wrist_right", 5.0))
+}
 POSE_RATE_HZ = 100.0
 
 

@@ -43,7 +43,7 @@ SMALLEST_SPREAD_RAD: Final = float(np.deg2rad(0.5))
 TURNS: Final = (
     ("Tilt up and down", "tilt the camera up and down"),
     ("Turn left and right", "turn the camera left and right, about its vertical axis"),
-    ("Roll", "roll the camera about its viewing direction, one ear to the shoulder"),
+    ("Roll", "roll the camera about its viewing direction, as an ear goes to the shoulder"),
 )
 
 
@@ -173,13 +173,14 @@ def _turn_gauge(title: str, spread_rad: float) -> Gauge:
 
 
 def _distance_gauge(distances_m: np.ndarray) -> Gauge:
-    wanted = f"farthest {WANTED_DISTANCE_RATIO:g} times nearest"
+    wanted = f"{WANTED_DISTANCE_RATIO:g} to 1"
     if len(distances_m) == 0:
-        return Gauge("Distance to the board", "unknown", wanted, 0.0)
+        return Gauge("Farthest to nearest", "unknown", wanted, 0.0)
     near_m, far_m = float(distances_m.min()), float(distances_m.max())
     share = np.log(far_m / near_m) / np.log(WANTED_DISTANCE_RATIO)
-    words = f"{near_m * 100:.0f} … {far_m * 100:.0f} cm"
-    return Gauge("Distance to the board", words, wanted, min(1.0, float(share)))
+    return Gauge(
+        "Farthest to nearest", f"{far_m / near_m:.1f} to 1", wanted, min(1.0, float(share))
+    )
 
 
 def _accuracy_gauges(result: HandEyeResult | None) -> tuple[Gauge, Gauge]:
@@ -206,8 +207,7 @@ def _todo(
     if num_places < 2:
         return ["show the whole board to the camera and hold still"]
     todo = [
-        f"{TURNS[axis][1]}, by 20 degrees to either side (spread so far "
-        f"{np.rad2deg(spreads_rad[axis]):.0f} degrees)"
+        f"{TURNS[axis][1]}, by 20 degrees to either side"
         for axis in np.argsort(spreads_rad)
         if spreads_rad[axis] < WANTED_SPREAD_RAD
     ]

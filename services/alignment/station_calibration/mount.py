@@ -99,6 +99,8 @@ def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[st
     svg = turns_picture(turns_rad, progress.todo, views.names, None)
     path = write_picture(options.to, picture, svg)
     say(f"{len(views.names)} views of {progress.num_places} places; turns of the camera: {path}")
+    for gauge in progress.gauges:
+        say(f"  {gauge.title}: {gauge.value}, wanted {gauge.wanted}")
     for words in progress.todo:
         say(f"next: {words}")
     facts: dict[str, object] = {

@@ -261,6 +261,11 @@ def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:
     changes: dict[str, object] = {"state": "simulated"} if item.state == "missing" else {}
     if not is_practised:
         changes |= {"run": None, "step": ""}
+    elif item.name.endswith("_gain_counts_per_kpa"):
+        changes |= {
+            "run": None,
+            "step": "Practice gloves lie untouched: they show no gain.",
+        }
     return item.model_copy(update=changes)
 
 

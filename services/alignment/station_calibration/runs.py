@@ -155,11 +155,12 @@ class GuidedRun:
 
     Args:
         request: what is calibrated.
-        place: the station.
+        station: where.
     """
 
-    def __init__(self, request: RunRequest, place: StationLocation) -> None:
-        self._place, self._request = place, request
+    def __init__(self, request: RunRequest, station: VisitedStation) -> None:
+        self._place, self._streams, _ = station
+        self._request = request
         now = datetime.now(UTC)
         self._lock = threading.Lock()
         # None ends the question that waits.
@@ -306,26 +307,43 @@ class GuidedRun:
 
     def _time(self) -> dict[str, object]:
         place = self._place
-        self._ask(
+        record = f"Record {SHAKE_S:g} s"
+        options = argparse.Namespace(
+            take="", store=place.store_url, to=place.folder, streams=None, reference=None
+        )
+        answer = self._ask(
             Question(
                 "Strap or hold all trackers and cameras together. Then turn them briskly and "
                 "irregularly about all axes, cameras towards a room with edges.",
-                f"Record {SHAKE_S:g} s",
+                record,
             )
         )
-        self._count_down("Take everything in hand; recording begins", LEAD_S)
+        number = 0
+        while True:
+            number += 1
+            if not answer:
+                options.take = self._shake(f"{self._status.run_id}-{number}")
+            options.streams = answer or None
+            try:
+                return measure_times(options, say=self._say)
+            except InvalidInputError as error:
+                trackers = ",".join(name for name in self._streams if name in TRACKERS)
+                choices = () if answer else (("Leave the cameras out", trackers),)
+                answer = self._ask(
+                    Question(f"Not measured: {error.message}", f"{record} again", choices=choices)
+                )
+
+    def _shake(self, name: str) -> str:
+        """Record a take in which everything is shaken, and return it."""
+        self._count_down("Take everything in hand; recording begins in", LEAD_S)
         for _ in range(round(LEAD_S / TICK_S)):
             self._wait(TICK_S)
-        with closing(place.link()) as link:
+        with closing(self._place.link()) as link:
             recorder = self._recorder(link.request, TIME_TASK)
-            take, _ = recorder.record(
-                self._status.run_id, "all trackers and cameras shaken together", SHAKE_S, str
-            )
+            words = "all trackers and cameras shaken together"
+            take, _ = recorder.record(name, words, SHAKE_S, str)
         self._set(countdown=None)
-        options = argparse.Namespace(
-            take=take, store=place.store_url, to=place.folder, streams=None, reference=None
-        )
-        return measure_times(options, say=self._say)
+        return take
 
     def _mount(self) -> dict[str, object]:
         camera, folder = self._request.subject, self._place.folder
@@ -455,15 +473,15 @@ class CalibrationRuns:
             board = parse_board(request.board)
             if request.kind == "mount":
                 check_unambiguous(board, request.board)
-        place = self.place.visited().place
+        station = self.place.visited()
         if request.kind == "mount":
-            read_lens(place.folder, request.subject)
+            read_lens(station.place.folder, request.subject)
         with self._lock:
             if self._run is not None and self._run.status.state not in ENDED:
                 raise ConflictError(
                     f"calibration run {self._run.status.run_id!r} is not done; end it first"
                 )
-            self._run = GuidedRun(request, place)
+            self._run = GuidedRun(request, station)
             return self._run.status
 
     def switch_practice(self, *, is_on: bool) -> None:

@@ -36,6 +36,8 @@ from services.alignment.synchronization.stream_clock import time_stream
 # Images that are decoded at once, so that ten seconds of a camera need no gigabyte.
 _IMAGES_AT_ONCE: Final = 32
 _COMMANDED: Final = "_commanded"
+# Chosen: slower cameras lose the corners between two images of a brisk turn.
+MIN_CAMERA_HZ: Final = 15.0
 
 Say = Callable[[str], None]
 
@@ -107,22 +109,34 @@ def _unfit(
         in_world = descriptor.frame in ("world", "tracker")
         return None if in_world else "has keypoints in wrist axes, which do not turn with the hand"
     if kind == "image":
-        camera = name.removeprefix("camera_")
-        if f"K_{camera}" not in cameras:
-            return f"needs K_{camera}: calibrate the camera first"
-        if in_spool and descriptor.unit == H264_UNIT:
-            return "is h264, which only a store decodes: give the uploaded recording with --store"
-        height_px, width_px = descriptor.shape[:2]
-        size_px = cameras.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
-        if tuple(size_px) != (width_px, height_px):
-            raise InvalidInputError(
-                f"K_{camera}: was measured on images of {size_px[0]:g} by {size_px[1]:g} px, but "
-                f"{name!r} holds {width_px} by {height_px}; calibrate the camera in this mode"
-            )
-        K = np.array(cameras[f"K_{camera}"])
-        check_camera_matrix(K, (width_px, height_px), where=f"K_{camera}")
-        return None
+        return _unfit_camera(descriptor, cameras, in_spool=in_spool)
     return "shows no turning; for gloves use `latency` with taps"
+
+
+def _unfit_camera(
+    descriptor: StreamDescriptor, cameras: dict[str, Matrix], *, in_spool: bool
+) -> str | None:
+    name = descriptor.name
+    camera = name.removeprefix("camera_")
+    if f"K_{camera}" not in cameras:
+        return f"needs K_{camera}: calibrate the camera first"
+    if descriptor.nominal_rate_hz < MIN_CAMERA_HZ:
+        return (
+            f"has {descriptor.nominal_rate_hz:g} images a second, expected at least "
+            f"{MIN_CAMERA_HZ:g} to see a brisk turn"
+        )
+    if in_spool and descriptor.unit == H264_UNIT:
+        return "is h264, which only a store decodes: give the uploaded recording with --store"
+    height_px, width_px = descriptor.shape[:2]
+    size_px = cameras.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
+    if tuple(size_px) != (width_px, height_px):
+        raise InvalidInputError(
+            f"K_{camera}: was measured on images of {size_px[0]:g} by {size_px[1]:g} px, but "
+            f"{name!r} holds {width_px} by {height_px}; calibrate the camera in this mode"
+        )
+    K = np.array(cameras[f"K_{camera}"])
+    check_camera_matrix(K, (width_px, height_px), where=f"K_{camera}")
+    return None
 
 
 def _turning(
