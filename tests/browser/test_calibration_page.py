@@ -267,6 +267,7 @@ def test_a_mount_is_calibrated_from_the_page_by_keyboard(page, address, folder, 
 @pytest.mark.slow
 def test_delays_of_all_trackers_are_measured_from_the_page_by_keyboard(page, address, folder):
     practise(page, address)
+    know_the_lens(folder)
     tab_to(page, "tr[data-name=path_delays] button")
     page.keyboard.press("Enter")
     page.keyboard.press("Enter")
@@ -280,6 +281,7 @@ def test_delays_of_all_trackers_are_measured_from_the_page_by_keyboard(page, add
     expect(state(page)).to_have_text("done", timeout=LONG_MS)
     expect(page.locator("#result")).to_contain_text("Relative to head")
     expect(page.locator("#result")).to_contain_text("standard deviations")
+    expect(page.locator("#result")).to_contain_text("camera_head has 10 images a second")
     # Three trackers: two delays, three pairs.
     expect(page.locator("#result tbody tr")).to_have_count(5)
     written = json.loads((folder / "calibration.json").read_text())

@@ -67,10 +67,11 @@ def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str,
         if wanted is not None and name not in wanted:
             continue
         reason = _unfit(descriptor, cameras, in_spool=isinstance(reader, SpoolReader))
-        if reason is None:
-            turnings[name] = _turning(options, reader, name, cameras)
+        found = reason or _turning(options, reader, name, cameras)
+        if isinstance(found, str):
+            left_out[name] = found
         else:
-            left_out[name] = reason
+            turnings[name] = found
     if len(turnings) < 2:
         raise InvalidInputError(
             f"{where}: {len(turnings)} of its streams show how they turned, expected two at least"
@@ -120,11 +121,6 @@ def _unfit_camera(
     camera = name.removeprefix("camera_")
     if f"K_{camera}" not in cameras:
         return f"needs K_{camera}: calibrate the camera first"
-    if descriptor.nominal_rate_hz < MIN_CAMERA_HZ:
-        return (
-            f"has {descriptor.nominal_rate_hz:g} images a second, expected at least "
-            f"{MIN_CAMERA_HZ:g} to see a brisk turn"
-        )
     if in_spool and descriptor.unit == H264_UNIT:
         return "is h264, which only a store decodes: give the uploaded recording with --store"
     height_px, width_px = descriptor.shape[:2]
@@ -144,7 +140,8 @@ def _turning(
     reader: SpoolReader | RecordingReader,
     name: str,
     cameras: dict[str, Matrix],
-) -> Turning:
+) -> Turning | str:
+    """How a stream turned, or why it does not show that."""
     descriptor = reader.streams[name]
     if descriptor.kind == "image":
         return _camera_turning(reader, name, cameras)
@@ -160,7 +157,7 @@ def _turning(
 
 def _camera_turning(
     reader: SpoolReader | RecordingReader, name: str, cameras: dict[str, Matrix]
-) -> Turning:
+) -> Turning | str:
     camera, descriptor = name.removeprefix("camera_"), reader.streams[name]
     if isinstance(reader, SpoolReader):
         batch = reader.read(name)
@@ -171,6 +168,14 @@ def _camera_turning(
         batch, images = reader.stamps(name), _images(reader, name)
     timed = TakeStream(name, descriptor, batch, reader.attributes.calibration)
     timing = time_stream(batch, descriptor, latency_ns=round(timed.number(f"{name}_latency_ns")))
+    if len(timing.t_host_ns) < 2:
+        return "has fewer than two images"
+    rate_hz = 1e9 / float(np.median(np.diff(timing.t_host_ns)))
+    if rate_hz < MIN_CAMERA_HZ:
+        return (
+            f"has {rate_hz:.0f} images a second, expected at least {MIN_CAMERA_HZ:g} to see a "
+            "brisk turn"
+        )
     is_kept = np.isin(np.arange(len(batch)), timing.kept)
     distortion = cameras.get(f"distortion_{camera}", ((0.0,) * 5,))
     return turning_of_images(

@@ -185,10 +185,11 @@ function showResult(run) {
   const isShown = run.state === "done" && run.request.kind === "time";
   find("result").hidden = !isShown;
   if (!isShown || shown.state === "done") return;
-  const { streams, pairs, note } = delayRows(run.facts);
+  const { streams, pairs, leftOut, note } = delayRows(run.facts);
   const table = (title, rows) => element("table", {}, element("thead", {}, element("tr", {}, element("th", { scope: "col" }, title), element("th", { scope: "col" }, "Delay (± one sigma)"))),
     element("tbody", {}, ...rows.map(([name, words]) => element("tr", {}, element("td", { class: "name" }, name), element("td", {}, words)))));
-  find("result").replaceChildren(table("Stream", streams), table("Pair, second after first", pairs), element("p", { class: "quiet" }, note));
+  find("result").replaceChildren(table("Stream", streams), table("Pair, second after first", pairs), element("p", {}, note),
+    element("ul", { class: "todo" }, ...leftOut.map((words) => element("li", {}, `Left out: ${words}`))));
 }
 
 function showCountdown(countdown) {

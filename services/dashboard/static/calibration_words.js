@@ -57,11 +57,12 @@ export function secondsLeft({ duration_s: duration, elapsed_s: elapsed }) {
 }
 
 // Of a run of path delays: rows of streams, and of the pairs that they were found from.
-export function delayRows({ streams, reference, pairs, loop_sigmas: loops }) {
+export function delayRows({ streams, reference, pairs, loop_sigmas: loops, left_out: leftOut }) {
   const ms = (value, sigma) => `${value.toFixed(2)} ± ${sigma.toFixed(2)} ms`;
   return {
     streams: Object.entries(streams).map(([name, { latency_ms: value, sigma_ms: sigma }]) => [name, ms(value, sigma)]),
     pairs: pairs.map(({ a, b, offset_ms: value, sigma_ms: sigma }) => [`${a} – ${b}`, ms(value, sigma)]),
+    leftOut: Object.entries(leftOut).map(([name, reason]) => `${name} ${reason}`),
     note: `Relative to ${reference}. Loops of three streams close within ${loops.toFixed(1)} standard deviations.`,
   };
 }
