@@ -31,7 +31,7 @@ def finish(page, row):
 
 def test_a_newcomer_calibrates_the_practice_station(page, tmp_path):
     page.set_viewport_size({"width": 1366, "height": 768})
-    with up(tmp_path, "--without", "twin", "--without", "studies") as urls:
+    with up(tmp_path, "--without", "twin,world_model,studies") as urls:
         page.goto(urls["dashboard"])
         go(page, "Calibration")
         expect(page.locator("#item_rows tr")).not_to_have_count(0)
