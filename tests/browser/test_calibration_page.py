@@ -15,9 +15,9 @@ from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
-from services.alignment.station_calibration.record import write_entry
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
+from tests.browser.stage import know_the_lens
 
 LONG_MS = 240_000
 SEED = 3
@@ -77,17 +77,6 @@ def practise(page, address):
     page.keyboard.press("Enter")
     expect(page.locator("#practice_stop")).to_be_focused(timeout=LONG_MS)
     expect(page.locator("#practice_words")).to_contain_text(BOARD)
-
-
-def know_the_lens(folder):
-    """Write the lens of the practice camera, as its own calibration would."""
-    lens = {
-        "K_head": pattern.K,
-        "K_head_sigma_px": np.full(4, 0.2),
-        "distortion_head": np.array([*pattern.DISTORTION, 0.0]),
-        "image_size_head_px": np.array(pattern.SIZE_PX, dtype=float),
-    }
-    write_entry(folder, "K_head", lens, {})
 
 
 def tab_to(page, selector):
