@@ -1,7 +1,7 @@
 """A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -202,6 +202,7 @@ class MockStation:
         unit_seed: of the devices' own offsets and gains, and of what the station knows of path
             delays; stations with one value have the same devices. Default: the seed.
         follow: as of `Station`.
+        unknown_delays: streams whose path delay the station's calibration does not hold.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -218,6 +219,7 @@ class MockStation:
         safety: SpoolSafety | None = None,
         unit_seed: int | None = None,
         follow: MakeFollowCheck | None = None,
+        unknown_delays: Collection[str] = (),
     ) -> None:
         unit_seed = seed if unit_seed is None else unit_seed
         self.pairs = build_mocks(
@@ -227,12 +229,15 @@ class MockStation:
         self._seed = seed
         # One round of all streams: the last sample and one period of its stream.
         self._lap_ns = max(int(s.t_ns[-1]) + s.descriptor.period_ns() for s in streams)
+        known = _known_of(self.pairs, unit_seed)
+        unknown = tuple(f"{stream}_latency_" for stream in unknown_delays)
+        known = {name: m for name, m in known.items() if not name.startswith(unknown)}
         self.station = Station(
             name=name,
             drivers=[pair.driver for pair in self.pairs],
             spool_root=spool_root,
             clock=clock,
-            calibration={**_known_of(self.pairs, unit_seed), **(calibration or {})},
+            calibration={**known, **(calibration or {})},
             safety=safety,
             simulated=True,
             follow=follow,

@@ -176,11 +176,15 @@ def live_router(station: Station) -> APIRouter:
         return Response(pack({}, pressures), media_type=MSGPACK)
 
     @router.get("/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def poses() -> Response:
-        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's."""
+    async def poses(mounted: Annotated[bool, Query()] = True) -> Response:  # noqa: FBT002 - a query's flag
+        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's.
+
+        Poses are those of the bodies; with `mounted=false` those of the trackers on them.
+        """
         now_ns = station.clock.now_ns()
         ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
-        return Response(pack({"age_s": ages_s}, station.live.poses(now_ns)), media_type=MSGPACK)
+        poses = station.live.poses(now_ns, mounted=mounted)
+        return Response(pack({"age_s": ages_s}, poses), media_type=MSGPACK)
 
     @router.get("/cameras")
     async def cameras() -> CameraList:

@@ -67,11 +67,6 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety, Retention):
         description="first_light: losses, delays and drifts of an ordinary station; worn_glove: a "
         "left glove with dead, stuck, saturated and drifted taxels",
     )
-    mock_practice: bool = Field(
-        default=False,
-        description="to practise calibration: a moving board before the mock head camera, gloves "
-        "at rest",
-    )
     mock_links: MockLinks = MockLinks()
     seed: int = Field(default=0, ge=0, description="random seed of mock devices")
     devices: tuple[ChosenDevice, ...] = Field(

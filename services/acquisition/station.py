@@ -203,12 +203,13 @@ class LiveView:
             if descriptor.kind in kinds
         }
 
-    def poses(self, now_ns: int) -> dict[str, Float32[np.ndarray, "n m"]]:
+    def poses(self, now_ns: int, *, mounted: bool = True) -> dict[str, Float32[np.ndarray, "n m"]]:
         """Newest poses and keypoints by stream, of those heard within the last 0.5 s.
 
         Returns:
             Of a body its pose T_world_NAME [4, 4], of a hand its keypoints [25, 3] in wrist axes,
-            metres; a node that is not seen is NaN. The mounts of the calibration are applied.
+            metres; a node that is not seen is NaN. The mounts of the calibration are applied; if
+            not `mounted`, poses are those of the trackers.
         """
         found: dict[str, np.ndarray] = {}
         for name, descriptor in self._descriptors.items():
@@ -220,7 +221,8 @@ class LiveView:
                 mount = self._calibration.get(f"T_{name}_wrist_{descriptor.side}")
                 found[name] = values if mount is None else apply(invert(mount), values)
             elif descriptor.kind == "pose" and _is_pose(values):
-                found[name] = self._in_world(descriptor, transform_from_pose(values))
+                T = transform_from_pose(values)
+                found[name] = self._in_world(descriptor, T) if mounted else T
         return {name: values.astype(np.float32) for name, values in found.items()}
 
     def _in_world(self, descriptor: StreamDescriptor, T: np.ndarray) -> np.ndarray:

@@ -47,6 +47,11 @@ def default_spool() -> Path:
     return data_folder() / "spool"
 
 
+def practice_spool(spool: Path) -> Path:
+    """Where takes of the practice devices of a station are kept, beside its own."""
+    return spool.with_name(f"{spool.name}_practice")
+
+
 def is_system_file(path: PurePath | str) -> bool:
     """Whether a relative path is, or lies in, what an operating system left: no data, no damage."""
     return any(

@@ -1,4 +1,4 @@
-"""Made-up streams: two moving, pressing hands, and a board and resting gloves for calibration."""
+"""Made-up streams: two moving, pressing hands, and a board, trackers and gloves to calibrate."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -7,13 +7,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.geometry import pinhole_matrix, transform
+from dextouch.geometry import invert, pinhole_matrix, pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile import PADS
 from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, Side, TactileLayout
+from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64
@@ -32,13 +33,42 @@ DISTORTION: Final = (-0.11, 0.06, 0.0012, -0.0009)
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
 RIM_M = 0.02
 RATE_HZ = 10.0
-STILL_IMAGES, MOVING_IMAGES, NUM_POSES = 7, 3, 40
+MOVING_IMAGES, NUM_POSES = 3, 40
+# Images at rest at each pose in turn: motion that repeats itself shows no delay.
+STILL_IMAGES: Final = (6, 8, 12, 7, 10, 6, 9)
 NOISE_COUNTS = 1.5
 # Width of an edge in pixels, as that of a lens in focus.
 EDGE_PX = 1.6
 DEPTHS_M = (0.42, 0.55, 0.72)
 TILTS_RAD = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5), (0.0, 0.0))
 PAPER, INK, WALL = 225.0, 30.0, 125.0
+# Where the practice camera sits on its tracker, and its board in the world: calibration has to find
+# out the first. The board hangs upright in front of a head at 1.45 m; z is up.
+T_TRACKER_CAMERA: Final = transform(
+    rotation_from_vector(np.array([-1.9, 0.12, 0.2])), np.array([0.031, 0.046, -0.052])
+)
+T_WORLD_BOARD: Final = transform(
+    np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.array([0.0, 0.35, 1.45])
+)
+# Of the practice trackers at each place, per axis (rad, m): a good room-scale tracker.
+PLACE_SIGMA: Final = (np.deg2rad(0.03), 3e-4)
+# All practice trackers are strapped together.
+T_HEAD_WRISTS: Final = {
+    "wrist_left": transform(
+        rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([-0.1, 0.0, 0.0])
+    ),
+    "wrist_right": transform(
+        rotation_from_vector(np.array([-0.4, 0.6, 1.1])), np.array([0.1, 0.0, 0.0])
+    ),
+}
+# Delays of their paths, which calibration has to find out, and the noise of each pose.
+PRACTICE_FAULTS: Final = {
+    f"pose_tracker_{name}": DeviceFaults(
+        path_delay_ms=delay_ms, position_noise_m=1e-4, rotation_noise_rad=float(np.deg2rad(0.02))
+    )
+    for name, delay_ms in (("head", 0.0), ("wrist_left", 12.0), ("wrist_right", 5.0))
+}
+POSE_RATE_HZ = 100.0
 
 
 def pattern_streams(
@@ -164,24 +194,43 @@ def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
 
 
 def practice_streams(seed: int = 0, *, layout: TactileLayout | None = None) -> list[ReplayStream]:
-    """All human streams, with a board before the head camera and gloves at rest."""
+    """All human streams, with a board before the head camera, on its tracker, and gloves at rest.
+
+    The trackers of head and wrists move as one body.
+    """
     images = board_images(seed)
-    board = ReplayStream(
-        StreamDescriptor(
-            name="camera_head",
-            kind="image",
-            shape=images.shape[1:],
-            dtype="uint8",
-            unit="rgb8",
-            nominal_rate_hz=RATE_HZ,
-        ),
-        np.rint(np.arange(len(images)) * (1e9 / RATE_HZ)).astype(np.int64),
-        images,
-    )
+    board = _stream("camera_head", "image", (RATE_HZ, "rgb8"), images)
     # One round for all: a shorter stream would pause until the board is done.
-    pattern = pattern_streams(len(images) / RATE_HZ, layout=layout)
-    others = [stream for stream in pattern if stream.descriptor.kind != "image"]
-    return [*(_at_rest(stream) for stream in others), board]
+    others = pattern_streams(len(images) / RATE_HZ, layout=layout)
+    heads = _practice_heads(seed)
+    moved = {"head": heads} | {name: heads @ T for name, T in T_HEAD_WRISTS.items()}
+    poses = [
+        _stream(name, "pose", (POSE_RATE_HZ, "pose_m_wxyz"), pose_from_transform(Ts))
+        for name, Ts in moved.items()
+    ]
+    rest = [_at_rest(s) for s in others if s.descriptor.kind not in {"image", "pose"}]
+    return [*rest, *poses, board]
+
+
+def _practice_heads(seed: int) -> Float64[np.ndarray, "n 4 4"]:
+    """Poses T_world_tracker of the head that see the board as `board_images` shows it."""
+    places = np.array([*_board_poses(), _board_poses()[0]])
+    errors = np.random.default_rng([seed, 1]).normal(size=places.shape)
+    errors[:, :3] *= PLACE_SIGMA[0]
+    errors[:, 3:] *= PLACE_SIGMA[1]
+    errors[-1] = errors[0]
+    # The camera starts to move after its last still image.
+    steps = np.array([[num_still - 1, MOVING_IMAGES + 1] for num_still in _rests()])
+    begins = np.cumsum(steps.ravel()) - steps.ravel()
+    image = np.arange(steps.sum() * round(POSE_RATE_HZ / RATE_HZ)) * RATE_HZ / POSE_RATE_HZ
+    phases = [*np.repeat(np.arange(NUM_POSES), 2), NUM_POSES]
+    phase = np.interp(image, [*begins, steps.sum()], phases)
+    place = np.minimum(phase.astype(int), NUM_POSES - 1)
+    share = (phase - place)[:, None]
+    boards, error = ((1 - share) * a[place] + share * a[place + 1] for a in (places, errors))
+    Ts_camera_board = np.array([board_pose(pose) for pose in boards])
+    heads = T_WORLD_BOARD @ invert(T_TRACKER_CAMERA @ Ts_camera_board)
+    return heads @ transform(rotation_from_vector(error[:, :3]), error[:, 3:])
 
 
 def _at_rest(stream: ReplayStream) -> ReplayStream:
@@ -195,15 +244,17 @@ def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:
     rng, rays = np.random.default_rng(seed), _rays()
     poses = _board_poses()
     grey = []
-    for here, there in pairwise([*poses, poses[0]]):
+    for (here, there), num_still in zip(pairwise([*poses, poses[0]]), _rests(), strict=True):
         still = render(here, rays)
         moving = [
             render(here + share * (there - here), rays)
             for share in np.linspace(0, 1, MOVING_IMAGES + 2)[1:-1]
         ]
-        grey += [still] * STILL_IMAGES + moving
-    noisy = [image + NOISE_COUNTS * rng.standard_normal(image.shape) for image in grey]
-    images = np.stack([np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in noisy])
+        grey += [still] * num_still + moving
+    images = np.empty((len(grey), *rays.shape[:2]), dtype=np.uint8)
+    for image, clean in zip(images, grey, strict=True):
+        noise = NOISE_COUNTS * rng.standard_normal(clean.shape, dtype=np.float32)
+        image[:] = np.clip(np.rint(clean + noise), 0, 255)
     # Three equal channels without three copies.
     return np.broadcast_to(images[..., None], (*images.shape, 3))
 
@@ -215,33 +266,40 @@ def render(pose: np.ndarray, rays: Float64[np.ndarray, "h w 3"]) -> Float32[np.n
         pose: [6] of the board in the camera.
         rays: direction of every pixel.
     """
-    R = rotation_from_vector(pose[:3])
-    middle = np.array([(COLUMNS - 1) * SQUARE_M / 2, (ROWS - 1) * SQUARE_M / 2, 0.0])
-    T_camera_board = transform(R, pose[3:] - R @ middle)
+    T_camera_board = board_pose(pose)
     normal, origin = T_camera_board[:3, 2], T_camera_board[:3, 3]
     points = rays * ((normal @ origin) / (rays @ normal))[..., None] - origin
     x, y = (points @ T_camera_board[:3, axis] / SQUARE_M for axis in (0, 1))
-    ink = _stripes(x) * _stripes(y)
+    edge_x, edge_y = _edge(x), _edge(y)
+    ink = _stripes(x, edge_x) * _stripes(y, edge_y)
     rim = RIM_M / SQUARE_M
-    squares = _inside(x, -1.0, float(COLUMNS)) * _inside(y, -1.0, float(ROWS))
-    paper = _inside(x, -1 - rim, COLUMNS + rim) * _inside(y, -1 - rim, ROWS + rim)
+    squares = _inside(x, edge_x, -1.0, float(COLUMNS)) * _inside(y, edge_y, -1.0, float(ROWS))
+    paper = _inside(x, edge_x, -1 - rim, COLUMNS + rim) * _inside(y, edge_y, -1 - rim, ROWS + rim)
     sheet = PAPER + squares * 0.5 * (1 + ink) * (INK - PAPER)
     return (WALL + paper * (sheet - WALL)).astype(np.float32)
 
 
-def _stripes(a: np.ndarray) -> np.ndarray:
+def board_pose(pose: np.ndarray) -> Float64[np.ndarray, "4 4"]:
+    """T_camera_board of a rotation vector and the place of the board's middle (m)."""
+    R = rotation_from_vector(pose[:3])
+    middle = np.array([(COLUMNS - 1) * SQUARE_M / 2, (ROWS - 1) * SQUARE_M / 2, 0.0])
+    return transform(R, pose[3:] - R @ middle)
+
+
+def _stripes(a: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """+1 and -1 in turn between whole numbers, with edges as wide as a lens makes them."""
     cell = np.floor(a)
     distance = (0.5 - np.abs(a - cell - 0.5)) * np.where(cell % 2, 1.0, -1.0)
-    return 2 * np.clip(distance / _edge(a), -0.5, 0.5)
+    return 2 * np.clip(distance / edge, -0.5, 0.5)
 
 
-def _inside(a: np.ndarray, low: float, high: float) -> np.ndarray:
+def _inside(a: np.ndarray, edge: np.ndarray, low: float, high: float) -> np.ndarray:
     """1 between two values, 0 outside of them."""
-    return np.clip(np.minimum(a - low, high - a) / _edge(a) + 0.5, 0, 1)
+    return np.clip(np.minimum(a - low, high - a) / edge + 0.5, 0, 1)
 
 
 def _edge(a: np.ndarray) -> np.ndarray:
+    """Change of `a` over the width of an edge in the image."""
     down, right = np.gradient(a)
     return EDGE_PX * np.hypot(down, right)
 
@@ -259,6 +317,11 @@ def _rays() -> Float64[np.ndarray, "h w 3"]:
         dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         x, y = (x_seen - dx) / radial, (y_seen - dy) / radial
     return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def _rests() -> list[int]:
+    """Number of images at rest at each pose."""
+    return [STILL_IMAGES[index % len(STILL_IMAGES)] for index in range(NUM_POSES)]
 
 
 def _board_poses() -> list[Float64[np.ndarray, "6"]]:

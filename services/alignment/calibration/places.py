@@ -43,11 +43,11 @@ MIN_CORRELATION_SIGMAS = 2.0
 MIN_SIDE = 3
 
 
-def place_labels(series: Series) -> Int64[np.ndarray, " n"]:
+def place_labels(series: Series, *, min_places: int = MIN_VIEWS) -> Int64[np.ndarray, " n"]:
     """Number of the place of each view, in the order in which they were first visited.
 
     Raises:
-        InvalidInputError: fewer than four places.
+        InvalidInputError: fewer than `min_places` places.
     """
     labels = np.full(len(series.Ts_world_body), -1)
     num_places = 0
@@ -62,10 +62,10 @@ def place_labels(series: Series) -> Int64[np.ndarray, " n"]:
                 )
             labels[is_near & (labels < 0)] = num_places
             num_places += 1
-    if num_places < MIN_VIEWS:
+    if num_places < min_places:
         raise InvalidInputError(
             f"{series.task}: {len(labels)} views are of {num_places} places, expected at least "
-            f"{MIN_VIEWS}, better 20: views within {np.rad2deg(MAX_SAME_PLACE_RAD):.0f} degrees "
+            f"{min_places}, better 20: views within {np.rad2deg(MAX_SAME_PLACE_RAD):.0f} degrees "
             f"and {MAX_SAME_PLACE_M * 1e3:.0f} mm of each other count once"
         )
     return labels

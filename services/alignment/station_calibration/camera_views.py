@@ -26,7 +26,6 @@ from services.alignment.station_calibration.boards import (
     Coverage,
     Lens,
     Photos,
-    TurnCoverage,
     camera_coverage,
     decode_photo,
     find_board,
@@ -347,22 +346,23 @@ def residual_picture(
     )
 
 
-def turns_picture(coverage: TurnCoverage, names: Sequence[str], off_mm: np.ndarray | None) -> str:
-    """Picture of tracker rotations, and the error of each view."""
+def turns_picture(
+    turns_rad: np.ndarray, todo: Sequence[str], names: Sequence[str], off_mm: np.ndarray | None
+) -> str:
+    """Picture of camera rotations [pairs, 3], and the error of each view."""
     parts = []
+    axes = ("tilt up and down", "turn left and right", "roll")
     for index, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
-        title = f"turns about {'xyz'[a]} (right) and {'xyz'[b]} (down)"
-        parts.append(
-            _at(16 + 220 * index, 60, _polar(coverage.turns_rad[:, (a, b)], 90, 90, title))
-        )
-    todo = coverage.todo or ("Nothing: the turns show the mount.",)
+        title = f"{axes[a]} (right), {axes[b]} (down)"
+        parts.append(_at(16 + 220 * index, 60, _polar(turns_rad[:, (a, b)], 90, 90, title)))
+    todo = todo or ("Nothing: the turns show the mount.",)
     parts.append(_at(16, 280, _advice(todo)))
     top = 320 + _ROW * len(todo)
     if off_mm is not None:
         parts.append(_text(16, top, "How far each view puts the board from its mean", bold=True))
         parts.append(_at(16, top + 10, _bars(off_mm, names, "mm", 640)))
         top += 10 + _ROW * len(names)
-    return _page(700, top + 20, f"Turns of the tracker, {len(names)} views", parts)
+    return _page(700, top + 20, f"Turns of the camera, {len(names)} views", parts)
 
 
 def glove_picture(found: GloveCalibration) -> str:

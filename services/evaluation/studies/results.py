@@ -30,8 +30,8 @@ from dextouch.schemas import (
     first_problems,
     matrix_rows,
 )
-from services.evaluation.bundled_policies import BUNDLED, BundledName, checkpoint_of
 from dextouch.tactile.layout import TactileLayout
+from services.evaluation.bundled_policies import BUNDLED, BundledName, checkpoint_of
 from services.evaluation.closed_loop import PlayedRollout
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore

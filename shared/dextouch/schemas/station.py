@@ -271,6 +271,15 @@ class HealthCause(FrozenModel):
     findings: tuple[str, ...] = ()
 
 
+class PracticeStatus(FrozenModel):
+    """Whether a station simulates devices to practise calibration with, below `/practice`.
+
+    Stations of real devices have none (`unavailable`).
+    """
+
+    state: Literal["unavailable", "off", "on"]
+
+
 class StationHealth(FrozenModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 

@@ -21,7 +21,6 @@ OPTIONS = {
     "mock_episode_id",
     "mock_faults",
     "mock_links",
-    "mock_practice",
     "seed",
     "devices",
     "calibration",

@@ -1,7 +1,7 @@
 """Command `dextouch station calibrate time`: path delays of everything that was shaken together."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -32,14 +32,17 @@ from services.alignment.station_calibration.record import (
     write_entry,
 )
 from services.alignment.synchronization.stream_clock import time_stream
-from services.pipelines.calibrate.takes import poses_of
 
 # Images that are decoded at once, so that ten seconds of a camera need no gigabyte.
 _IMAGES_AT_ONCE: Final = 32
 _COMMANDED: Final = "_commanded"
+# Chosen: slower cameras lose the corners between two images of a brisk turn.
+MIN_CAMERA_HZ: Final = 15.0
+
+Say = Callable[[str], None]
 
 
-def measure_times(options: argparse.Namespace) -> dict[str, object]:
+def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Measure the delays of all streams of a take that turned together, after a reference.
 
     Raises:
@@ -64,10 +67,11 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
         if wanted is not None and name not in wanted:
             continue
         reason = _unfit(descriptor, cameras, in_spool=isinstance(reader, SpoolReader))
-        if reason is None:
-            turnings[name] = _turning(options, reader, name, cameras)
+        found = reason or _turning(options, reader, name, cameras)
+        if isinstance(found, str):
+            left_out[name] = found
         else:
-            left_out[name] = reason
+            turnings[name] = found
     if len(turnings) < 2:
         raise InvalidInputError(
             f"{where}: {len(turnings)} of its streams show how they turned, expected two at least"
@@ -77,7 +81,7 @@ def measure_times(options: argparse.Namespace) -> dict[str, object]:
         raise InvalidInputError(f"{options.reference} {left_out[options.reference]}")
     reference = options.reference or _best_known(turnings, cameras)
     known = _Known(dict(reader.attributes.calibration), cameras)
-    return _written(options, shared_times(turnings, reference), known, left_out)
+    return _written(options, shared_times(turnings, reference), known, left_out, say)
 
 
 def _reader(take: str, store: str | None) -> SpoolReader | RecordingReader:
@@ -106,22 +110,29 @@ def _unfit(
         in_world = descriptor.frame in ("world", "tracker")
         return None if in_world else "has keypoints in wrist axes, which do not turn with the hand"
     if kind == "image":
-        camera = name.removeprefix("camera_")
-        if f"K_{camera}" not in cameras:
-            return f"needs K_{camera}: calibrate the camera first"
-        if in_spool and descriptor.unit == H264_UNIT:
-            return "is h264, which only a store decodes: give the uploaded recording with --store"
-        height_px, width_px = descriptor.shape[:2]
-        size_px = cameras.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
-        if tuple(size_px) != (width_px, height_px):
-            raise InvalidInputError(
-                f"K_{camera}: was measured on images of {size_px[0]:g} by {size_px[1]:g} px, but "
-                f"{name!r} holds {width_px} by {height_px}; calibrate the camera in this mode"
-            )
-        K = np.array(cameras[f"K_{camera}"])
-        check_camera_matrix(K, (width_px, height_px), where=f"K_{camera}")
-        return None
+        return _unfit_camera(descriptor, cameras, in_spool=in_spool)
     return "shows no turning; for gloves use `latency` with taps"
+
+
+def _unfit_camera(
+    descriptor: StreamDescriptor, cameras: dict[str, Matrix], *, in_spool: bool
+) -> str | None:
+    name = descriptor.name
+    camera = name.removeprefix("camera_")
+    if f"K_{camera}" not in cameras:
+        return f"needs K_{camera}: calibrate the camera first"
+    if in_spool and descriptor.unit == H264_UNIT:
+        return "is h264, which only a store decodes: give the uploaded recording with --store"
+    height_px, width_px = descriptor.shape[:2]
+    size_px = cameras.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
+    if tuple(size_px) != (width_px, height_px):
+        raise InvalidInputError(
+            f"K_{camera}: was measured on images of {size_px[0]:g} by {size_px[1]:g} px, but "
+            f"{name!r} holds {width_px} by {height_px}; calibrate the camera in this mode"
+        )
+    K = np.array(cameras[f"K_{camera}"])
+    check_camera_matrix(K, (width_px, height_px), where=f"K_{camera}")
+    return None
 
 
 def _turning(
@@ -129,13 +140,14 @@ def _turning(
     reader: SpoolReader | RecordingReader,
     name: str,
     cameras: dict[str, Matrix],
-) -> Turning:
+) -> Turning | str:
+    """How a stream turned, or why it does not show that."""
     descriptor = reader.streams[name]
     if descriptor.kind == "image":
         return _camera_turning(reader, name, cameras)
     stream = read_stream(options.take, name, options.store)
     if descriptor.kind == "pose":
-        t_ns, poses = poses_of(stream)
+        t_ns, poses = stream.poses()
         return turning_of_rotations(t_ns, transform_from_pose(poses)[:, :3, :3])
     t_ns, points_m = stream.timed()
     palm_m = points_m[:, PALM_NODES].astype(np.float64)
@@ -145,7 +157,7 @@ def _turning(
 
 def _camera_turning(
     reader: SpoolReader | RecordingReader, name: str, cameras: dict[str, Matrix]
-) -> Turning:
+) -> Turning | str:
     camera, descriptor = name.removeprefix("camera_"), reader.streams[name]
     if isinstance(reader, SpoolReader):
         batch = reader.read(name)
@@ -156,6 +168,14 @@ def _camera_turning(
         batch, images = reader.stamps(name), _images(reader, name)
     timed = TakeStream(name, descriptor, batch, reader.attributes.calibration)
     timing = time_stream(batch, descriptor, latency_ns=round(timed.number(f"{name}_latency_ns")))
+    if len(timing.t_host_ns) < 2:
+        return "has fewer than two images"
+    rate_hz = 1e9 / float(np.median(np.diff(timing.t_host_ns)))
+    if rate_hz < MIN_CAMERA_HZ:
+        return (
+            f"has {rate_hz:.0f} images a second, expected at least {MIN_CAMERA_HZ:g} to see a "
+            "brisk turn"
+        )
     is_kept = np.isin(np.arange(len(batch)), timing.kept)
     distortion = cameras.get(f"distortion_{camera}", ((0.0,) * 5,))
     return turning_of_images(
@@ -199,7 +219,11 @@ class _Known:
 
 
 def _written(
-    options: argparse.Namespace, found: SharedTimes, known: _Known, left_out: dict[str, str]
+    options: argparse.Namespace,
+    found: SharedTimes,
+    known: _Known,
+    left_out: dict[str, str],
+    say: Say,
 ) -> dict[str, object]:
     reference = found.reference
     reference_ms, sigma_ref_ns = known.best_ns(reference) * 1e-6, known.sigma_ns(reference)
@@ -226,16 +250,16 @@ def _written(
         matrices = {f"{entry}_ns": float(latency_ns), f"{entry}_sigma_ns": sigma_ns}
         write_entry(options.to, entry, matrices, facts)
         rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
-        print(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
-    print(
+        say(f"{name + '_latency':32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
+    say(
         f"relative to {reference}, which has {reference_ms:.2f} ms; "
         f"{len(found.pairs)} pairs of streams, loops close within {found.loop_sigmas:.1f} standard "
         "deviations"
     )
     for name, reason in left_out.items():
-        print(f"left out: {name} {reason}")
+        say(f"left out: {name} {reason}")
     for (a, b), reason in found.unusable.items():
-        print(f"not used: {a} and {b}: {reason}")
+        say(f"not used: {a} and {b}: {reason}")
     return {
         "reference": reference,
         "streams": rows,
@@ -250,4 +274,5 @@ def _written(
         ],
         "loop_sigmas": found.loop_sigmas,
         "left_out": left_out,
+        "unusable": [[a, b, reason] for (a, b), reason in found.unusable.items()],
     }
