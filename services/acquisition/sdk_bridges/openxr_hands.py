@@ -251,7 +251,9 @@ class OpenXrHands(Source):
         for name, types in EXTENSION_FUNCTIONS.items():
             address = ctypes.c_void_p()
             self._call("xrGetInstanceProcAddr", self._instance, name.encode(), byref(address))
-            self._extensions[name] = ctypes.CFUNCTYPE(*types)(address.value or 0)
+            if not address.value:
+                raise DeviceError(f"OpenXR: the runtime has no {name}; use another runtime")
+            self._extensions[name] = ctypes.CFUNCTYPE(*types)(address.value)
         system = c_uint64()
         request = SystemGetInfo(TYPE_SYSTEM, None, HEAD_MOUNTED_DISPLAY)
         self._call("xrGetSystem", self._instance, byref(request), byref(system))

@@ -1,14 +1,19 @@
 """The server of all bridges: slow and several stations, addresses, summaries."""
 
+import asyncio
 import json
 import socket
+import struct
 import threading
 import time
 
+import httpx
 import numpy as np
 import pytest
 
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError, InvalidInputError, UnavailableError
+from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgedDevice, parse_hello
 from services.acquisition.sdk_bridges.server import (
@@ -18,7 +23,16 @@ from services.acquisition.sdk_bridges.server import (
     Summary,
     run_bridge,
 )
-from services.acquisition.sdk_bridges.source import OUR_AXES, Pace, Source, hello, pose_reading
+from services.acquisition.sdk_bridges.source import (
+    OUR_AXES,
+    Pace,
+    Reading,
+    Source,
+    hello,
+    pose_reading,
+    station_time_ns,
+)
+from services.acquisition.settings import AcquisitionSettings
 
 DEVICE = BridgedDevice(index=0, serial_number="T-1", source="left")
 HELLO = hello(kind="pose_tracker", software="a test", devices=(DEVICE,), frame=OUR_AXES)
@@ -211,6 +225,63 @@ def test_the_summary_says_what_was_sent_and_lost():
     ]
     assert json.loads(json.dumps(summary.as_json()))["sent"] == {"T-1": 200}
     assert Summary().lines() == ["no samples"]
+
+
+class SlewedClock(StationClock):
+    """A host whose CLOCK_MONOTONIC was slewed ahead by three seconds, and which slept for two."""
+
+    def read_ns(self, clock_id):
+        boot_ns = {
+            time.CLOCK_MONOTONIC_RAW: 100 * 10**9,
+            time.CLOCK_MONOTONIC: 103 * 10**9,
+            time.CLOCK_BOOTTIME: 105 * 10**9,
+        }
+        return boot_ns[clock_id]
+
+
+def test_stamps_of_the_slewed_clock_are_converted():
+    # 4 s before now, and now is 100 s and the 2 s of sleep.
+    assert station_time_ns(99 * 10**9, SlewedClock()) == 98 * 10**9
+
+
+async def test_a_take_holds_the_numbers_of_a_bridge(serve, tmp_path):
+    device = BridgedDevice(index=0, serial_number="EMG", source="none")
+    source = Numbers(
+        hello(kind="numbers", software="a test", devices=(device,), frame=OUR_AXES, channels=2)
+    )
+    port = serve(source).port
+    device = {"kind": "numbers", "port": port, "stream": "emg", "shape": (2,), "unit": "uV"}
+    settings = AcquisitionSettings(devices=({**device, "rate_hz": 1000},), spool=tmp_path)
+    app = create_app(settings)
+    sent = {}
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(
+            transport=httpx.ASGITransport(app), base_url="http://localhost"
+        ) as client,
+    ):
+        for step, body in (
+            ("arm", {"task": "stack_bowls", "instruction": "stack the bowls"}),
+            ("record", None),
+        ):
+            answer = await client.post(f"/v1/recorder/{step}", json=body)
+            assert answer.status_code == 200, answer.text
+        recording_id = answer.json()["recording_id"]
+        async with asyncio.timeout(30):
+            while (await client.get("/v1/recorder")).json()["num_samples"].get("emg", 0) < 50:
+                t_ns, values = StationClock().now_ns(), (0.25 * len(sent), -1.0 * len(sent))
+                sent[t_ns] = values
+                source.waiting = [Reading("EMG", 0, t_ns, struct.pack("<2d", *values))]
+                await asyncio.sleep(0.002)
+        await client.post("/v1/recorder/stop")
+        body = {"success": True, "accept_incomplete": True}
+        assert (await client.post("/v1/recorder/save", json=body)).json()["state"] == "saved"
+    spool = SpoolReader(tmp_path / recording_id)
+    descriptor, batch = spool.streams["emg"], spool.read("emg")
+    assert (descriptor.kind, descriptor.unit, descriptor.shape) == ("scalar", "uV", (2,))
+    assert len(batch) >= 50
+    for t_ns, values in zip(batch.t_device_ns, batch.values, strict=True):
+        assert sent[int(t_ns)] == tuple(values)
 
 
 def test_the_pace_leaves_out_what_has_passed(monkeypatch):

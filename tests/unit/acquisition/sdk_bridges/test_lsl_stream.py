@@ -76,6 +76,26 @@ def test_numbers_and_stamps_arrive_as_they_were_pushed(name, serve, connect, pus
         assert sample.t_device_ns <= sample.t_host_ns + 5e6
 
 
+def test_the_offset_of_the_clocks_is_added(name, serve, connect, pushing, monkeypatch):
+    """As of an outlet on a computer that was started a thousand seconds later."""
+    behind_s = 1000.0
+    from pylsl.lib import lib
+
+    def correction(inlet, remote_s, uncertainty_s, timeout_s, code):
+        uncertainty_s._obj.value = 0.25e-3
+        return behind_s
+
+    monkeypatch.setattr(lib, "lsl_time_correction_ex", correction)
+    source, outlet = LslStream(name), Outlet(name)
+    driver = connect(**numbers(serve(source).port))
+    samples = pushing(outlet, driver, 5, stamp_s=lambda: pylsl.local_clock() - behind_s)
+    for sample in samples:
+        assert abs(sample.t_host_ns - sample.t_device_ns) < 5e9
+    assert source.report() == [
+        "offset of the outlet's clock: 1000.000000 s, uncertain by 0.25 ms at most"
+    ]
+
+
 @pytest.mark.parametrize("channel_format", ["cf_float32", "cf_int16", "cf_int32"])
 def test_other_formats_become_float64(name, serve, connect, read, channel_format):
     outlet = Outlet(name, channel_format=getattr(pylsl, channel_format))

@@ -222,6 +222,26 @@ def test_devices_are_listed(openvr):
     ]
 
 
+def test_our_structures_are_those_of_the_real_module():
+    real = pytest.importorskip("openvr", reason="openvr is not installed (extra `bridges`)")
+    for ours, theirs in (
+        (HmdMatrix34_t, real.HmdMatrix34_t),
+        (TrackedDevicePose_t, real.TrackedDevicePose_t),
+    ):
+        assert ctypes.sizeof(ours) == ctypes.sizeof(theirs)
+        for name, _ in ours._fields_:
+            assert getattr(ours, name).offset == getattr(theirs, name).offset, name
+    assert real.VRApplication_Background == FakeOpenVr.VRApplication_Background
+    assert real.TrackingResult_Running_OK == RUNNING_OK
+    for name in vars(FakeOpenVr):
+        if name.startswith(("TrackedDeviceClass", "TrackingUniverse", "Prop_", "VREvent_Q", "k_")):
+            assert getattr(real, name) == getattr(FakeOpenVr, name), name
+    for name in ("pollNextEvent", "acknowledgeQuit_Exiting", "getTrackedDeviceClass"):
+        assert callable(getattr(real.IVRSystem, name))
+    # Without SteamVR it refuses by an error that we know.
+    assert issubclass(real.error_code.InitError, real.error_code.OpenVRError)
+
+
 def test_a_missing_module_is_said_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "openvr", None)
     with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[bridges\]'"):
