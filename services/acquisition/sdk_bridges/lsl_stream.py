@@ -22,7 +22,7 @@ from services.acquisition.sdk_bridges.source import (
     Source,
     hello,
     import_sdk,
-    station_time_ns,
+    station_offset_ns,
 )
 
 INSTALL = "`pip install 'dextouch-wm[bridges]'` or `pip install pylsl`"
@@ -110,10 +110,10 @@ class LslStream(Source):
         samples, stamps = self._guarded(
             lambda: self._inlet.pull_chunk(timeout=READ_S, max_samples=MAX_SAMPLES, min_samples=1)
         )
+        offset_ns = station_offset_ns(self._clock)
         readings = []
         for values, stamp_s in zip(samples, stamps, strict=True):
-            local_ns = round((stamp_s + self._correction_s) * 1e9)
-            t_ns = station_time_ns(local_ns, self._clock)
+            t_ns = round((stamp_s + self._correction_s) * 1e9) + offset_ns
             payload = struct.pack(f"<{len(values)}d", *values)
             readings.append(Reading(self._value, SOURCES["none"], t_ns, payload))
         return readings

@@ -32,7 +32,7 @@ from services.acquisition.sdk_bridges.source import (
     hand_reading,
     hello,
     load_library,
-    station_time_ns,
+    station_offset_ns,
     wrist_axes,
 )
 
@@ -214,7 +214,7 @@ class OpenXrHands(Source):
     clock = (
         "the runtime's for the moment of the request, asked for as CLOCK_MONOTONIC "
         "(XR_KHR_convert_timespec_time) and converted to this host's raw monotonic clock (error "
-        "below 1 µs); the runtime extrapolates to that moment"
+        "below 10 µs); the runtime extrapolates to that moment"
     )
 
     def __init__(
@@ -295,7 +295,7 @@ class OpenXrHands(Source):
             byref(Timespec(seconds, nanoseconds)),
             byref(xr_time),
         )
-        t_ns = station_time_ns(t_monotonic_ns, self._clock)
+        t_ns = t_monotonic_ns + station_offset_ns(self._clock)
         readings = (self._reading(side, xr_time, t_ns) for side in self._devices)
         return [reading for reading in readings if reading is not None]
 

@@ -1,6 +1,7 @@
 """Interface between a bridge and the SDK that it reads, and the readings that pass through it."""
 
 import ctypes
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -27,6 +28,10 @@ from services.acquisition.drivers.sdk_link import (
     FrameConvention,
 )
 
+# Two clocks are read together in a few µs; where it took longer, the process was interrupted.
+# Chosen: ten attempts, since even a busy machine interrupts fewer than one of two.
+READ_GAP_NS = 20_000
+CLOCK_READS = 10
 # Result and argument types of a shared library's functions, by their names.
 Functions = Mapping[str, tuple[object, tuple[object, ...]]]
 # Sources whose axes are ours already: right-handed, z up.
@@ -224,11 +229,21 @@ class Pace:
         time.sleep((self._due_ns - now_ns) / 1e9)
 
 
-def station_time_ns(t_monotonic_ns: int, clock: StationClock) -> int:
-    """Time on the station's clock of a recent stamp on CLOCK_MONOTONIC of this host.
+def station_offset_ns(clock: StationClock) -> int:
+    """What a recent stamp on CLOCK_MONOTONIC of this host needs to be on the station's clock.
 
-    Both clocks are read now. NTP may slew one against the other by up to 500 ppm (the kernel's
-    limit; chrony's own up to 8 %), which for a stamp of a tenth of a second ago is 50 µs.
+    NTP slews CLOCK_MONOTONIC against the station's clock, by 500 ppm (the kernel) or more (chrony),
+    so it is read anew for every few stamps: for one of a tenth of a second ago 500 ppm are 50 µs.
+    A reading that was interrupted is repeated; what remains is below half of READ_GAP_NS.
     """
-    now_monotonic_ns = clock.read_ns(time.CLOCK_MONOTONIC)
-    return clock.now_ns() - (now_monotonic_ns - t_monotonic_ns)
+    gap_ns, offset_ns = sys.maxsize, 0
+    for _ in range(CLOCK_READS):
+        before_ns = clock.now_ns()
+        monotonic_ns = clock.read_ns(time.CLOCK_MONOTONIC)
+        after_ns = clock.now_ns()
+        if after_ns - before_ns < gap_ns:
+            gap_ns = after_ns - before_ns
+            offset_ns = (before_ns + after_ns) // 2 - monotonic_ns
+        if gap_ns <= READ_GAP_NS:
+            break
+    return offset_ns

@@ -28,6 +28,8 @@ static const int chains[NUM_NODES] = {13, 9, 9, 9, 9, 9, 5, 5, 5, 5, 6, 6, 6,
                                       6,  6, 8, 8, 8, 8, 8, 7, 7, 7, 7, 7};
 static const int joints[NUM_NODES] = {0, 1, 2, 3, 4, 5, 1, 2, 4, 5, 1, 2, 3,
                                       4, 5, 1, 2, 3, 4, 5, 1, 2, 3, 4, 5};
+/* What the joint before the thumb's tip is called: distal, or intermediate. */
+static int thumb_joint = 4;
 static uint32_t node_id(int node) { return 1000 + 7 * node; }
 
 static RawSkeletonStreamCallback_t callback;
@@ -85,7 +87,7 @@ Code CoreSdk_GetRawSkeletonNodeInfoArray(uint32_t glove_id, NodeInfo *infos, uin
       for (int i = 0; i < NUM_NODES; i++) {
         int node = NUM_NODES - 1 - i;
         infos[i] = (NodeInfo){node_id(node), 0, chains[node], node ? gloves[glove].side : 0,
-                              joints[node]};
+                              node == 8 ? thumb_joint : joints[node]};
       }
       return Success;
     }
@@ -111,6 +113,7 @@ void test_publish(void) {
   for (int glove = 0; glove < NUM_GLOVES; glove++) info.skeletonsCount += gloves[glove].streams;
   if (callback) callback(&info);
 }
+void test_thumb(int joint) { thumb_joint = joint; }
 void test_stop(int glove) { gloves[glove].streams = false; }
 void test_disconnect(void) { connected = false; }
 /* View, up, handedness, whether in the world, and the motion of the hand. */

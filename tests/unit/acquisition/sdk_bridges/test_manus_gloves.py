@@ -62,9 +62,12 @@ def fingers(port, side="left"):
     return {"kind": "finger_tracker", "side": side, "port": port}
 
 
+# FingerJointType_Distal and FingerJointType_Intermediate: both name the thumb's third joint.
+@pytest.mark.parametrize("thumb_joint", [4, 3])
 def test_keypoints_are_relative_to_the_wrist_and_in_its_axes(
-    manus, serve, connect, read, hand, rng
+    manus, serve, connect, read, hand, rng, thumb_joint
 ):
+    manus.library.test_thumb(thumb_joint)
     source = ManusGloves(library=manus.path)
     driver = connect(**fingers(serve(source).port))
 
@@ -97,7 +100,7 @@ async def test_both_hands_at_the_route_of_a_station(manus, serve, live_poses, ha
     np.testing.assert_allclose(found["keypoints_right"], 2 * hand, atol=1e-6)
 
 
-def test_repeated_data_is_not_sent(manus, serve, connect, read, hand):
+def test_repeated_data_is_not_sent(manus, serve, connect, read, hand, until):
     source = ManusGloves(("left",), library=manus.path)
     bridge = serve(source)
     driver = connect(**fingers(bridge.port))
@@ -113,7 +116,7 @@ def test_repeated_data_is_not_sent(manus, serve, connect, read, hand):
         manus.publish()
     manus.move(RIGHT, hand, *here)
     manus.publish()
-    time.sleep(0.05)
+    until(lambda: source.not_sent["another glove"], driver.read)
     summary = bridge.end()
     assert summary.not_sent["unchanged"] >= 5
     assert summary.not_sent["another glove"] == 1
@@ -133,17 +136,20 @@ def test_a_node_that_is_not_finite_is_not_seen(manus, serve, connect, read, hand
     assert np.flatnonzero(np.isnan(sample.values).any(axis=1)).tolist() == [7]
 
 
-def test_a_wrist_without_a_rotation_is_no_sample(manus, serve, connect, hand):
+def test_a_wrist_without_a_rotation_is_no_sample(manus, serve, connect, until):
     source = ManusGloves(library=manus.path)
     connect(**fingers(serve(source).port))
     nothing = (ctypes.c_float * 75)()
-    while source.not_sent["no wrist"] < 3:
+
+    def move():
         manus.library.test_move(LEFT, nothing, nothing, 1)
         manus.publish()
 
+    until(lambda: source.not_sent["no wrist"] >= 3, move)
+
 
 def test_a_second_glove_of_a_hand_takes_over_from_a_silent_one(
-    manus, serve, connect, read, hand, monkeypatch
+    manus, serve, connect, read, hand, monkeypatch, until
 ):
     source = ManusGloves(library=manus.path)
     driver = connect(**fingers(serve(source).port))
@@ -155,8 +161,7 @@ def test_a_second_glove_of_a_hand_takes_over_from_a_silent_one(
 
     read(driver, 2, after=lambda: move(LEFT, 1.0))
     move(OTHER_LEFT, 2.0)
-    while not source.not_sent["another glove"]:
-        driver.read()
+    until(lambda: source.not_sent["another glove"], driver.read)
     # As if a second had passed.
     monkeypatch.setattr("services.acquisition.sdk_bridges.manus_gloves.REPLACED_NS", 10_000_000)
     manus.library.test_stop(LEFT)

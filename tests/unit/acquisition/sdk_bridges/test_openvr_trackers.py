@@ -166,15 +166,14 @@ def test_an_untracked_pose_is_no_sample(openvr, serve, connect, read, result, is
     assert driver.decoder.tracking["occluded"] >= 5
 
 
-def test_unchanged_and_disconnected_poses_are_not_sent(openvr, serve, connect, read):
+def test_unchanged_and_disconnected_poses_are_not_sent(openvr, serve, connect, read, until):
     source = OpenVrTrackers({"LHR-LEFT": "left", "LHR-HEAD": "head"})
     openvr.poses[5][4] = False
     bridge = serve(source)
     driver = connect(kind="pose_tracker", stream="wrist_left", port=bridge.port)
     read(driver, 3)
     openvr.moves = False
-    while source.not_sent["unchanged"] < 5:
-        driver.read()
+    until(lambda: source.not_sent["unchanged"] >= 5, driver.read)
     summary = bridge.end()
     assert summary.not_sent["unchanged"] >= 5
     assert summary.not_sent["disconnected"] >= 8

@@ -159,13 +159,12 @@ def test_stamps_are_the_time_of_the_request(runtime, serve, connect, read):
     assert on_monotonic_ns < time.monotonic_ns() + 5_000_000
 
 
-def test_unchanged_joints_are_not_sent(runtime, serve, connect, read):
+def test_unchanged_joints_are_not_sent(runtime, serve, connect, until):
     source = OpenXrHands(("left",), library=runtime.path)
     bridge = serve(source)
     driver = connect(**fingers(bridge.port))
     runtime.show(LEFT, flat_hand("left"), Rotation.identity())
-    while source.not_sent["unchanged"] < 5:
-        driver.read()
+    until(lambda: source.not_sent["unchanged"] >= 5, driver.read)
     assert bridge.end().not_sent["unchanged"] >= 5
 
 
