@@ -119,6 +119,18 @@ def test_what_a_full_queue_loses_is_counted(listening, connect, read):
     assert any("did not read in time" in line for line in listening.summary.lines())
 
 
+def test_all_stations_count_the_same_packets(listening, connect, read):
+    drivers = [
+        connect(kind="pose_tracker", stream="wrist_left", port=port_of(listening)) for _ in range(2)
+    ]
+    for count in range(5):
+        listening.send(pose(10_000_000 * (count + 1)), has_station_time=False)
+    numbers = [[sample.sequence for sample in read(driver, 5)] for driver in drivers]
+    assert numbers[0] == numbers[1] == sorted(set(numbers[0]))
+    for driver in drivers:
+        assert (driver.statistics.lost, driver.statistics.restarts) == (0, 0)
+
+
 def test_stamps_that_do_not_advance_are_not_sent(listening):
     second = 10**9
     for t_ns in (5 * second, 5 * second, 4 * second + 1, 6 * second, 1 * second, 2 * second, -1):
