@@ -166,11 +166,6 @@ class LibsurviveTrackers(Source):
         finally:
             self.close()
 
-    def report(self) -> list[str]:
-        """Who was never there."""
-        found = {device.serial_number for device in self._found.values() if device is not None}
-        return [f"never present: {name}" for name in self._devices if name not in found]
-
     def _start(self) -> None:
         self._library = library = load_library(self._path, FUNCTIONS, install=INSTALL)
         words = [word.encode() for word in self._arguments]

@@ -247,10 +247,6 @@ class ManusGloves(Source):
         self._skeletons.clear()
         self._gloves.clear()
 
-    def report(self) -> list[str]:
-        """Hands that never came."""
-        return [f"never present: {side}" for side in self._devices if side not in self._owners]
-
     def _call(self, name: str, *arguments: object) -> None:
         if self._library is None:
             raise DeviceError("MANUS: not started; open it first")

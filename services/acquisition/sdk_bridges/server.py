@@ -47,7 +47,7 @@ class Summary:
 
     Attributes:
         seconds: from its start to its end.
-        sent: readings of each device.
+        sent: readings of each device, also of those that had none.
         restarts: how often the clock of each device went back by more than a second.
         old: readings whose stamps did not advance, by device; they were not sent.
         dropped: packets that a full queue lost, all stations together.
@@ -161,6 +161,7 @@ class BridgeServer:
     ) -> None:
         self.summary = Summary()
         self._hello, self._clock = hello, clock
+        self._expect_devices()
         self._path: Path | None = None
         self._lock = threading.Lock()
         self._stations: list[StationLink] = []
@@ -187,6 +188,7 @@ class BridgeServer:
         """Say another hello: stations must connect again if the devices are others now."""
         if hello != self._hello:
             self._hello = hello
+            self._expect_devices()
             with self._lock:
                 for station in self._stations:
                     station.close()
@@ -227,6 +229,9 @@ class BridgeServer:
                 station.close()
         if self._path is not None:
             self._path.unlink(missing_ok=True)
+
+    def _expect_devices(self) -> None:
+        self.summary.sent.update({device.serial_number: 0 for device in self._hello.devices})
 
     def _put(self, place: int, t_device_ns: int, payload: bytes) -> None:
         with self._lock:

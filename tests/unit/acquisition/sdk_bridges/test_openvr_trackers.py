@@ -177,7 +177,8 @@ def test_unchanged_and_disconnected_poses_are_not_sent(openvr, serve, connect, r
     summary = bridge.end()
     assert summary.not_sent["unchanged"] >= 5
     assert summary.not_sent["disconnected"] >= 8
-    assert set(summary.sent) == {"LHR-LEFT"}
+    assert summary.sent["LHR-LEFT"] >= 3
+    assert summary.sent["LHR-HEAD"] == 0
 
 
 async def test_two_trackers_at_the_route_of_a_station(openvr, serve, live_poses):
