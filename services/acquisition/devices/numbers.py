@@ -102,6 +102,8 @@ class NumbersSettings(TrackerSettings):
     def _is_a_stream(self) -> "NumbersSettings":
         if not 1 <= np.prod(self.shape, dtype=float) <= MAX_CHANNELS or min(self.shape) < 1:
             raise ValueError(f"shape: got {self.shape}, expected 1 … {MAX_CHANNELS} numbers")
+        if self.stream.startswith("camera_"):
+            raise ValueError(f"stream: got {self.stream!r}, expected another name: cameras give it")
         is_pose = (self.shape, self.unit) == (POSE_SHAPE, POSE_UNIT)
         if is_pose is not (self.stream_kind == "pose") or (is_pose and self.frame is None):
             raise ValueError(

@@ -108,6 +108,7 @@ def test_a_pose_is_taken_as_it_is():
         {"shape": (2**40, 2**40)},
         {"stream_kind": "pose"},
         {"stream_kind": "image"},
+        {"stream": "camera_head"},
         {"shape": (7,), "unit": "pose_m_wxyz", "frame": "world"},
         {"link": "usb", "vendor_id": 1, "product_id": 2, "port": None},
         {"port": None},
