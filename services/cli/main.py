@@ -47,6 +47,11 @@ COMMANDS = {
     "station serve": Command(
         "record gloves, trackers and cameras", "pipelines.station:main", "acquisition"
     ),
+    "station bridge": Command(
+        "serve samples of other makers' trackers and programs to stations",
+        "acquisition.sdk_bridges.command_line:main",
+        "acquisition.sdk_bridges.parser:bridge_parser",
+    ),
     "station enrol": Command(
         "exchange a one-time token for the station's key of the store",
         "cli.enrolment:station_enrol_main",
