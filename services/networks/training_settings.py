@@ -14,6 +14,8 @@ MaxSteps = Annotated[
 ]
 CpuBudget = Annotated[float, Field(gt=0, description="CPU seconds after which training ends")]
 Batch = Annotated[int, Field(ge=1, description="examples per training step")]
+Share = Annotated[float, Field(ge=0, le=1)]
+NonNegative = Annotated[float, Field(ge=0)]
 LearningRate = Annotated[float, Field(gt=0, description="peak of the cosine schedule")]
 WarmupSteps = Annotated[int, Field(ge=1, description="warm-up steps of the learning rate")]
 WeightDecay = Annotated[float, Field(ge=0, description="AdamW weight decay")]

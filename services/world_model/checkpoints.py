@@ -46,10 +46,10 @@ LATER_STATISTICS = ("tokenizer.peak_kpa",)
 class TrainingSet(FrozenModel):
     """Episodes of one domain that a model was trained on, or that it was evaluated on (held out).
 
-    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes
-    (`dextouch.episodes`). `window_share` is the share of windows from the set, None where it
-    follows from the number of episodes. `checkpoint` is the digest of the ancestor that was trained
-    on the set, None for the checkpoint's own training.
+    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes,
+    `window_share` the share of windows from the set, None where it follows from the number of
+    episodes. `checkpoint` is the digest of the ancestor that was trained on the set, None for the
+    checkpoint's own training.
     """
 
     domain: Domain
@@ -68,11 +68,10 @@ def learned_tasks(sets: Iterable[TrainingSet]) -> set[str]:
 class CheckpointMetadata(FrozenModel):
     """Provenance and measured accuracy of a model, stored in its checkpoint.
 
-    `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
-    training episodes count as training episodes here, too. `tokenizer_digest` is that of the
-    pretrained tokenizer's file. None is not written, so that older releases can read the file.
-    `sets` are the episodes by domain, those of ancestors included; it is empty in files of older
-    releases.
+    `initialized_from` is the digest of the checkpoint that the weights were initialized from, whose
+    training episodes count here, too, and `tokenizer_digest` that of the pretrained tokenizer's
+    file. None is not written, so that older releases can read the file. `sets` are the episodes by
+    domain, those of ancestors included; empty in files of older releases.
     """
 
     format_version: int = 1
@@ -125,9 +124,11 @@ def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
     """
-    limit = _largest(path) if max_bytes is None else max_bytes
+    if max_bytes is None:
+        is_full_size = '"video_expert":"wan"' in notes_of(path).get(METADATA_KEY, "")
+        max_bytes = (available_memory() or sys.maxsize) if is_full_size else MAX_FILE_BYTES
     tensors, metadata, digest = read_weights(
-        path, CheckpointMetadata, METADATA_KEY, max_bytes=limit
+        path, CheckpointMetadata, METADATA_KEY, max_bytes=max_bytes
     )
     model = JointWorldModel(metadata.network)
     if model.text_features is not None:
@@ -146,15 +147,6 @@ def read_metadata(path: Path) -> CheckpointMetadata:
         InvalidInputError: unsupported format version.
     """
     return read_history(path, CheckpointMetadata, METADATA_KEY)
-
-
-def _largest(path: Path) -> int:
-    """Largest size of a file of its kind, as its metadata declare it."""
-    text = notes_of(path).get(METADATA_KEY, "")
-    if '"video_expert":"wan"' not in text:
-        return MAX_FILE_BYTES
-    available = available_memory()
-    return sys.maxsize if available is None else available
 
 
 def list_checkpoints(folder: Path) -> dict[Path, str]:
@@ -180,8 +172,7 @@ class StateBounds(FrozenModel):
     def latent_distance(self) -> float:
         """Largest distance at which a latent step is not flagged.
 
-        If the bound is on the mean over an episode, no step exceeds that mean times the number of
-        steps.
+        No step exceeds a bound on the mean over an episode times the number of steps.
         """
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 

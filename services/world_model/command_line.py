@@ -51,7 +51,7 @@ def run_train(arguments: list[str]) -> int:
 
 
 def run_adapt(arguments: list[str]) -> int:
-    """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
+    """Adapt a checkpoint to new tasks, as `run_train`."""
     settings = load_settings(adapt_settings(arguments), arguments)
     if isinstance(settings, AdaptStateCommand):
         return _train_state(settings)
@@ -60,14 +60,13 @@ def run_adapt(arguments: list[str]) -> int:
 
 
 def run_distill(arguments: list[str]) -> int:
-    """Train a checkpoint to sample in few steps; print the report and optionally write it."""
+    """Train a checkpoint to sample in few steps, as `run_train`."""
     settings = load_settings(DistillCommand, arguments)
     network = read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
-    """Train with a progress bar of the first process, which prints the report."""
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -99,7 +98,6 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
 
 
 def _train_state(settings: TrainStateCommand | AdaptStateCommand) -> int:
-    """Train a state model; print its evaluation and optionally write it to a file."""
     from services.world_model.training.state_trainer import train_state
 
     report = train_state(settings)
@@ -168,7 +166,6 @@ def run_show(arguments: list[str]) -> int:
 
 
 def _history(file: Path) -> dict[str, Any]:
-    """Metadata of a checkpoint of either kind, or of a tactile tokenizer."""
     if is_tokenizer(file):
         stored = read_tokenizer(file)
         about = stored.metadata.model_dump(mode="json", exclude={"train_scenes"})

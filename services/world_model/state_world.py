@@ -174,7 +174,7 @@ class StateWorld(BatchWorld[StateRollout]):
         return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
     def _check_start(self, start: RolloutStart, first: ObservedStart) -> None:
-        """Run the checks shared by all world models; hands and camera must be within reach."""
+        """Checks of all world models: hands and camera must be within reach."""
         check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
             first_image=first.image,
@@ -236,7 +236,16 @@ class StateWorld(BatchWorld[StateRollout]):
             )
             for index, state in enumerate(states)
         ]
-        return self._drawn(answers)
+        images = iter(self._renderer.draw_all([drawing for _, drawing in answers if drawing]))
+        return [
+            stepped
+            if drawing is None
+            else replace(
+                stepped,
+                observation=replace(stepped.observation, images={HEAD_CAMERA: next(images)}),
+            )
+            for stepped, drawing in answers
+        ]
 
     def _refuse_ended(self, state: StateRollout) -> None:
         limit = LAST_HORIZONS * self._metadata.bounds.horizon_latents
@@ -274,12 +283,8 @@ class StateWorld(BatchWorld[StateRollout]):
         return SteppedRollout(state, observation), drawing
 
     def _drawing(
-        self,
-        state: StateRollout,
-        actions: Float64[np.ndarray, "n 67"],
-        poses: Float32[np.ndarray, "n objects 7"],
+        self, state: StateRollout, actions: np.ndarray, poses: Float32[np.ndarray, "n objects 7"]
     ) -> Drawing:
-        """Steps of a rollout to draw, with hands and objects at the given poses."""
         actions = np.concatenate([state.first_reached[None], actions])
         first = self._poses(mean_poses(state.memory.start.objects), state.task)
         poses = np.concatenate([first, poses])
@@ -290,27 +295,8 @@ class StateWorld(BatchWorld[StateRollout]):
         boxes_m = boxes_m * size[:, BOX_AXES]
         return Drawing(state.image, state.K_head, states, boxes_m)
 
-    def _drawn(
-        self, answers: Sequence[tuple[SteppedRollout[StateRollout], Drawing | None]]
-    ) -> list[SteppedRollout[StateRollout]]:
-        """The answers with their images, all drawn together."""
-        images = iter(self._renderer.draw_all([drawing for _, drawing in answers if drawing]))
-        return [
-            stepped
-            if drawing is None
-            else replace(
-                stepped,
-                observation=replace(stepped.observation, images={HEAD_CAMERA: next(images)}),
-            )
-            for stepped, drawing in answers
-        ]
-
     def _uncertainty(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Uncertainty:
-        """Uncertainty of a chunk.
-
-        `distance` is of the hands' motion alone; of the start image count which objects are found,
-        their sizes and where the members' readers disagree, but not the readers' own `sd_m`.
-        """
+        """`distance` is of the hands' motion alone, and no part uses the readers' own `sd_m`."""
         bounds = self._metadata.bounds
         # Of the worst latent step, independent of the chunk length.
         disagreement_m = float(steps.disagreement_m[index].max())
@@ -333,6 +319,9 @@ class StateWorld(BatchWorld[StateRollout]):
             reason = f"hands are {times:.1f} times as far from training as allowed"
         elif not self._knows_instruction(state):
             reason = "the instruction is none of training"
+        # Of movable objects, as a share of the usual size.
+        movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
+        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
         success = steps.success[:, index, -1]
         return Uncertainty(
             disagreement=disagreement_m,
@@ -341,21 +330,14 @@ class StateWorld(BatchWorld[StateRollout]):
             reason=reason,
             success_probability=float(success.logit(1e-6).mean().sigmoid()),
             success_spread=float(success.max() - success.min()),
-            size_deviation=self._size_deviation(state),
+            size_deviation=float(deviations.max()),
         )
 
     def _knows_instruction(self, state: StateRollout) -> bool:
-        """Whether the model reads no instruction, or was trained with that of the rollout."""
         cosines = functional.cosine_similarity(
             self._instructions, state.memory.start.instruction[0], dim=1
         )
         return not self._instructions.numel() or float(cosines.max()) > _SAME_INSTRUCTION
-
-    def _size_deviation(self, state: StateRollout) -> float:
-        """Largest deviation of a movable object's size from the usual one, as a share of it."""
-        movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
-        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
-        return float(deviations.max())
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
         """Poses of the task's objects; absent ones lie below the table."""

@@ -28,6 +28,8 @@ PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
 _THETA = 1e4
 NUM_MODULATIONS = 6
 Heads = Float[Tensor, "batch heads tokens head_width"]
+Tokens = Float[Tensor, "batch tokens width"]
+_Rows = Float[Tensor, "*batch width"]
 
 
 @cache
@@ -107,9 +109,7 @@ def angles(positions: Float32[Tensor, "tokens 3"], head_width: int) -> Float32[T
     return torch.cat(parts, dim=1).float()
 
 
-def rotate(
-    heads: Float[Tensor, "batch heads tokens width"], turn: Float32[Tensor, "tokens n"]
-) -> Float[Tensor, "batch heads tokens width"]:
+def rotate(heads: Heads, turn: Float32[Tensor, "tokens n"]) -> Heads:
     """Turn each pair of values by its angle, in float32."""
     first, second = split_axis(heads.float(), -1, (-1, 2)).unbind(-1)
     cos, sin = turn.cos(), turn.sin()
@@ -158,16 +158,13 @@ class ActionAttention(nn.Module):
         self.to_out = nn.Linear(inner, width, bias=False)
 
     def forward(
-        self,
-        tokens: Float32[Tensor, "batch tokens width"],
-        actions: Float32[Tensor, "batch groups keys width"],
-    ) -> Float32[Tensor, "batch tokens width"]:
+        self, tokens: Tokens, actions: Float32[Tensor, "batch groups keys width"]
+    ) -> Tokens:
         """What the tokens take from their actions; groups are consecutive and of one size."""
         groups = split_axis(self.norm(tokens), 1, (actions.shape[1], -1)).flatten(0, 1)
         query = split_axis(self.to_query(groups), -1, (self.num_heads, -1)).transpose(1, 2)
-        both = split_axis(
-            self.to_key_value(actions.flatten(0, 1)), -1, (2, self.num_heads, -1)
-        ).permute(2, 0, 3, 1, 4)
+        both = split_axis(self.to_key_value(actions.flatten(0, 1)), -1, (2, self.num_heads, -1))
+        both = both.permute(2, 0, 3, 1, 4)
         attended = functional.scaled_dot_product_attention(
             self.query_norm(query), self.key_norm(both[0]), both[1]
         )
@@ -186,7 +183,7 @@ class KeysValues:
 class Text:
     """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
 
-    The words do not depend on the flow time, so that the steps of a sampler can share one object.
+    They do not depend on the flow time, so that the steps of a sampler can share one object.
     """
 
     words: Float[Tensor, "batch words width"]
@@ -209,7 +206,7 @@ class Stream:
     `actions` the action tokens of each group of tokens, for cross-attention.
     """
 
-    tokens: Float[Tensor, "batch tokens width"]
+    tokens: Tokens
     modulation: Float[Tensor, "batch groups 6 width"]
     turn: Float32[Tensor, "tokens angles"] | None = None
     text: Text | None = None
@@ -229,7 +226,7 @@ class Stream:
             if (values := getattr(self, name)) is not None
         }
         first, others = (
-            replace(self, **{name: both[index] for name, both in parts.items()}) for index in (0, 1)
+            replace(self, **{name: both[i] for name, both in parts.items()}) for i in (0, 1)
         )
         return first, others
 
@@ -357,11 +354,7 @@ class JointLayer(nn.Module):
         return seen, self.tactile.finish(tactile, attended[:, num_video:])
 
 
-def modulated_norm(
-    tokens: Float[Tensor, "*batch width"],
-    shift: Float[Tensor, "*batch width"],
-    scale: Float[Tensor, "*batch width"],
-) -> Float[Tensor, "*batch width"]:
+def modulated_norm(tokens: _Rows, shift: _Rows, scale: _Rows) -> _Rows:
     """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
 

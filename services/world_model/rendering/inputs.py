@@ -293,8 +293,8 @@ def _warped(
         torch.from_numpy(start.layers)[torch.from_numpy(owner)],
         torch.from_numpy(positions),
         interpolation=config.interpolation,
-    ).clamp_(0.0, 1.0)
-    planes: np.ndarray = sampled.numpy()
+    )
+    planes: np.ndarray = sampled.clamp_(0.0, 1.0).numpy()
     outside = ~is_inside(positions, start.layers.shape[2:])
     return planes[:, :3], planes[:, 3:], outside[:, None].astype(np.float32)
 
@@ -344,9 +344,8 @@ def _moved_at_start(
     boxes = table[np.arange(len(owner))[:, None, None], start.shown[owner]]
     hands = (start.hands[owner] > _COVERED) * moved[:, :2, None, None]
     shares = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
-    sampled = sample_images(
-        torch.from_numpy(shares), torch.from_numpy(positions), interpolation="bilinear"
-    )
+    moved_from = torch.from_numpy(positions)
+    sampled = sample_images(torch.from_numpy(shares), moved_from, interpolation="bilinear")
     return np.asarray(sampled.numpy())
 
 
@@ -355,8 +354,7 @@ def grown(
 ) -> Float32[np.ndarray, "*batch h w"]:
     """Largest value of a mask (0 or more) within some pixels along both axes.
 
-    A window doubles with each comparison, one axis after the other: ten times faster than
-    `torch.nn.functional.max_pool2d`.
+    A window doubles with each comparison: ten times faster than torch's `max_pool2d`.
     """
     for axis in (-2, -1):
         mask = np.swapaxes(mask, axis, -2)

@@ -89,8 +89,7 @@ class RendererNetwork(nn.Module):
     def _entered(self, inputs: DrawingInputs) -> Float[Tensor, "n width rows cols"]:
         """Stem convolution of all channels, with 2×2 blocks of fine pixels folded into channels.
 
-        Computed as a convolution of the fine pixels with stride 2, whose kernel holds the weights
-        of their four positions, which copies less than folding the pixels.
+        A stride of 2, with the weights of four positions in a kernel, copies less than folding.
         """
         weight, px = self.stem.weight, self.config.stem_px
         dtype, padding = weight.dtype, px // 2

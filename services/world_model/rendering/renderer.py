@@ -20,11 +20,7 @@ from services.world_model.rendering.inputs import (
     drawing_inputs,
 )
 from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
-from services.world_model.rendering.rasters import (
-    MAX_DRAWN_OBJECTS,
-    SceneStates,
-    joined,
-)
+from services.world_model.rendering.rasters import MAX_DRAWN_OBJECTS, SceneStates, joined
 
 # Chosen: about 1.5 MB of working memory an image; larger blocks are not faster.
 _BLOCK_IMAGES: Final = 32
@@ -71,10 +67,8 @@ class Renderer:
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
         """Draw images of any number of rollouts; together as alone, except for rounding.
 
-        Start images have one size, whose sides are multiples of `pixel_multiple`.
-
-        If camera, hands and objects are where they were at the start, the image is exactly the
-        start image.
+        Start images have one size, whose sides are multiples of `pixel_multiple`. Where nothing
+        moved since the start, the image is exactly the start image.
         """
         if not drawings:
             return []

@@ -31,6 +31,10 @@ from services.world_model.rendering.rasters import SceneStates, joined, object_t
 
 LOG_EVERY_STEPS = 50
 _EDGE_WINDOW_PX = 7
+# Chosen: half of the pairs begin at the first image of an episode, as rollouts do.
+_LATE_START_SHARE = 0.5
+# Chosen: rotation noise (rad) on each axis, a multiple of what predicted poses are off.
+_SHAKE_RAD = 0.05
 OnProgress = Callable[[float, int, float], None]
 
 
@@ -63,8 +67,7 @@ def train_renderer(
     """Train on pairs of images of one clip: a start image and a target image.
 
     `rng` draws initial weights, pairs and pose noise. `on_progress` is called every few steps with
-    the completed share, the step and the loss. Training starts from the weights of `initial`, which
-    has the same shape, if there is one.
+    the completed share, the step and the loss. Weights begin as those of `initial`, if given.
 
     Returns:
         The averaged network, and the CPU seconds of training.
@@ -142,7 +145,7 @@ class RendererRun:
         for _ in range(self._settings.batch):
             clip = int(self._rng.integers(len(self._clips)))
             length = len(self._clips[clip])
-            is_late = self._rng.random() < self._settings.late_start_fraction
+            is_late = self._rng.random() < _LATE_START_SHARE
             start = int(self._rng.integers(length - 1)) if is_late else 0
             starts.append((clip, start))
             laters.append((clip, int(self._rng.integers(start + 1, length))))
@@ -153,7 +156,7 @@ class RendererRun:
         settings, shape = self._settings, states.object_present.shape
         is_shaken = self._rng.random(len(states)) < settings.shaken_fraction
         shift = self._rng.normal(size=(*shape, 3)) * settings.shake_m
-        turn = self._rng.normal(size=(*shape, 3)) * settings.shake_rad
+        turn = self._rng.normal(size=(*shape, 3)) * _SHAKE_RAD
         poses = states.object_poses.copy()
         poses[..., :3] += shift * is_shaken[:, None, None]
         R = rotation_from_vector(turn * is_shaken[:, None, None])

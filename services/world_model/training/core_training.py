@@ -37,6 +37,8 @@ _SETTLED_M = 1e-3
 # Cores are trained from the first step and from every so many steps after it.
 _START_STRIDE = 8
 _TAXEL_SHARE = 4
+# Chosen: some examples have measured actions, so that rollouts of these are known, too.
+_MEASURED_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def _draw(
     def chance(fraction: float) -> Bool[Tensor, " batch"]:
         return torch.rand(len(rows), generator=generator) < fraction
 
-    measured = chance(settings.measured_fraction) | ~table.commanded[rows]
+    measured = chance(_MEASURED_SHARE) | ~table.commanded[rows]
     commands = table.commands(rows, start_step, measured)
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
     held &= _is_settled(table, rows, start_step) & table.labelled[rows]

@@ -1,15 +1,14 @@
 """Random training windows of episodes in memory, as requests and targets.
 
-Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
-reads nothing from disk. For data larger than memory, episodes stay on disk, and a window is read
-through the store's reader, which decodes one camera and only the span of the window.
+Episodes are read once and cut with the re-anchoring of the store's reader. For data larger than
+memory, they stay on disk, and a window is read through that reader, its span alone.
 """
 
 import hashlib
 from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -36,6 +35,9 @@ from services.world_model.network.inputs import ObjectsAtStart, PredictionReques
 CUT: Final = (needs.EVERY_PART, needs.EVERY_IMAGE)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
+# Chosen: half of the windows of episodes that have commanded actions have these, since policies
+# send them, and of those a third is anchored like the later chunks of a rollout.
+_COMMANDED_SHARE, _CHAINED_SHARE = 0.5, 0.3
 
 
 @dataclass(frozen=True)
@@ -207,6 +209,13 @@ def _reader(url: str, episode_id: str) -> EpisodeReader:
     return EpisodeStore(url).open(episode_id)
 
 
+# What a stored episode has of its arrays.
+_SHARED: Final = (
+    "episode_id", "task", "scene", "action_kinds", "content_sha256", "domain", "model_rate_hz",
+    "interpolated",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class StoredEpisode:
     """One episode that stays on disk; created by `index_episodes`."""
@@ -287,9 +296,9 @@ class WindowSampler:
     """Samples windows uniformly over starts, and over the episodes of each domain.
 
     Windows have no interpolated step. Episodes have one of `max_steps` at least. Of windows from
-    episodes with commanded actions, the `commanded_fraction` has them, and of these the
-    `chained_fraction` is anchored like a later chunk. `human_share` is that of windows from human
-    episodes, if there are human and robot ones; None: every episode is equally likely.
+    episodes with commanded actions, half have them, and 30 % of these are anchored like a later
+    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
+    None: every episode is equally likely.
     """
 
     def __init__(
@@ -298,8 +307,6 @@ class WindowSampler:
         rng: np.random.Generator,
         *,
         max_steps: int,
-        commanded_fraction: float = 0.5,
-        chained_fraction: float = 0.3,
         human_share: float | None = None,
     ) -> None:
         short = [e.episode_id for e in episodes if not len(window_starts(e, max_steps))]
@@ -311,8 +318,6 @@ class WindowSampler:
             )
         self._episodes = list(episodes)
         self._rng = rng
-        self._commanded_fraction = commanded_fraction
-        self._chained_fraction = chained_fraction
         of: dict[Domain, list[int]] = {"human": [], "robot": []}
         for index, episode in enumerate(episodes):
             of[episode.domain].append(index)
@@ -343,13 +348,11 @@ class WindowSampler:
         episode = self._episodes[index]
         starts = window_starts(episode, num_steps)
         start = int(starts[self._rng.integers(len(starts))])
-        is_commanded = self._rng.random() < self._commanded_fraction
-        is_chained = bool(self._rng.random() < self._chained_fraction)
+        is_commanded = self._rng.random() < _COMMANDED_SHARE
+        is_chained = bool(self._rng.random() < _CHAINED_SHARE)
         if not is_commanded or "commanded" not in episode.action_kinds:
             return WindowPosition(index, start, num_steps)
-        return WindowPosition(
-            index, start, num_steps, action_kind="commanded", from_command=is_chained
-        )
+        return WindowPosition(index, start, num_steps, "commanded", from_command=is_chained)
 
 
 def load_episodes(
@@ -384,20 +387,14 @@ def index_episodes(
     for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
         # The cached reader, so that processes forked later inherit it open.
         arrays = read_episode(_reader(url, found.item_id), image_px=image_px)
+        shared: dict[str, Any] = {name: getattr(arrays, name) for name in _SHARED}
         indexed.append(
             StoredEpisode(
                 url=url,
-                episode_id=arrays.episode_id,
-                task=arrays.task,
-                scene=arrays.scene,
                 num_steps=len(arrays),
-                action_kinds=arrays.action_kinds,
-                content_sha256=arrays.content_sha256,
                 print_sha256=arrays.fingerprint(),
-                domain=arrays.domain,
-                model_rate_hz=arrays.model_rate_hz,
                 image_px=image_px,
-                interpolated=arrays.interpolated,
+                **shared,
             )
         )
     return indexed

@@ -1,8 +1,4 @@
-"""Episodes of people and of robots in one training: subsets of them, checks, and their provenance.
-
-Both forms of the world model are trained on them, so that only what is common to their episodes is
-used here.
-"""
+"""Episodes of people and of robots in one training: subsets of them, checks, and provenance."""
 
 import hashlib
 from collections import Counter

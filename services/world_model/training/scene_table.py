@@ -198,9 +198,8 @@ class SceneTable:
             return chosen(use_measured, getattr(self.measured, name)[rows][:, steps], sent)
 
         here = self.measured
-        holding = here.points_m[rows, start][:, None, None].expand(
-            -1, 1, len(SAMPLE_OFFSETS), -1, -1, -1
-        )
+        holding = here.points_m[rows, start][:, None, None]
+        holding = holding.expand(-1, 1, len(SAMPLE_OFFSETS), -1, -1, -1)
         return Commands(
             torch.cat([holding, taken("points_m", samples)], dim=1),
             torch.cat([here.axes[rows, start][:, None], taken("axes", ends)], dim=1),
@@ -215,21 +214,22 @@ class SceneTable:
     def tensors(self) -> dict[str, Tensor]:
         """All data as named tensors, to share with other processes through a file."""
         flat = {"image_steps": torch.tensor(self.image_steps)}
-        for name in (one.name for one in fields(self) if one.name != "image_steps"):
-            flat |= by_name(getattr(self, name), name)
+        for field in fields(self):
+            if field.name != "image_steps":
+                flat |= by_name(getattr(self, field.name), field.name)
         return {name: value.contiguous() for name, value in flat.items()}
 
     @classmethod
     def from_tensors(cls, flat: dict[str, Tensor]) -> "SceneTable":
         """Inverse of `tensors`."""
         parts: dict[str, Any] = {name: part for name, part in flat.items() if "." not in name}
-        kinds: dict[str, type[Any]] = {
-            "sent": HandTable, "measured": HandTable, "objects": ObjectPoses,
-        }  # fmt: skip
-        for name, kind in kinds.items():
-            start = f"{name}."
-            inner = {key: value for key, value in flat.items() if key.startswith(start)}
-            parts[name] = kind(**{key.removeprefix(start): one for key, one in inner.items()})
+        for name, kind in (("sent", HandTable), ("measured", HandTable), ("objects", ObjectPoses)):
+            inner = {
+                key.partition(".")[2]: one
+                for key, one in flat.items()
+                if key.startswith(f"{name}.")
+            }
+            parts[name] = kind(**inner)
         return cls(**{**parts, "image_steps": tuple(flat["image_steps"].tolist())})
 
 
@@ -363,16 +363,14 @@ def filled_touch(
 
 
 def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:
-    """For each taxel the nearest measured one in rows and columns of its pad, or itself."""
     nearest = np.arange(NUM_TAXELS)
     if measured.all():
         return nearest
     tips, palm = split_pads(nearest)
     for pad in (*tips, palm):
         if measured[pad].any():
-            places = distance_transform_edt(
-                ~measured[pad], return_distances=False, return_indices=True
-            )
+            away = ~measured[pad]
+            places = distance_transform_edt(away, return_distances=False, return_indices=True)
             nearest[pad] = pad[tuple(places)]
     return nearest
 
@@ -390,8 +388,7 @@ def _known(
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
     """Latent steps with an image in at least half of the episodes that have them."""
-    num_shown = np.zeros(max(lengths), dtype=np.int64)
-    num_long = np.zeros(max(lengths), dtype=np.int64)
+    num_shown, num_long = np.zeros((2, max(lengths)), dtype=np.int64)
     for episode, length in zip(episodes, lengths, strict=True):
         own = episode.image_steps
         if not len(own) or own[0] != 0:
@@ -435,12 +432,10 @@ def _size(
 ) -> Float32[np.ndarray, "slots 2"]:
     """Width and height of an episode's objects relative to the usual ones; 1 in empty slots."""
     size = np.ones((MAX_OBJECTS, 2), dtype=np.float32)
-    if not len(episode.boxes_m):
-        return size
-    across, height = (slice(3, 5), slice(5, 6))
-    for column, part in enumerate((across, height)):
-        factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
-        size[: len(factors), column] = factors.clip(*SIZE_RANGE)
+    if len(episode.boxes_m):
+        for column, part in enumerate((slice(3, 5), slice(5, 6))):
+            factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
+            size[: len(factors), column] = factors.clip(*SIZE_RANGE)
     return size
 
 
@@ -454,7 +449,6 @@ def _padded(
 
 
 def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> list[ObjectTrack]:
-    """Object poses of the episodes, if these fit the configuration."""
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
     size_px = (config.image_px, config.image_px)

@@ -1,8 +1,8 @@
 """Episodes that a state model is trained and evaluated on, and their provenance.
 
 Poses of their objects are those of the twin, of markers or trackers, clicked in the first image, or
-given by touch (docs/objects.md). Where others of their task have poses, episodes without are taken,
-too: touch and outcome are learned from them.
+given by touch (docs/objects.md). Where others of their task have poses, episodes without teach
+touch and outcome.
 """
 
 import hashlib
@@ -109,8 +109,8 @@ class SceneGrid(EpisodeGrid):
 
     @cached_property
     def _touched_alone(self) -> ObjectTrack | None:
-        may = self._file is not None and self._may_be_touched
-        return touched_objects(self, self._file) if may and self._file else None
+        is_held = self._file is not None and self._may_be_touched
+        return touched_objects(self, self._file) if is_held and self._file else None
 
     @property
     def _may_be_touched(self) -> bool:
@@ -193,8 +193,8 @@ def load_scene_episodes(
         and _recording(grids[name]) not in recordings
     }
     if len(used) < len(without):
-        reason, count = needs.OBJECTS.lack, len(without) - len(used)
-        logger.warning("skipped_episodes", reason=f"{reason} ({needs.OBJECTS.remedy})", count=count)
+        reason = f"{needs.OBJECTS.lack} ({needs.OBJECTS.remedy})"
+        logger.warning("skipped_episodes", reason=reason, count=len(without) - len(used))
     if not used:
         return [grids[name] for name in grids if name in with_poses]
     both = replace(posed, is_met=lambda reader: reader.item_id in used | with_poses)
@@ -203,7 +203,6 @@ def load_scene_episodes(
 
 
 def _recording(grid: EpisodeGrid) -> str | None:
-    """What an episode was aligned from at a station."""
     return recording_of(grid.about) if grid.about.origin == "recorded" else None
 
 
@@ -219,12 +218,13 @@ def _grid(
         return SceneGrid(reader, image_px)
     given = clicks.episodes.get(reader.item_id)
     stored = None
+    given = stored = clicks.episodes.get(reader.item_id)
     if given is None:
         held = (store for store in stores if store.exists(reader.item_id))
         stored = next((store.clicks(reader.item_id) for store in held), None)
-    one = given or stored
-    if one is None:
+    if stored is None:
         return SceneGrid(reader, image_px, objects=clicks)
+    one = stored
     clicked = clicked_poses(about, clicks, one, may_lack_headings=given is None)
     unfinished = [
         each.name
@@ -332,7 +332,6 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
 
 
 def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:
-    """People in scenes that are not held out of the robots' ones."""
     scenes = {episode.scene for episode in heldout}
     kept = [episode for episode in people if episode.scene not in scenes]
     if len(kept) < len(people):

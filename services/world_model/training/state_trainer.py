@@ -108,16 +108,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
-    contents = (episode.content_sha256 for episode in training)
-    hashed = data_hash(contents, image_px=_unusual_px(settings))
+    hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
-    heldout_table = scene_table(heldout, config)
-    table = scene_table(
-        training,
-        config,
-        labelled=labelled_episodes(training, settings),
-        human_share=settings.share_of_human,
-    )
+    heldout_table, labelled = scene_table(heldout, config), labelled_episodes(training, settings)
+    share = settings.share_of_human
+    table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
         check_drawable(drawn_episodes(data))
     codec = _codec(table, config, base)
@@ -165,15 +160,14 @@ def _metadata(
 ) -> StateMetadata:
     """Provenance and accuracy of a trained model."""
     settings, base = work.settings, work.base
+    keeps_bounds = base is not None and settings.learn != "all"
     return StateMetadata(
         name=settings.name,
         dynamics=work.config,
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
-        bounds=bounds
-        if base is None or settings.learn == "all"
-        else base.checkpoint.metadata.bounds,
+        bounds=base.checkpoint.metadata.bounds if base and keeps_bounds else bounds,
         command=command,
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
@@ -222,11 +216,6 @@ class _Work:
     def keeps_readers(self) -> bool:
         """Whether the initial model's readers are kept."""
         return self.settings.learn == "success"
-
-    @property
-    def keeps_renderer(self) -> bool:
-        """Whether the initial model's renderer is kept."""
-        return self.settings.learn != "all"
 
     def reader_file(self, member: int) -> Path:
         """File of a member's finished reader; its name depends on settings and data."""
@@ -318,7 +307,7 @@ def _train_parts(work: _Work) -> None:
         if not (work.reads_starts or work.keeps_readers):
             orders += [pool.submit(_train_reader, work, m) for m in members]
         orders += [pool.submit(_train_core, work, m) for m in members]
-        if not (work.keeps_renderer or work.renderer_file.exists()):
+        if work.settings.learn == "all" and not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
@@ -329,11 +318,10 @@ def _train_renderer(work: _Work) -> None:
     settings = work.settings
     episodes = drawn_episodes(load_state_data(settings))
     rng = np.random.default_rng(settings.seed)
-    episodes = [
-        e for e, known in zip(episodes, labelled_episodes(episodes, settings), strict=True) if known
-    ]
-    chosen = rng.permutation(len(episodes))[:MAX_CLIPS]
-    clips = scene_clips([episodes[index] for index in sorted(chosen)])
+    labelled = zip(episodes, labelled_episodes(episodes, settings), strict=True)
+    known = [episode for episode, is_labelled in labelled if is_labelled]
+    chosen = rng.permutation(len(known))[:MAX_CLIPS]
+    clips = scene_clips([known[index] for index in sorted(chosen)])
     lines = ProgressLines("train renderer", has_bar=False)
 
     def on_progress(share: float, step: int, loss: float) -> None:
@@ -351,7 +339,6 @@ def _train_renderer(work: _Work) -> None:
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
-    """Write a finished part with its CPU seconds."""
     write_tensors(path, model.state_dict(), {_CPU_S: str(cpu_s)})
 
 
@@ -363,7 +350,6 @@ def _load(model: nn.Module, path: Path) -> float:
 
 
 def _table(work: _Work) -> tuple[SceneTable, TouchCodec]:
-    """The training data as kept for the processes of the parts."""
     torch.set_num_threads(1)
     flat = load_file(work.parts / "table.safetensors")
     codec = TouchCodec(work.config.touch_channels)
@@ -377,13 +363,15 @@ def _train_reader(work: _Work, member: int) -> None:
     if work.reader_file(member).exists():
         return
     table, _ = _table(work)
-    started_s = time.process_time()
-    on_step = _on_step(member, "reader")
+    started_s, base = time.process_time(), work.base
     seed = work.settings.seed * _SEED_STRIDE + member
-    settings, base = work.settings.reader, work.base
-    initial = None if base is None else base.reader(work.config, member, seed=seed)
     trained = train_reader(
-        table, work.config, settings, seed=seed, on_step=on_step, initial=initial
+        table,
+        work.config,
+        work.settings.reader,
+        seed=seed,
+        on_step=_on_step(member, "reader"),
+        initial=None if base is None else base.reader(work.config, member, seed=seed),
     )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
 
@@ -393,15 +381,14 @@ def _train_core(work: _Work, member: int) -> None:
     if work.core_file(member).exists():
         return
     readings: dict[int, Reading] = {}
-    starts_read = work.keeps_readers
-    if work.reads_starts and not starts_read:
+    if work.reads_starts and not work.keeps_readers:
         _train_reader(work, member)
     table, codec = _table(work)
     started_s = time.process_time()
-    if work.reads_starts or starts_read:
+    if work.reads_starts or work.keeps_readers:
         reader = _finished_reader(work, member)
         readings = {step: read_step(reader, table, step) for step in start_steps(table)}
-    data = CoreData(table, touch_latents(codec, table), readings, starts_read)
+    data = CoreData(table, touch_latents(codec, table), readings, work.keeps_readers)
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
     initial = None
@@ -423,7 +410,6 @@ def _finished_reader(work: _Work, member: int) -> StartReader:
 
 
 def _on_step(member: int, part: str) -> OnStep:
-    """Shows how far a part of a member is."""
     lines = ProgressLines(f"train member {member} {part}", has_bar=False)
 
     def on_step(step: int, loss: float) -> None:
@@ -446,7 +432,7 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
         cpu_s += _load(core, work.core_file(index))
     dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)
-    if work.base is not None and work.keeps_renderer:
+    if work.base is not None and work.settings.learn != "all":
         renderer.load_state_dict(work.base.checkpoint.renderer.state_dict())
     else:
         cpu_s += _load(renderer, work.renderer_file)
@@ -454,7 +440,7 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
 
 
 def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
-    """Weights of cores of one member each as those of one core with all members."""
+    """One core's weights from cores of one member each."""
     weights = [dict(core.named_parameters()) for core in cores]
     shared = dict(cores[0].named_buffers())
     return shared | {name: torch.cat([each[name] for each in weights]) for name in weights[0]}

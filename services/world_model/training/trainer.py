@@ -123,13 +123,10 @@ class TrainingRun:
         # Generator states after the windows trained on, and after those read ahead.
         self._window_numbers = json.dumps(self._rng.bit_generator.state)
         self._drawn: deque[str] = deque()
-        windows = settings.windows
         self._sampler = WindowSampler(
             episodes,
             self._rng,
             max_steps=self._window_steps(settings.network.max_steps),
-            commanded_fraction=windows.commanded_fraction,
-            chained_fraction=windows.chained_fraction,
             human_share=settings.share_of_human,
         )
         options = OptimizerOptions(
@@ -179,11 +176,7 @@ class TrainingRun:
         sampling = {"sampling_steps", "sampler", "sampling_time_shift"}
         requested = self.settings.network.model_dump(exclude=sampling)
         there = checkpoint.metadata.network.model_dump(exclude=sampling)
-        others = {
-            name: (there[name], requested[name])
-            for name in requested
-            if there[name] != requested[name]
-        }
+        others = {n: (there[n], value) for n, value in requested.items() if there[n] != value}
         if others:
             raise ConflictError(
                 "training: the initial checkpoint has other network settings (stored, "
@@ -249,9 +242,8 @@ class TrainingRun:
             budget.advance()
             budget.cpu_s = self.processes.mean(torch.tensor(budget.cpu_s)).item()
             if budget.step % LOG_EVERY_STEPS == 0 or budget.share() >= 1.0:
-                progress = TrainingProgress(
-                    budget.step, min(budget.share(), 1.0), loss_video, loss_tactile
-                )
+                share = min(budget.share(), 1.0)
+                progress = TrainingProgress(budget.step, share, loss_video, loss_tactile)
                 self.log.append(progress)
                 if on_progress is not None:
                     on_progress(progress)
@@ -287,7 +279,6 @@ class TrainingRun:
         return video, tactile
 
     def _batches(self) -> Iterator[WindowBatch]:
-        """Endless iterator over the windows of each step."""
         if self.settings.streaming:
             workers = self.settings.loader_workers
             return read_batches(self.episodes, self._noted_places(), num_workers=workers)

@@ -111,9 +111,8 @@ class StateFiles:
                 tensors, notes = read_tensors(self._file, where)
             except CorruptDataError as error:
                 raise CorruptDataError(f"{error.message}; remove it to start over") from error
-            return TrainingState(
-                tensors, checked_facts(notes.get(METADATA_KEY, ""), identity, where)
-            )
+            facts = checked_facts(notes.get(METADATA_KEY, ""), identity, where)
+            return TrainingState(tensors, facts)
         where = f"training state {self._folder.name}"
         facts = checked_facts((self._folder / FACTS).read_text(), identity, where)
         reader = HuggingFaceStorageReader(str(self._of_step(facts.step)))
@@ -188,8 +187,7 @@ def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> R
     names = facts.identity.keys() | expected.keys()
     others = sorted(n for n in names if saved.get(n) != expected.get(n))
     if others:
-        was = {name: saved.get(name) for name in others}
-        now = {name: expected.get(name) for name in others}
+        was, now = ({name: some.get(name) for name in others} for some in (saved, expected))
         raise ConflictError(
             f"{where}: saved by a run with {was}, got {now}; use the settings and episodes of that "
             "run, or omit --resume to start over"
