@@ -18,7 +18,6 @@ from services.networks.weight_files import (
     available_memory,
     digest_of,
     half_weights,
-    holds,
     load_strictly,
     notes_of,
     read_history,
@@ -262,7 +261,7 @@ class StateCheckpoint:
 
 def is_state_checkpoint(path: Path) -> bool:
     """Whether the metadata of a safetensors file declares a state model."""
-    return holds(path, _STATE_KEY)
+    return _STATE_KEY in notes_of(path)
 
 
 def write_state_checkpoint(
@@ -350,7 +349,7 @@ class StoredTokenizer:
 
 def is_tokenizer(path: Path) -> bool:
     """Whether a file declares a tactile tokenizer."""
-    return holds(path, _TOKENIZER_KEY)
+    return _TOKENIZER_KEY in notes_of(path)
 
 
 def write_tokenizer(path: Path, tokenizer: TactileTokenizer, metadata: TokenizerMetadata) -> str:

@@ -4,7 +4,7 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -37,6 +37,9 @@ from services.world_model.settings import (
 from services.world_model.training.distribution import joined_processes
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
+
+if TYPE_CHECKING:
+    from services.world_model.training.state_trainer import StateReport
 
 
 def run_train(arguments: list[str]) -> int:
@@ -92,8 +95,8 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
 
         report = train(settings, on_progress, processes)
     if report is not None:
-        print(_table(report))
-        write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
+        counts = f"{report.num_train_episodes} episodes, {report.num_heldout_episodes} held out"
+        _show(report, f"{report.steps} steps, {counts}", json_path)
     return 0
 
 
@@ -101,14 +104,18 @@ def _train_state(settings: TrainStateCommand | AdaptStateCommand) -> int:
     from services.world_model.training.state_trainer import train_state
 
     report = train_state(settings)
-    print(
-        f"{report.checkpoint}: {report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s, "
-        f"{report.num_training_episodes} episodes, {report.num_heldout_episodes} held out"
-    )
+    counts = f"{report.num_training_episodes} episodes, {report.num_heldout_episodes} held out"
+    _show(report, counts, settings.json_path)
+    return 0
+
+
+def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path | None) -> None:
+    """Print a report and optionally write it to a file."""
+    size = f"{report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s"
+    print(f"{report.checkpoint} ({report.digest[:16]}): {size}, {counts}")
     for name, value in report.metrics.items():
         print(f"{name:<36} {value:.3f}")
-    write_result(settings.json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
-    return 0
+    write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
 
 
 def run_serve(arguments: list[str]) -> int:
@@ -180,16 +187,3 @@ def _history(file: Path) -> dict[str, Any]:
     digest = read_checkpoint(file).digest if small else digest_of(file)
     history = metadata.model_dump(mode="json", exclude={"train_fingerprints"})
     return {"file": file.name, "digest": digest, "form": "paper's form", **history}
-
-
-def _table(report: TrainingReport) -> str:
-    rows = [
-        ("checkpoint", str(report.checkpoint)),
-        ("digest", report.digest[:16]),
-        ("parameters", f"{report.num_parameters:,}"),
-        ("steps", f"{report.steps} in {report.cpu_s:.0f} CPU s"),
-        ("episodes", f"{report.num_train_episodes}, held out {report.num_heldout_episodes}"),
-        *((name, f"{value:.3f}") for name, value in report.metrics.items()),
-    ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)

@@ -20,6 +20,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
+from services.world_model import starts
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -50,16 +51,6 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
-from services.world_model.starts import (
-    ObservedStart,
-    check_geometry,
-    checked_chunk,
-    checked_selectors,
-    foreign_snapshot,
-    observed_start,
-    opened_snapshot,
-    refuse_non_finite,
-)
 
 MAX_SNAPSHOT_BYTES = 2**20
 MAX_CHUNK_STEPS = 64
@@ -143,7 +134,7 @@ class StateWorld(BatchWorld[StateRollout]):
             UnknownNameError: a task or action kind that the model was not trained on.
             InvalidInputError: missing or invalid observation, anchor or K_head.
         """
-        first = observed_start(
+        first = starts.observed_start(
             start, tasks=self._description.tasks, image_px=self._metadata.dynamics.image_px
         )
         self._check_start(start, first)
@@ -173,9 +164,9 @@ class StateWorld(BatchWorld[StateRollout]):
         seen = first.observation(self._poses(memory.poses, start.task))
         return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
-    def _check_start(self, start: RolloutStart, first: ObservedStart) -> None:
+    def _check_start(self, start: RolloutStart, first: starts.ObservedStart) -> None:
         """Checks of all world models: hands and camera must be within reach."""
-        check_geometry(first.anchor, first.K_head)
+        starts.check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
             first_image=first.image,
             first_tactile_kpa=first.tactile_kpa,
@@ -204,10 +195,10 @@ class StateWorld(BatchWorld[StateRollout]):
             EndedError: the hands have moved four times as long as any episode of training.
             UnavailableError: the model predicts NaN or infinity.
         """
-        requested = checked_selectors(states, actions, seeds, selectors)
+        requested = starts.checked_selectors(states, actions, seeds, selectors)
         for state in states:
             self._refuse_ended(state)
-        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
+        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         for chunk in chunks:
             check_reach(chunk)
         motions = [
@@ -221,7 +212,7 @@ class StateWorld(BatchWorld[StateRollout]):
             "objects' place": imagined.poses.position_m,
             "objects' direction": imagined.poses.axes,
         }
-        refuse_non_finite("state model", checked)
+        starts.refuse_non_finite("state model", checked)
         answers = [
             self._answer(
                 replace(
@@ -348,19 +339,10 @@ class StateWorld(BatchWorld[StateRollout]):
 
     def snapshot(self, state: StateRollout) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
-        fields = {
-            "digest": self._digest,
-            "task": state.task,
-            "action_kind": state.action_kind,
-            "step": state.step,
-            "num_moving": state.num_moving,
-        }
-        arrays = {
-            "image": state.image,
-            "anchor": np.stack(state.anchor.as_tuple()),
-            "K_head": state.K_head,
-            "first_reached": state.first_reached,
-        }
+        names = ("task", "action_kind", "step", "num_moving")
+        fields = {"digest": self._digest, **{name: getattr(state, name) for name in names}}
+        arrays = {name: getattr(state, name) for name in ("image", "K_head", "first_reached")}
+        arrays["anchor"] = np.stack(state.anchor.as_tuple())
         return pack(fields, {**arrays, **memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:
@@ -370,7 +352,7 @@ class StateWorld(BatchWorld[StateRollout]):
             InvalidInputError: not a snapshot of this checkpoint.
             NonFiniteError: NaN or infinity.
         """
-        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")
         size = (config.image_px, config.image_px, 3)
@@ -378,15 +360,13 @@ class StateWorld(BatchWorld[StateRollout]):
         if (
             name not in config.tasks
             or fields.get("action_kind") not in ACTION_KINDS
-            or not isinstance(step, int)
-            or not isinstance(moving, int)
-            or min(step, moving) < 0
+            or not (isinstance(step, int) and isinstance(moving, int) and min(step, moving) >= 0)
             or arrays.get("image", np.zeros(0)).dtype != np.uint8
             or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
         ):
-            raise foreign_snapshot(fields, arrays)
+            raise starts.foreign_snapshot(fields, arrays)
         anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-        check_geometry(anchor, K_head)
+        starts.check_geometry(anchor, K_head)
         memory = memory_from_arrays(arrays, config, self._metadata.num_members)
         if int(memory.start.task[0, 0]) != config.tasks.index(name):
             raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")

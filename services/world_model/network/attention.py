@@ -38,13 +38,11 @@ def left_joint_signs() -> Float64[np.ndarray, "20"]:
 
     A mirror maps an axis a to -S a; the sign says whether that is the right hand's axis.
     """
-    left, right = RobotHand("left"), RobotHand("right")
-    signs = [
-        np.sign(np.dot(-MIRROR_WRIST * np.array(row_left.axis), np.array(row_right.axis)))
-        for finger_left, finger_right in zip(left.fingers, right.fingers, strict=True)
-        for row_left, row_right in zip(finger_left.joints, finger_right.joints, strict=True)
+    axes = [
+        np.array([joint.axis for finger in RobotHand(side).fingers for joint in finger.joints])
+        for side in ("left", "right")
     ]
-    return np.array(signs, dtype=np.float64)
+    return np.sign(np.einsum("ij,ij->i", -MIRROR_WRIST * axes[0], axes[1]))
 
 
 def mirror_pose_9d(

@@ -18,8 +18,8 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.networks.subwords import MAX_SUBWORDS, WORD, subwords
 from services.networks.weight_files import read_tensors, write_tensors
+from services.world_model.dynamics.features import MAX_SUBWORDS, WORD, subwords
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 
 MAX_WORDS = 16

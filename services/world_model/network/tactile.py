@@ -18,7 +18,7 @@ from dextouch.tactile.layout import (
     TIP_SHAPE,
     join_pads,
 )
-from services.networks.principal_axes import principal_axes, root_pressure, root_scale
+from services.world_model.dynamics.features import principal_axes, root_pressure, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Stream,

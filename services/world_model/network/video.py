@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.networks.principal_axes import principal_axes, root_scale
+from services.world_model.dynamics.features import principal_axes, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Block,
@@ -52,7 +52,7 @@ Latents = Float32[Tensor, "batch latents tokens channels"]
 Images = Float32[Tensor, "batch time px px 3"]
 _Raster = Float32[Tensor, "batch time 2 cells cells"]
 _Shown = Float32[Tensor, "batch shown px px 3"]
-_Patches = Float32[Tensor, "batch latents rows cols channels"]
+_Patches = Float32[Tensor, "batch latents rows cols values"]
 
 
 class VideoExpert(nn.Module):

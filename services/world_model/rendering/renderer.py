@@ -57,9 +57,8 @@ class Renderer:
         for weight in self._network.parameters():
             if weight.ndim == 4:
                 weight.data = weight.data.contiguous(memory_format=torch.channels_last)
-        self._paint = Traced(
-            self._network, self._network.__call__, lambda inputs: inputs.fine.shape
-        )
+        call = self._network.__call__
+        self._paint = Traced(self._network, call, lambda inputs: inputs.fine.shape)
         # A rollout draws all its chunks from one start. Those used last are at the end.
         self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
         self._lock = threading.Lock()
@@ -77,11 +76,10 @@ class Renderer:
         counts = [len(states) for states in later]
         states = joined(later)
         owner = np.repeat(np.arange(len(drawings)), counts)
+        ends = range(_BLOCK_IMAGES, len(states), _BLOCK_IMAGES)
         blocks = [
             self._drawn_block(starts, states.take(rows), owner[rows])
-            for rows in np.split(
-                np.arange(len(states)), range(_BLOCK_IMAGES, len(states), _BLOCK_IMAGES)
-            )
+            for rows in np.split(np.arange(len(states)), ends)
         ]
         return np.split(np.concatenate(blocks), np.cumsum(counts)[:-1])
 

@@ -91,9 +91,8 @@ def train_core(
         def loss() -> Tensor:
             return core_loss(core, data, _draw(data, settings, generator, rng), settings)
 
-        return train_averaged(
-            core, loss, settings, weight_decay=settings.weight_decay, on_step=on_step
-        )
+        decay = settings.weight_decay
+        return train_averaged(core, loss, settings, weight_decay=decay, on_step=on_step)
 
 
 @torch.no_grad()
@@ -125,8 +124,7 @@ def start_steps(table: SceneTable) -> list[int]:
 def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:
     """Random start, with a probability proportional to the root of the remaining length.
 
-    Starts near the end teach little about persistence, but rollouts begin there, too. Starts that
-    few episodes have are as much rarer.
+    Starts near the end teach little about persistence. Those of few episodes are as much rarer.
     """
     remaining = np.sqrt([table.num_steps - 1 - step for step in later])
     weight = remaining * [len(table.starts_at(step)) for step in later]
@@ -151,22 +149,15 @@ def _draw(
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
     held &= _is_settled(table, rows, start_step) & table.labelled[rows]
     start = _read_start(data, rows, start_step, settings, generator)
-    return _Batch(
-        rows=rows,
-        start_step=start_step,
-        start=SceneStart(
-            start.objects,
-            start.sd_m,
-            start.size,
-            data.touch[rows, start_step].float(),
-            table.pads_kpa[rows, start_step],
-            table.task[rows],
-            (~measured).float(),
-            table.instruction[rows],
-        ),
-        commands=_held_still(commands, held),
-        is_held=held,
+    scene = SceneStart(
+        **vars(start),
+        touch=data.touch[rows, start_step].float(),
+        pads_kpa=table.pads_kpa[rows, start_step],
+        task=table.task[rows],
+        commanded=(~measured).float(),
+        instruction=table.instruction[rows],
     )
+    return _Batch(rows, start_step, scene, _held_still(commands, held), held)
 
 
 def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor, " batch"]:
@@ -189,9 +180,9 @@ def _read_start(
 ) -> Reading:
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
-    The noise of each object has its own standard deviation, of up to `pose_noise_m`; that of clicks
-    is in the poses already. Poses from touch are those of takes that succeeded: where a task has
-    some, all of its episodes start from what the reader sees, or starts would tell the outcome.
+    The noise of each object has its own standard deviation; that of clicks is in the poses already.
+    Poses from touch are those of takes that succeeded: where a task has some, all of its episodes
+    start from what the reader sees, or starts would tell the outcome.
     """
     true = data.table.objects_at(rows, start_step)
     sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()

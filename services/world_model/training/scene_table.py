@@ -61,20 +61,18 @@ class HandTable:
 class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
-    `length` is the number of an episode's own steps, of which `interpolated` ones have actions that
-    nothing measured; `objects_known` are the steps at which the pose of an object is known,
-    `measured_objects` marks episodes whose poses have the errors of a measurement, `touched` those
-    of tasks of which some have poses from touch, and `placed_sd_m` is the standard deviation of
-    positions from clicks or touch, 0 of others. `images` are those of the steps `image_steps`,
-    where `shown`; `in_contact` marks pads in contact. Taxels that are not `measured_taxels` have
-    the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at a
-    step, for want of a sample or of half of their taxels, count in no loss. `sent` are commanded
-    hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
-    episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
-    follows from their number. `labelled` marks episodes whose object poses are trained on;
-    `boxes_m` are the usual boxes of each task's objects in their frames (middle, half sizes), and
-    `size` factors of their width and height. `instruction` are the features of each episode's
-    sentence.
+    `length` is the number of an episode's own steps, of which nothing measured the actions of those
+    `interpolated`. The poses of objects are `objects_known` at a step; `measured_objects` marks
+    episodes whose poses have the errors of a measurement, `touched` those of tasks of which some
+    have poses from touch, `labelled` those whose poses are trained on; `placed_sd_m` is the
+    standard deviation of positions from clicks or touch, else 0. `images` are those of the
+    `image_steps`, where `shown`; `in_contact` marks pads. Taxels that are not `measured_taxels`
+    have the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at
+    a step, for want of a sample or of half of their taxels, count in no loss. `sent` are the hands
+    as `commanded`, elsewhere measured ones. `human` marks episodes of people, and `human_share` is
+    their share in what is drawn, NaN if it follows from their number. `boxes_m` are the usual boxes
+    of each task's objects in their frames (middle, half sizes), and `size` factors of their width
+    and height. `instruction` are the features of each episode's sentence.
     """
 
     sent: HandTable

@@ -41,7 +41,7 @@ from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_cli
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.domains import check_stores, check_tasks, subset_by_hash
+from services.world_model.training.dataset import check_stores, check_tasks, subset_by_hash
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 

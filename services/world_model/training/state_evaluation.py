@@ -28,10 +28,9 @@ _SMALLEST_DISTANCE = 1e-3
 class StateFigures:
     """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
 
-    `figures` hold errors of readers (first member) and objects in mm, and contact F1 and error of
-    touch for each chunk of 16 steps, also for repeating the touch before the chunk. Names with
-    `from_16` refer to rollouts from the ground truth at step 16, whose chunks start there.
-    `object_mm` is the median position error of an object at the end of a chunk.
+    `figures` hold errors of readers (first member) and objects (median at the end of a chunk) in
+    mm, and contact F1 and error of touch for each chunk of 16 steps, also for repeating the touch
+    before it. Names with `from_16` are of rollouts from the ground truth at step 16.
     """
 
     figures: dict[str, float]

@@ -32,34 +32,14 @@ from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
-from services.world_model.training.core_training import (
-    CoreData,
-    start_steps,
-    touch_latents,
-    train_core,
-)
-from services.world_model.training.domains import training_sets
+from services.world_model.training import core_training, state_data
+from services.world_model.training.dataset import training_sets
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_clips,
     scene_table,
     usual_boxes_m,
-)
-from services.world_model.training.state_data import (
-    StateData,
-    check_drawable,
-    check_new,
-    configured,
-    drawn_episodes,
-    heldout_share,
-    labelled_episodes,
-    load_state_data,
-    object_sources,
-    recorded_scenes,
-    seed_ranges,
-    splits_by_task,
-    trained_splits,
 )
 from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
@@ -98,11 +78,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         )
     settings = _with_precision(settings)
     command = _command(settings)
-    data = load_state_data(settings)
+    data = state_data.load_state_data(settings)
     training, heldout = data.training, data.heldout
     base = None if settings.init is None else Base(settings.init)
-    config = configured(data, settings, base)
-    check_new(data, settings, base)
+    config = state_data.configured(data, settings, base)
+    state_data.check_new(data, settings, base)
     if base is not None:
         settings = _with_base(base, config, settings)
         config = base.configured(config, keeps_tasks=settings.learn == "success")
@@ -110,13 +90,16 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     parts.mkdir(parents=True, exist_ok=True)
     hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
-    heldout_table, labelled = scene_table(heldout, config), labelled_episodes(training, settings)
+    heldout_table, labelled = (
+        scene_table(heldout, config),
+        state_data.labelled_episodes(training, settings),
+    )
     share = settings.share_of_human
     table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
-        check_drawable(drawn_episodes(data))
+        state_data.check_drawable(state_data.drawn_episodes(data))
     codec = _codec(table, config, base)
-    is_known = all(bool(table.knows_all(step).all()) for step in start_steps(table))
+    is_known = all(bool(table.knows_all(step).all()) for step in core_training.start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
@@ -151,7 +134,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
 
 def _metadata(
     work: "_Work",
-    data: StateData,
+    data: state_data.StateData,
     bounds: StateBounds,
     metrics: dict[str, float],
     *,
@@ -172,13 +155,13 @@ def _metadata(
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(data.training),
-        training_seeds=seed_ranges(data.training, base),
-        training_splits=trained_splits(settings, base),
-        task_splits=splits_by_task(data.training, settings, base),
-        heldout_share=heldout_share(settings, base),
-        training_scenes=recorded_scenes(data.training, base),
+        training_seeds=state_data.seed_ranges(data.training, base),
+        training_splits=state_data.trained_splits(settings, base),
+        task_splits=state_data.splits_by_task(data.training, settings, base),
+        heldout_share=state_data.heldout_share(settings, base),
+        training_scenes=state_data.recorded_scenes(data.training, base),
         data_hash=work.data_hash,
-        object_sources=object_sources(data.training),
+        object_sources=state_data.object_sources(data.training),
         sets=training_sets(
             data.training,
             data.heldout,
@@ -248,7 +231,9 @@ class _Work:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _objects(data: StateData, config: DynamicsConfig, base: Base | None) -> dict[str, Any]:
+def _objects(
+    data: state_data.StateData, config: DynamicsConfig, base: Base | None
+) -> dict[str, Any]:
     """Names and usual boxes of every task's objects; of tasks without episodes the base's."""
     names = {one.task: one.object_names for one in data.episodes}
     boxes_m = {
@@ -316,9 +301,9 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = drawn_episodes(load_state_data(settings))
+    episodes = state_data.drawn_episodes(state_data.load_state_data(settings))
     rng = np.random.default_rng(settings.seed)
-    labelled = zip(episodes, labelled_episodes(episodes, settings), strict=True)
+    labelled = zip(episodes, state_data.labelled_episodes(episodes, settings), strict=True)
     known = [episode for episode, is_labelled in labelled if is_labelled]
     chosen = rng.permutation(len(known))[:MAX_CLIPS]
     clips = scene_clips([known[index] for index in sorted(chosen)])
@@ -387,15 +372,19 @@ def _train_core(work: _Work, member: int) -> None:
     started_s = time.process_time()
     if work.reads_starts or work.keeps_readers:
         reader = _finished_reader(work, member)
-        readings = {step: read_step(reader, table, step) for step in start_steps(table)}
-    data = CoreData(table, touch_latents(codec, table), readings, work.keeps_readers)
+        readings = {
+            step: read_step(reader, table, step) for step in core_training.start_steps(table)
+        }
+    data = core_training.CoreData(
+        table, core_training.touch_latents(codec, table), readings, work.keeps_readers
+    )
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
     initial = None
     if work.base is not None:
         learns_all = work.settings.learn == "all"
         initial = work.base.core(work.config, member, seed=seed, learns_all=learns_all)
-    core = train_core(
+    core = core_training.train_core(
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)

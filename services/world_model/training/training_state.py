@@ -2,9 +2,8 @@
 
 It is one safetensors file of the weights, their moving average, the optimizer and the random state,
 with the counters as JSON in its metadata. Under torchrun it is a folder with a folder for each
-state, in which every process has a file; the counters, in a JSON file beside them, name the newest
-complete one, and any number of processes can resume. A crash at any time leaves the last complete
-state, which is removed when the run has ended.
+state, with a file of every process; the counters, in a JSON file beside them, name the newest
+complete one, and any number of processes can resume. A crash leaves the last complete state.
 """
 
 import json
