@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
 from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
@@ -70,30 +68,14 @@ def run_distill(arguments: list[str]) -> int:
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
-    columns = (
-        TextColumn("training"),
-        BarColumn(),
-        TextColumn("step {task.fields[step]}  video {task.fields[video]:.3f}"),
-        TextColumn("touch {task.fields[tactile]:.3f}"),
-        TimeRemainingColumn(),
-    )
-    lines = ProgressLines("training")
-    with joined_processes() as processes, Progress(*columns, disable=not processes.is_first) as bar:
-        task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
+    lines = ProgressLines("training", has_bar=False)
 
-        def on_progress(now: TrainingProgress) -> None:
-            bar.update(
-                task,
-                completed=now.share,
-                step=now.step,
-                video=now.loss_video,
-                tactile=now.loss_tactile,
-            )
-            if processes.is_first:
-                losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
-                lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
+    def on_progress(now: TrainingProgress) -> None:
+        losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
+        lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
-        report = train(settings, on_progress, processes)
+    with joined_processes() as processes:
+        report = train(settings, on_progress if processes.is_first else None, processes)
     if report is not None:
         counts = f"{report.num_train_episodes} episodes, {report.num_heldout_episodes} held out"
         _show(report, f"{report.steps} steps, {counts}", json_path)

@@ -19,19 +19,17 @@ from dextouch.serving import (
     service_config,
 )
 from services.networks.training_settings import (
-    AverageDecay,
+    AdamWSettings,
     Batch,
     CpuBudget,
     Device,
     LearningRate,
-    MaxGradientNorm,
     MaxSteps,
     Seed,
     Share,
     Splits,
     Stores,
     WarmupSteps,
-    WeightDecay,
 )
 from services.world_model.network.configuration import (
     NetworkConfig,
@@ -51,15 +49,9 @@ from services.world_model.settings import (
 STATE: Final = "state"
 
 
-class OptimizerSettings(FrozenModel):
-    """Settings of the optimizer."""
+class OptimizerSettings(AdamWSettings):
+    """Settings of the optimizer and of the loss."""
 
-    batch: Batch = 8
-    learning_rate: LearningRate = 2e-3
-    warmup_steps: WarmupSteps = 100
-    weight_decay: WeightDecay = 0.02
-    max_gradient_norm: MaxGradientNorm = 1.0
-    ema_decay: AverageDecay = 0.995
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
     precision: Precision = Field(default="float32", description="of matrix products in training")
     touch_loss: Literal["all", "contact_or_changing"] = Field(

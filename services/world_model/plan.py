@@ -24,7 +24,7 @@ from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import MAX_WORDS, key_of
-from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
+from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
 
 _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
 # Text encoder of the published model, UMT5-XXL.
@@ -209,17 +209,15 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
         first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
         first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
     )
-    context = model.with_clean_tokens(model.context(inputs, first), noisy)
+
+    def shared() -> Context:
+        return model.with_clean_tokens(model.context(inputs, first), noisy)
+
+    context, steps = shared(), config.sampling_steps
     jobs: dict[str, tuple[int, Callable[[], Any]]] = {
         "encode the first image": (1, lambda: model.first_latents(inputs)),
-        "what sampler steps share": (
-            1,
-            lambda: model.with_clean_tokens(model.context(inputs, first), noisy),
-        ),
-        "one sampler step": (
-            config.sampling_steps,
-            lambda: model.denoise(context, noisy, torch.ones(1)),
-        ),
+        "what sampler steps share": (1, shared),
+        "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
         "decode all images": (1, lambda: model.decode(first, noisy)),
     }
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
@@ -233,7 +231,6 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
 
 
 def _tensors_of(kept: object) -> list[Tensor]:
-    """Tensors of nested dataclasses and tuples."""
     if isinstance(kept, Tensor):
         return [kept]
     if is_dataclass(kept):

@@ -139,14 +139,9 @@ class StateWorld(BatchWorld[StateRollout]):
         )
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
+        task = self._description.tasks.index(start.task)
         memory = self._dynamics.begin(
-            first_steps(
-                [first.image],
-                [first.K_head],
-                [first.tactile_kpa],
-                [motion],
-                [self._description.tasks.index(start.task)],
-            ),
+            first_steps([first.image], [first.K_head], [first.tactile_kpa], [motion], [task]),
             torch.from_numpy(first.tactile_kpa)[None],
             Commands.holding([motion]),
             torch.tensor([float(start.action_kind == "commanded")]),
@@ -341,8 +336,12 @@ class StateWorld(BatchWorld[StateRollout]):
         """Serialize the state for `restore` with the same checkpoint."""
         names = ("task", "action_kind", "step", "num_moving")
         fields = {"digest": self._digest, **{name: getattr(state, name) for name in names}}
-        arrays = {name: getattr(state, name) for name in ("image", "K_head", "first_reached")}
-        arrays["anchor"] = np.stack(state.anchor.as_tuple())
+        arrays = {
+            "image": state.image,
+            "anchor": np.stack(state.anchor.as_tuple()),
+            "K_head": state.K_head,
+            "first_reached": state.first_reached,
+        }
         return pack(fields, {**arrays, **memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:

@@ -148,12 +148,9 @@ class ModelWorld(BatchWorld[ModelState]):
             "world model", {"image": future.images, "touch": future.tactile_kpa}
         )
         images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
-        return [
-            _advance(state, chunk, imagined, selector)
-            for state, chunk, imagined, selector in zip(
-                states, chunks, zip(images, touches, strict=True), requested, strict=True
-            )
-        ]
+        futures = zip(images, touches, strict=True)
+        each = zip(states, chunks, futures, requested, strict=True)
+        return [_advance(*one) for one in each]
 
     def _requests(
         self, states: Sequence[ModelState], chunks: Sequence[np.ndarray]

@@ -96,7 +96,6 @@ class Traced(Generic[Outputs]):
         return outputs
 
     def _traced(self, inputs: tuple[Any, ...]) -> tuple[Callable[..., tuple[Tensor, ...]], Outputs]:
-        """A trace for inputs of these shapes, and outputs of its form."""
         forms: list[Outputs] = []
         function = self._function
 
@@ -133,7 +132,6 @@ def _tensors(part: Any) -> Iterator[Tensor]:  # noqa: ANN401 - any nesting of da
 
 
 def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
-    """The form with other tensors."""
     if isinstance(form, Tensor):
         return next(tensors)
     parts = [_rebuilt(one, tensors) for one in _parts(form)]

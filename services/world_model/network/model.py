@@ -164,7 +164,8 @@ class JointWorldModel(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "JointWorldModel":  # noqa: FBT001, FBT002
         """Move or convert the weights; codecs, conditions and norms keep their precision."""
         tensors = (*self.named_parameters(), *self.named_buffers())
-        kept = {name: tensor.data for name, tensor in tensors if _keeps_precision(name)}
+        parts = {name: any(part in name for part in FLOAT32_PARTS) for name, _ in tensors}
+        kept = {n: one.data for n, one in tensors if n.startswith(_EXACT_PARTS) or parts[n]}
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         for name, tensor in (*self.named_parameters(), *self.named_buffers()):
             if name in kept and tensor.dtype != kept[name].dtype:
@@ -382,11 +383,6 @@ class JointWorldModel(nn.Module):
             tactile = torch.zeros_like(tactile)
         images = self.codec.decode_future(video, all_images=all_images)
         return Prediction(images, self.tokenizer.decode(tactile))
-
-
-def _keeps_precision(name: str) -> bool:
-    """Whether a tensor keeps its precision when the experts are converted."""
-    return name.startswith(_EXACT_PARTS) or any(part in name for part in FLOAT32_PARTS)
 
 
 @contextmanager

@@ -6,12 +6,10 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from services.networks.training_settings import (
-    AverageDecay,
+    AdamWSettings,
     Batch,
+    BudgetSettings,
     CpuBudget,
-    LearningRate,
-    MaxGradientNorm,
-    MaxSteps,
     NonNegative,
     Share,
     WarmupSteps,
@@ -45,17 +43,13 @@ class RendererConfig(FrozenModel):
         return 2 ** len(self.widths)
 
 
-class RendererTraining(FrozenModel):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+class RendererTraining(AdamWSettings, BudgetSettings):
+    """One training run of the renderer."""
 
     cpu_budget_s: CpuBudget = 400.0
-    max_steps: MaxSteps = None
     batch: Batch = 24
-    learning_rate: LearningRate = 2e-3
     warmup_steps: WarmupSteps = 50
     weight_decay: WeightDecay = 0.01
-    ema_decay: AverageDecay = 0.995
-    max_gradient_norm: MaxGradientNorm = 1.0
     gradient_weight: NonNegative = Field(default=0.5, description="image gradient loss")
     sharpness_weight: NonNegative = Field(
         default=0.3, description="edge strength loss (7 px windows)"

@@ -12,13 +12,7 @@ from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from services.networks.optimizer import (
-    Budget,
-    OptimizerLoop,
-    OptimizerOptions,
-    floored_cosine,
-    update_average,
-)
+from services.networks.optimizer import Budget, OptimizerLoop, update_average
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.rendering.inputs import (
     DrawingInputs,
@@ -80,16 +74,8 @@ def train_renderer(
     if initial is not None:
         run.network.load_state_dict(initial.state_dict())
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
-    options = OptimizerOptions(
-        learning_rate=settings.learning_rate,
-        weight_decay=settings.weight_decay,
-        max_gradient_norm=settings.max_gradient_norm,
-        warmup_steps=settings.warmup_steps,
-        schedule=floored_cosine,
-        betas=(0.9, 0.95),
-    )
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
-    for loss in OptimizerLoop(run.network, options, budget).run(run.loss):
+    for loss in OptimizerLoop(run.network, settings.options(), budget).run(run.loss):
         update_average(averaged, run.network, decay=settings.ema_decay, num_updates=budget.step - 1)
         if on_progress is not None and budget.step % LOG_EVERY_STEPS == 0:
             on_progress(min(budget.share(), 1.0), budget.step, loss)

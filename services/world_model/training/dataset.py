@@ -256,19 +256,19 @@ class StoredEpisode:
             UnknownNameError: an action kind that it does not have.
             CorruptDataError: damaged bytes.
         """
-        grid = EpisodeGrid(_reader(self.url, self.episode_id), self.image_px)
-        read = grid.reader.window(
-            place.start, place.num_steps, cameras=(), action_kind=place.action_kind
+        grid, kind = (
+            EpisodeGrid(_reader(self.url, self.episode_id), self.image_px),
+            place.action_kind,
         )
+        read = grid.reader.window(place.start, place.num_steps, cameras=(), action_kind=kind)
         actions, anchor = read.actions, read.anchor
         if place.from_command and place.action_kind == "commanded":
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
         images = grid.images(range(place.start, place.start + place.num_steps))
-        known = grid.boxed_objects(read.t_ref_ns[:1])
-        objects = (
-            None if known is None else ObjectsAtStart(known[0][0].astype(np.float64), known[1])
-        )
+        objects = None
+        if known := grid.boxed_objects(read.t_ref_ns[:1]):
+            objects = ObjectsAtStart(known[0][0].astype(np.float64), known[1])
         request = PredictionRequest(
             first_image=images[0],
             first_tactile_kpa=read.tactile_kpa[0],
@@ -458,8 +458,7 @@ def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> li
         )
 
     def place(index: int) -> str:
-        text = f"subset/{episodes[index].content_sha256}"
-        return hashlib.sha256(text.encode()).hexdigest()
+        return hashlib.sha256(f"subset/{episodes[index].content_sha256}".encode()).hexdigest()
 
     chosen = sorted(range(len(episodes)), key=place)[:count]
     return [episodes[index] for index in sorted(chosen)]
@@ -520,8 +519,7 @@ def training_sets(
     """The episodes of a run by domain, after the inherited ones of its ancestors.
 
     `ancestor` is the digest of the initial checkpoint. `human_share` of what is drawn is human;
-    None: as their number says. `image_px` is the side that images are scaled to, as `data_hash`
-    wants it.
+    None: as their number says. `image_px` is as for `data_hash`.
     """
     found = [
         one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})

@@ -419,10 +419,8 @@ def usual_boxes_m(episodes: Sequence[EpisodeGrid]) -> dict[str, Float64[np.ndarr
     for episode in episodes:
         if len(episode.boxes_m):
             by_task[episode.task].append(episode.boxes_m)
-    return {
-        task: np.median(boxes, axis=0) if boxes else np.zeros((0, 6))
-        for task, boxes in by_task.items()
-    }
+    none = np.zeros((0, 6))
+    return {task: np.median(b, axis=0) if b else none for task, b in by_task.items()}
 
 
 def _size(

@@ -38,7 +38,7 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
-from services.world_model.checkpoints import learned_tasks, scene_digest
+from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
 from services.world_model.training.dataset import check_stores, check_tasks, subset_by_hash
@@ -185,13 +185,8 @@ def load_scene_episodes(
     without = grids.keys() - with_poses
     tasks_posed = {grids[name].task for name in with_poses}
     recordings = {_recording(grids[name]) for name in with_poses} - {None}
-    used = {
-        name
-        for name in without
-        if grids[name].task in tasks_posed
-        and grids[name].object_names
-        and _recording(grids[name]) not in recordings
-    }
+    of_task = [n for n in without if grids[n].task in tasks_posed and grids[n].object_names]
+    used = {name for name in of_task if _recording(grids[name]) not in recordings}
     if len(used) < len(without):
         reason = f"{needs.OBJECTS.lack} ({needs.OBJECTS.remedy})"
         logger.warning("skipped_episodes", reason=reason, count=len(without) - len(used))
@@ -226,11 +221,9 @@ def _grid(
         return SceneGrid(reader, image_px, objects=clicks)
     one = stored
     clicked = clicked_poses(about, clicks, one, may_lack_headings=given is None)
-    unfinished = [
-        each.name
-        for each, known in zip(clicked.objects, clicked.known.tolist(), strict=True)
-        if not known and each.name in one.objects and one.objects[each.name].state == "seen"
-    ]
+    each = zip(clicked.objects, clicked.known.tolist(), strict=True)
+    missing = [found.name for found, known in each if not known and found.name in one.objects]
+    unfinished = [name for name in missing if one.objects[name].state == "seen"]
     if unfinished:
         logger.warning("clicks_without_heading", episode=reader.item_id, objects=unfinished)
     return SceneGrid(reader, image_px, objects=clicks, clicked=clicked)
@@ -505,13 +498,6 @@ def seed_ranges(episodes: Sequence[EpisodeGrid], base: Base | None) -> dict[str,
         if episode.about.seed is not None:
             seeds.setdefault(episode.task, []).append(episode.about.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
-
-
-def recorded_scenes(episodes: Sequence[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
-    """Digests of the scenes without a seed, the base's included."""
-    known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
-    own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
-    return tuple(sorted(known | own))
 
 
 def heldout_share(settings: StateTrainSettings, base: Base | None) -> float | None:

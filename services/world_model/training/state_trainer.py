@@ -24,7 +24,12 @@ from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.checkpoints import StateBounds, StateMetadata, write_state_checkpoint
+from services.world_model.checkpoints import (
+    StateBounds,
+    StateMetadata,
+    scene_digest,
+    write_state_checkpoint,
+)
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
@@ -121,14 +126,9 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     metadata = _metadata(work, data, bounds, measured.figures, command=command, cpu_s=cpu_s)
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
+    size = sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters()))
     return StateReport(
-        settings.output,
-        digest,
-        sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters())),
-        cpu_s,
-        len(training),
-        len(heldout),
-        measured.figures,
+        settings.output, digest, size, cpu_s, len(training), len(heldout), measured.figures
     )
 
 
@@ -141,9 +141,11 @@ def _metadata(
     command: str,
     cpu_s: float,
 ) -> StateMetadata:
-    """Provenance and accuracy of a trained model."""
     settings, base = work.settings, work.base
     keeps_bounds = base is not None and settings.learn != "all"
+    # Recordings have no seed.
+    scenes = {scene_digest(one.scene) for one in data.training if one.about.seed is None}
+    scenes |= set() if base is None else set(base.checkpoint.metadata.training_scenes)
     return StateMetadata(
         name=settings.name,
         dynamics=work.config,
@@ -159,7 +161,7 @@ def _metadata(
         training_splits=state_data.trained_splits(settings, base),
         task_splits=state_data.splits_by_task(data.training, settings, base),
         heldout_share=state_data.heldout_share(settings, base),
-        training_scenes=state_data.recorded_scenes(data.training, base),
+        training_scenes=tuple(sorted(scenes)),
         data_hash=work.data_hash,
         object_sources=state_data.object_sources(data.training),
         sets=training_sets(
@@ -285,7 +287,6 @@ def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> Touc
 
 
 def _train_parts(work: _Work) -> None:
-    """Train missing parts, several in parallel."""
     members = range(work.settings.num_members)
     with worker_pool(work.settings.jobs) as pool:
         orders = []
@@ -436,7 +437,6 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """Command that repeats a run, as its checkpoint records it."""
     command = "adapt" if isinstance(settings, StateAdaptSettings) else "world-model"
     places = ("episodes", "human", "heldout", "init", "clicks")
     left_out = {"output", "jobs", "json_path"}

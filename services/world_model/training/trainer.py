@@ -83,14 +83,7 @@ class TrainingRun:
             max_steps=self._window_steps(settings.network.max_steps),
             human_share=settings.share_of_human,
         )
-        options = optimizer.OptimizerOptions(
-            learning_rate=settings.optimizer.learning_rate,
-            weight_decay=settings.optimizer.weight_decay,
-            max_gradient_norm=settings.optimizer.max_gradient_norm,
-            warmup_steps=settings.optimizer.warmup_steps,
-            schedule=optimizer.floored_cosine,
-            betas=(0.9, 0.95),
-        )
+        options = settings.optimizer.options()
         self.loop = optimizer.OptimizerLoop(self.model, options, self.budget)
 
     @torch.no_grad()
@@ -212,16 +205,13 @@ class TrainingRun:
             batch = own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
+        noise, is_own = self.settings.windows.context_noise, self.settings.self_forcing
+        options = LossOptions(noise, settings.touch_loss, settings.precision, own_noisy=is_own)
         loss = losses(
             self.model,
             batch,
             generator=self._generator,
-            options=LossOptions(
-                self.settings.windows.context_noise,
-                settings.touch_loss,
-                settings.precision,
-                own_noisy=self.settings.self_forcing,
-            ),
+            options=options,
             processes=self.processes,
         )
         total = loss.video + settings.tactile_weight * loss.tactile
