@@ -141,9 +141,7 @@ def read_metadata(path: Path) -> CheckpointMetadata:
     """Metadata of a checkpoint, without reading its weights.
 
     Raises:
-        NotFoundError: no such file.
-        CorruptDataError: not a checkpoint of this form, or damaged metadata.
-        InvalidInputError: unsupported format version.
+        NotFoundError, CorruptDataError, InvalidInputError: as `read_weights`.
     """
     return read_history(path, CheckpointMetadata, METADATA_KEY)
 
@@ -157,9 +155,8 @@ class StateBounds(FrozenModel):
     """Limits beyond which a rollout is flagged as uncertain.
 
     `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
-    the length of the episodes that the cores were trained on. Bounds `of_chunks` apply to the worst
-    latent step of any 16 steps of an episode; those of older checkpoints apply to whole episodes:
-    to the worst disagreement and the mean distance.
+    the length of training episodes. Bounds `of_chunks` apply to the worst latent step of any 16
+    steps; those of older checkpoints to an episode's worst disagreement and mean distance.
     """
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
@@ -180,12 +177,11 @@ class StateMetadata(FrozenModel):
     """Provenance and measured accuracy of a state model, stored in its checkpoint.
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
-    (all splits if empty) but the share `heldout_share`, by hash; `training_scenes` are
-    `scene_digest` of those without a seed, which a station recorded. `task_splits` are the splits
-    by task, of tasks whose splits differ from `training_splits`. `object_sources` are the
-    numbers of training episodes whose object poses are from the twin, markers, trackers or clicks,
-    and of those without any ("none"). `sets` are the episodes by domain, those of the models that
-    it started from included; files of older releases have none.
+    (all splits if empty; `task_splits` has those of tasks that differ) but the share
+    `heldout_share`, by hash; `training_scenes` are `scene_digest` of recorded ones, without a seed.
+    `object_sources` are the numbers of training episodes by the source of their object poses, or
+    "none". `sets` are the episodes by domain, those of the models that it started from included;
+    files of older releases have none.
     """
 
     format_version: int = 5

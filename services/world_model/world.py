@@ -47,8 +47,7 @@ class ModelWorld(BatchWorld[ModelState]):
     """A flow-matching model as a world.
 
     Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
-    products; codecs are always float32. A model that is conditioned on contact geometry needs a
-    `reader`, which finds the objects of every chunk's first step.
+    products; codecs are float32. With contact geometry, `reader` finds objects at a chunk's start.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks.

@@ -142,10 +142,10 @@ def slot_features(
 class DynamicsConfig(FrozenModel):
     """Architecture of a dynamics model, stored in its checkpoints.
 
-    `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
-    objects fill the first slots in the order of the episode's `object_names`. With the domain
-    `human`, cores are given whose hands act, and predict the touch of either by heads of its own.
-    With `instructions`, the sentences of training, cores read the instruction of a rollout.
+    A task's index in `tasks` selects its embedding, and its objects fill the first slots in the
+    order of the episode's `object_names`. With the domain `human`, cores are given whose hands act,
+    and have heads for the touch of either. With `instructions`, the sentences of training, cores
+    read the instruction of a rollout.
     """
 
     tasks: tuple[str, ...] = Field(min_length=1)
@@ -260,10 +260,9 @@ class Commands:
 class ObjectPoses:
     """Objects in the world frame.
 
-    `axes` are the directions of the object's z and x axis. An axis that cannot be observed (the yaw
-    of a round bowl) is predicted shorter than one, so that its length expresses certainty.
-    `present` is 1 for an object, 0 for unused slots and objects out of reach, and a probability in
-    between.
+    `axes` are the directions of the object's z and x axis, shorter than one where they cannot be
+    observed (the yaw of a round bowl). `present` is 1 for an object, 0 for unused slots and objects
+    out of reach, and a probability in between.
     """
 
     position_m: Float32[Tensor, "*batch objects 3"]
@@ -373,9 +372,8 @@ def root_pressure(tactile_kpa: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]
 class TouchCodec(nn.Module):
     """Frozen encoder and decoder of one hand's taxels, the same for left and right.
 
-    Latents are in units of the strongest axis' amplitude, so that their squared error is
-    proportional to that of the root of pressure. Decoded pressure is bounded by `peak_kpa`, the
-    highest pressure in training.
+    Squared errors of latents are proportional to those of the root of pressure. Decoded pressure is
+    bounded by `peak_kpa`, the highest pressure in training.
     """
 
     basis: Tensor

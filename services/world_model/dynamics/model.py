@@ -151,10 +151,9 @@ class SceneMemory:
 
     `start` holds objects and touch at the first step as every member knows them, `state` the state
     of every member's core (both with axes members, batch, …), `poses` the current object poses
-    (mean over members), `disagreement_m` the ensemble disagreement about them, `success` the
-    members' probability that the task is done at the end, `points_m` the hand points when they last
-    moved, and `num_still` the number of latent steps since then (at least `REST_LATENTS` from the
-    start on for hands that touch nothing).
+    (mean over members), `disagreement_m` the largest spread of a position, `success` the members'
+    probability that the task is done at the end, `points_m` the hand points when they last moved,
+    `num_still` the latent steps since then (`REST_LATENTS` at first for hands that touch nothing).
     """
 
     start: SceneStart

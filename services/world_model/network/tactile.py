@@ -81,10 +81,7 @@ class TactileTokenizer(nn.Module, ABC):
 
 
 class LearnedTokenizer(TactileTokenizer):
-    """Autoencoder of root pressures in units of their root mean square.
-
-    `dextouch train tokenizer` trains one.
-    """
+    """Autoencoder of root pressures in units of their root mean square (`train tokenizer`)."""
 
     root_scale: Tensor
 
@@ -232,8 +229,7 @@ def canvas_cells() -> np.ndarray:
 class GridTokenizer(LearnedTokenizer):
     """One autoencoder for palm and fingertips on one canvas, the paper's baseline.
 
-    It has as many weights and latents as Split-Hands. The canvas makes neighbours of taxels that
-    are far apart on the hand.
+    It has as many weights as Split-Hands; taxels far apart on the hand are neighbours on it.
     """
 
     _cells: Tensor

@@ -119,9 +119,8 @@ class VideoExpert(nn.Module):
 class VisualCodec(nn.Module):
     """Linear tokenizer of 1 + 4k images by principal axes of 8×8×4 patches, in closed form.
 
-    The first image forms a group of its own (repeated four times), followed by groups of four, as
-    in causal video autoencoders. A token covers two by two patches of one latent frame. It is
-    fitted once on training images, then frozen in the checkpoint.
+    The first image forms a group of its own (repeated four times), followed by groups of four. A
+    token covers two by two patches of one latent frame. Frozen once fitted on training images.
     """
 
     mean: Tensor
@@ -283,10 +282,9 @@ class WanConstants:
 class WanVideoCondition(nn.Module):
     """Times, actions and instructions as the transformer of Wan2.2 takes them.
 
-    Each latent frame has its own time, 0 for the clean first one, so modulations are computed per
-    latent frame, not per token. Actions are added to the embedding of the time, with an effect of
-    zero before training. Without them and without tactile tokens, the video side equals diffusers'
-    `WanTransformer3DModel`.
+    Modulations are computed per latent frame, each with its own time, 0 for the clean first one.
+    Actions are added to the embedding of the time, with an effect of zero before training. Without
+    them and tactile tokens, the video side equals diffusers' `WanTransformer3DModel`.
     """
 
     def __init__(self, config: NetworkConfig, wan: WanConfig, embedder: nn.Module) -> None:

@@ -27,7 +27,7 @@ LOG_EVERY_STEPS = 50
 _EDGE_WINDOW_PX = 7
 # Chosen: half of the pairs begin at the first image of an episode, as rollouts do.
 _LATE_START_SHARE = 0.5
-# Chosen: rotation noise (rad) on each axis, a multiple of what predicted poses are off.
+# Chosen: rotation noise (rad) on each axis, beside `shake_m` of position noise.
 _SHAKE_RAD = 0.05
 OnProgress = Callable[[float, int, float], None]
 

@@ -45,9 +45,9 @@ _MEASURED_SHARE = 0.15
 class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
-    Cores start from true poses with noise, and know its size, as they know that of a reader's error
-    in a rollout. `readings` are a reader's by start step, which episodes start from whose objects
-    are not labelled or not known there, or all if `starts_read`; empty if none does.
+    Cores start from true poses with noise of known size. `readings` are a reader's by start step,
+    which episodes start from whose objects are not labelled or not known there, or all if
+    `starts_read`; empty if none does.
     """
 
     table: SceneTable
@@ -221,8 +221,7 @@ def core_loss(
     """Weighted sum of the errors in objects, touch, contact and final success.
 
     Where hands are held still without contact, the targets are no motion and no change of touch. A
-    change of it needs a new `CORE_VERSION` (`state_trainer`): finished members are not trained
-    again without.
+    change of it needs a new `CORE_VERSION` (`state_trainer`).
     """
     commands, start = batch.commands, batch.start
     table, rows = data.table, batch.rows

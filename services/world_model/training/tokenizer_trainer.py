@@ -33,7 +33,7 @@ from services.world_model.training.dataset import E, TrainingEpisode
 from services.world_model.training.scene_table import filled_touch
 
 _EVALUATION_BATCH, _TIMING_ROUNDS = 1000, 5
-# Chosen: as of the world model's, but for the small network without weight decay.
+# Chosen: decay of the averaged weights, for runs of some thousand steps.
 _EMA_DECAY = 0.99
 OnEvaluation = Callable[[float, checkpoints.Reconstruction], None]
 # By scene: the touch of each episode, and its content.

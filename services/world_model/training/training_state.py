@@ -47,8 +47,7 @@ class RunFacts(FrozenModel):
     """Metadata of a state.
 
     `identity` holds the settings and data of the run, `window_numbers` the state of the generator
-    that draws windows after the last completed step, as JSON. `log` has rows of step, completed
-    fraction of the run, and the video and tactile losses.
+    of windows, as JSON. `log` has rows of step, completed fraction, and video and tactile losses.
     """
 
     identity: dict[str, JsonValue]
