@@ -35,8 +35,8 @@ MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 class ObservedStart:
     """The step that a rollout begins with; its arrays are copies.
 
-    Touch is clipped at zero; the pose parts of `reached` are the identity, since actions are
-    relative to the poses of step 0.
+    Touch is clipped at zero; `reached` is relative to the poses of step 0, so its poses are the
+    identity.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -66,10 +66,7 @@ def observed_start(
     layout: TactileLayout = DEXTOUCH_V1,
     image_px: int | None = None,
 ) -> ObservedStart:
-    """Validate the observed step of a start.
-
-    `image_px` is the side that the middle square of the image is scaled to; None leaves it as it
-    is.
+    """Validate the observed step of a start, and scale its image's middle square to `image_px`.
 
     Raises:
         InvalidInputError: missing observation, anchor or K_head.
@@ -214,10 +211,7 @@ def refuse_non_finite(model: str, predicted: Mapping[str, Tensor]) -> None:
 
 
 class SceneReader:
-    """Finds the objects of requests, for a model that is conditioned on contact geometry.
-
-    The start readers of a state model are averaged.
-    """
+    """Finds objects for a model with contact geometry, by the mean of a state model's readers."""
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
         self._readers = checkpoint.dynamics.readers()

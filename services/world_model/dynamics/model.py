@@ -1,8 +1,7 @@
 """Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec.
 
-`begin` estimates object poses from one observed step; `advance` predicts object motion and touch
-for the next commands. The only state kept between chunks is a `SceneMemory`, which is batched,
-unbatched and serialized here, too.
+The only state kept between chunks is a `SceneMemory`, which is batched, unbatched and serialized
+here, too.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -102,8 +101,8 @@ def stillness(
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 
     Hands move when they leave that position, however slowly. A scene is at rest in latent steps
-    without hand motion that follow at least `REST_LATENTS` such steps. Latent steps are counted,
-    not chunks, so that it does not matter how a client splits its commands into chunks.
+    without motion that follow `REST_LATENTS` such steps. Latent steps are counted, not chunks, so
+    that a client may split its commands as it likes.
     """
     moved, rested = [], []
     for samples_m in commanded_m.unbind(1):
@@ -154,10 +153,9 @@ class SceneMemory:
 
     `start` holds objects and touch at the first step as every member knows them, `state` the state
     of every member's core (both with axes members, batch, …), `poses` the current object poses
-    (mean over members), `disagreement_m` the ensemble disagreement about them, `success` the
-    members' probability that the task is done at the end, `points_m` the hand points when they last
-    moved, and `num_still` the number of latent steps since then (at least `REST_LATENTS` from the
-    start on for hands that touch nothing).
+    (mean over members), `disagreement_m` the largest spread of a position, `success` the members'
+    probability that the task is done at the end, `points_m` the hand points when they last moved,
+    `num_still` the latent steps since then (`REST_LATENTS` at first for hands that touch nothing).
     """
 
     start: SceneStart
@@ -172,8 +170,6 @@ class SceneMemory:
 
 @dataclass(frozen=True)
 class _Run:
-    """Predictions for a run of latent steps; as `ImaginedSteps`."""
-
     poses: ObjectPoses
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
     disagreement_m: Float32[Tensor, "batch latents"]
@@ -296,11 +292,8 @@ class DynamicsModel(nn.Module):
         run = self._imagined(poses, future, self.core.distance(commands, state.wrist_m[0]))
         return unfolded(after, members), run
 
-    def _kind_of(
-        self, commands: Commands, start: SceneStart, state: CoreState, poses: ObjectPoses
-    ) -> tuple[int, int, int]:
+    def _kind_of(self, commands: Commands, start: SceneStart, *_: object) -> tuple[int, int, int]:
         """Latent steps, entries of the batch, and the slots that some entry uses."""
-        del state, poses
         return len(commands), start.task.shape[1], self.core.used_slots(start.task[0])
 
     def readers(self) -> list[StartReader]:
@@ -333,7 +326,7 @@ class DynamicsModel(nn.Module):
 
 
 def _spread_m(poses: ObjectPoses) -> Float32[Tensor, "*batch"]:
-    """Largest standard deviation over members of the position of an object that is present."""
+    """Largest standard deviation over members of the position of a present object."""
     used = poses.present.mean(0) > PRESENCE_THRESHOLD
     return (poses.position_m.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
@@ -365,7 +358,6 @@ def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
 
 
 def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) -> _Run:
-    """Latent steps in which everything stays constant."""
     num_latents = distance.shape[1]
 
     def held(now: Tensor, count: int) -> Tensor:
@@ -431,9 +423,8 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
     objects, zeros = MAX_OBJECTS, torch.zeros
 
     def poses(*batch: int) -> ObjectPoses:
-        return ObjectPoses(
-            zeros(*batch, objects, 3), zeros(*batch, objects, 2, 3), zeros(*batch, objects)
-        )
+        sizes = (objects, 3), (objects, 2, 3), (objects,)
+        return ObjectPoses(*(zeros(*batch, *size) for size in sizes))
 
     start = SceneStart(
         objects=poses(members, 1),
@@ -477,10 +468,9 @@ def _checked(name: str, arrays: Mapping[str, np.ndarray], expected: Tensor) -> T
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise NonFiniteError(f"snapshot: {name} contains NaN or infinity")
-    if array.dtype.kind == "f" and np.abs(array).max() > _LARGEST:
+    if array.dtype.kind == "f" and (largest := np.abs(array).max()) > _LARGEST:
         raise InvalidInputError(
-            f"snapshot: {name} has values up to {np.abs(array).max():.3g}, expected at most "
-            f"{_LARGEST:.0e}"
+            f"snapshot: {name} has values up to {largest:.3g}, expected at most {_LARGEST:.0e}"
         )
     found = torch.from_numpy(np.array(array))
     return found.clamp(*_RANGES[name]) if name in _RANGES else found

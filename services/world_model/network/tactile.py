@@ -12,7 +12,7 @@ from torch.nn import functional
 from dextouch.errors import InvalidInputError
 from dextouch.tactile import PADS
 from dextouch.tactile.layout import TactileLayout
-from services.networks.principal_axes import principal_axes, root_pressure, root_scale
+from services.world_model.dynamics.features import principal_axes, root_pressure, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Stream,
@@ -25,6 +25,8 @@ from services.world_model.network.attention import (
 from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 
+Pressures = Float32[Tensor, "*batch taxels"]
+Latents = Float32[Tensor, "*batch tokens channels"]
 NUM_PADS = 6
 # Amplitude of palms relative to that of tips; the best value in an ablation on touch.
 PALM_SCALE = 0.7
@@ -54,15 +56,11 @@ class TactileTokenizer(nn.Module, ABC):
         """Fit what follows from training touch in closed form, including `peak_kpa`."""
 
     @abstractmethod
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
-    ) -> Float32[Tensor, "*batch tokens channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
 
     @abstractmethod
-    def decode(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch taxels"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
 
     def bounded(
@@ -76,10 +74,7 @@ class TactileTokenizer(nn.Module, ABC):
 
 
 class LearnedTokenizer(TactileTokenizer):
-    """Autoencoder of root pressures in units of their root mean square.
-
-    `dextouch train tokenizer` trains one.
-    """
+    """Autoencoder of root pressures in units of their root mean square (`train tokenizer`)."""
 
     root_scale: Tensor
 
@@ -102,23 +97,17 @@ class LearnedTokenizer(TactileTokenizer):
         self.root_scale.copy_(root_pressure(tactile_kpa).square().mean().sqrt().clamp_min(1e-3))
         self.peak_kpa.copy_(tactile_kpa.max())
 
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
-    ) -> Float32[Tensor, "*batch tokens channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
         roots = root_pressure(tactile_kpa).reshape(-1, self._num_taxels) / self.root_scale
         latents = self.encode_roots(roots)
         return latents.reshape(*tactile_kpa.shape[:-1], self.num_tokens, self.channels)
 
-    def decode(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch taxels"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
         return self.roots(latents).clamp_min(0.0).square()
 
-    def roots(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch taxels"]:
+    def roots(self, latents: Latents) -> Pressures:
         """Root pressures (√kPa), which the loss compares; values may be below zero."""
         flat = latents.reshape(-1, self.num_tokens * self.channels)
         return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
@@ -163,16 +152,11 @@ class MapEncoder(nn.Module):
         super().__init__()
         self.first = _convolution(1, shape.width)
         self.position = nn.Parameter(torch.zeros(shape.width, shape.rows, shape.columns))
-        strides = [2] * shape.num_halvings or [1]
-        self.deeper = nn.Sequential(
-            *(
-                layer
-                for stride in strides
-                for layer in (_convolution(shape.width, shape.width, stride=stride), nn.GELU())
-            ),
-            nn.Flatten(),
-            nn.Linear(shape.num_features, shape.hidden, bias=False),
-        )
+        layers: list[nn.Module] = []
+        for stride in [2] * shape.num_halvings or [1]:
+            layers += [_convolution(shape.width, shape.width, stride=stride), nn.GELU()]
+        features = nn.Linear(shape.num_features, shape.hidden, bias=False)
+        self.deeper = nn.Sequential(*layers, nn.Flatten(), features)
         self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
         self.to_latents = nn.Linear(shape.hidden, shape.channels, bias=False)
 
@@ -194,18 +178,11 @@ class MapDecoder(nn.Module):
         self.from_latents = nn.Linear(shape.channels, shape.hidden, bias=False)
         self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
         self.to_features = nn.Linear(shape.hidden, shape.num_features, bias=False)
-        self.deeper = nn.Sequential(
-            nn.GELU(),
-            *(
-                layer
-                for _ in range(shape.num_halvings - 1)
-                for layer in (
-                    nn.Upsample(scale_factor=2),
-                    _convolution(shape.width, shape.width),
-                    nn.GELU(),
-                )
-            ),
-        )
+        layers: list[nn.Module] = [nn.GELU()]
+        for _ in range(shape.num_halvings - 1):
+            convolution = _convolution(shape.width, shape.width)
+            layers += [nn.Upsample(scale_factor=2), convolution, nn.GELU()]
+        self.deeper = nn.Sequential(*layers)
         # The last doubling of the resolution writes four cells per feature.
         factor = 2 if shape.num_halvings else 1
         rows, columns = (n * 2**shape.num_halvings // factor for n in shape.lowest)
@@ -259,8 +236,7 @@ def canvas_cells(layout: TactileLayout) -> tuple[np.ndarray, tuple[int, int]]:
 class GridTokenizer(LearnedTokenizer):
     """One autoencoder for palm and fingertips on one canvas, the paper's baseline.
 
-    It has as many weights and latents as Split-Hands. The canvas makes neighbours of taxels that
-    are far apart on the hand.
+    It has as many weights as Split-Hands; taxels far apart on the hand are neighbours on it.
     """
 
     _cells: Tensor
@@ -335,10 +311,7 @@ class SplitHandsTokenizer(LearnedTokenizer):
 
 
 class PrincipalAxesTokenizer(TactileTokenizer):
-    """Tips as they are and palms along their principal axes, as one token, in closed form.
-
-    Fitted in a second, it loses little touch, but learns nothing about the hand.
-    """
+    """Tips as they are and palms along their principal axes, as one token, in closed form."""
 
     tip_scale: Tensor
     palm_basis: Tensor
@@ -371,18 +344,14 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
         self.peak_kpa.copy_(tactile_kpa.max())
 
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch taxels"]
-    ) -> Float32[Tensor, "*batch 1 channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
         roots = root_pressure(tactile_kpa)
         tips = roots[..., : self._num_tips] / self.tip_scale
         palm = (roots[..., self._num_tips :] @ self.palm_basis) / self.palm_scale
         return torch.cat([tips, palm], dim=-1)[..., None, :]
 
-    def decode(
-        self, latents: Float32[Tensor, "*batch 1 channels"]
-    ) -> Float32[Tensor, "*batch taxels"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
         tips = latents[..., 0, : self._num_tips] * self.tip_scale
         palm = (latents[..., 0, self._num_tips :] * self.palm_scale) @ self.palm_basis.T

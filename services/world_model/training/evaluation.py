@@ -81,9 +81,8 @@ def evaluate_prediction(
             f"evaluation: got {len(episodes)} episodes without a window of "
             f"{model.config.max_steps} steps, expected at least one"
         )
-    windows = [
-        _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
-    ]
+    steps = model.config.max_steps
+    windows = [_cut(episode, start, steps, action_kind) for episode, start in places]
     truth = Futures(
         np.stack([w.images[1:] for w in windows]),
         np.stack([w.tactile_kpa[1:] for w in windows]),
@@ -91,8 +90,8 @@ def evaluate_prediction(
         model.config.tactile_layout,
     )
     first = Futures(
-        np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
-        np.stack([w.tactile_kpa[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
+        np.stack([w.images[:1] for w in windows]).repeat(steps - 1, axis=1),
+        np.stack([w.tactile_kpa[:1] for w in windows]).repeat(steps - 1, axis=1),
     )
     requests = [window.request for window in windows]
     figures = _figures(predict_all(model, requests), truth, "")
@@ -138,10 +137,8 @@ def predict_all(model: JointWorldModel, requests: Sequence[PredictionRequest]) -
 
     def predicted(part: Sequence[PredictionRequest], begin: int) -> tuple[Tensor, Tensor]:
         inputs = build_inputs(part, model.config)
-        noises = [
-            model.noise(inputs.num_steps, torch.Generator().manual_seed(begin + index))
-            for index in range(len(part))
-        ]
+        generators = [torch.Generator().manual_seed(begin + index) for index in range(len(part))]
+        noises = [model.noise(inputs.num_steps, each) for each in generators]
         future = model.predict(inputs, stack_noise(noises))
         return future.images, future.tactile_kpa
 
@@ -197,9 +194,8 @@ def _actions_of_other_takes(
         num_steps = len(request.actions)
         if other is not episode and start + num_steps <= len(other):
             taken = _cut(other, start, num_steps, kind).request
-            others.append(
-                (index, replace(request, actions=taken.actions, action_kind=taken.action_kind))
-            )
+            swapped = replace(request, actions=taken.actions, action_kind=taken.action_kind)
+            others.append((index, swapped))
     return others
 
 

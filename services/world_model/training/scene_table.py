@@ -61,20 +61,18 @@ class HandTable:
 class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
-    `length` is the number of an episode's own steps, of which `interpolated` ones have actions that
-    nothing measured; `objects_known` are the steps at which the pose of an object is known,
-    `measured_objects` marks episodes whose poses have the errors of a measurement, `touched` those
-    of tasks of which some have poses from touch, and `placed_sd_m` is the standard deviation of
-    positions from clicks or touch, 0 of others. `images` are those of the steps `image_steps`,
-    where `shown`; `in_contact` marks pads in contact. Taxels that are not `measured_taxels` have
-    the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at a
-    step, for want of a sample or of half of their taxels, count in no loss. `sent` are commanded
-    hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
-    episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
-    follows from their number. `labelled` marks episodes whose object poses are trained on;
-    `boxes_m` are the usual boxes of each task's objects in their frames (middle, half sizes), and
-    `size` factors of their width and height. `instruction` are the features of each episode's
-    sentence.
+    `length` is the number of an episode's own steps, of which nothing measured the actions of those
+    `interpolated`. The poses of objects are `objects_known` at a step; `measured_objects` marks
+    episodes whose poses have the errors of a measurement, `touched` those of tasks of which some
+    have poses from touch, `labelled` those whose poses are trained on; `placed_sd_m` is the
+    standard deviation of positions from clicks or touch, else 0. `images` are those of the
+    `image_steps`, where `shown`; `in_contact` marks pads. Taxels that are not `measured_taxels`
+    have the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at
+    a step, for want of a sample or of half of their taxels, count in no loss. `sent` are the hands
+    as `commanded`, elsewhere measured ones. `human` marks episodes of people, and `human_share` is
+    their share in what is drawn, NaN if it follows from their number. `boxes_m` are the usual boxes
+    of each task's objects in their frames (middle, half sizes), and `size` factors of their width
+    and height. `instruction` are the features of each episode's sentence.
     """
 
     sent: HandTable
@@ -198,9 +196,8 @@ class SceneTable:
             return chosen(use_measured, getattr(self.measured, name)[rows][:, steps], sent)
 
         here = self.measured
-        holding = here.points_m[rows, start][:, None, None].expand(
-            -1, 1, len(SAMPLE_OFFSETS), -1, -1, -1
-        )
+        holding = here.points_m[rows, start][:, None, None]
+        holding = holding.expand(-1, 1, len(SAMPLE_OFFSETS), -1, -1, -1)
         return Commands(
             torch.cat([holding, taken("points_m", samples)], dim=1),
             torch.cat([here.axes[rows, start][:, None], taken("axes", ends)], dim=1),
@@ -215,21 +212,22 @@ class SceneTable:
     def tensors(self) -> dict[str, Tensor]:
         """All data as named tensors, to share with other processes through a file."""
         flat = {"image_steps": torch.tensor(self.image_steps)}
-        for name in (one.name for one in fields(self) if one.name != "image_steps"):
-            flat |= by_name(getattr(self, name), name)
+        for field in fields(self):
+            if field.name != "image_steps":
+                flat |= by_name(getattr(self, field.name), field.name)
         return {name: value.contiguous() for name, value in flat.items()}
 
     @classmethod
     def from_tensors(cls, flat: dict[str, Tensor]) -> "SceneTable":
         """Inverse of `tensors`."""
         parts: dict[str, Any] = {name: part for name, part in flat.items() if "." not in name}
-        kinds: dict[str, type[Any]] = {
-            "sent": HandTable, "measured": HandTable, "objects": ObjectPoses,
-        }  # fmt: skip
-        for name, kind in kinds.items():
-            start = f"{name}."
-            inner = {key: value for key, value in flat.items() if key.startswith(start)}
-            parts[name] = kind(**{key.removeprefix(start): one for key, one in inner.items()})
+        for name, kind in (("sent", HandTable), ("measured", HandTable), ("objects", ObjectPoses)):
+            inner = {
+                key.partition(".")[2]: one
+                for key, one in flat.items()
+                if key.startswith(f"{name}.")
+            }
+            parts[name] = kind(**inner)
         return cls(**{**parts, "image_steps": tuple(flat["image_steps"].tolist())})
 
 
@@ -371,9 +369,8 @@ def _nearest_measured(
         return nearest
     for pad in [pad for stack in layout.split(nearest) for pad in stack]:
         if measured[pad].any():
-            places = distance_transform_edt(
-                ~measured[pad], return_distances=False, return_indices=True
-            )
+            away = ~measured[pad]
+            places = distance_transform_edt(away, return_distances=False, return_indices=True)
             nearest[pad] = pad[tuple(places)]
     return nearest
 
@@ -391,8 +388,7 @@ def _known(
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
     """Latent steps with an image in at least half of the episodes that have them."""
-    num_shown = np.zeros(max(lengths), dtype=np.int64)
-    num_long = np.zeros(max(lengths), dtype=np.int64)
+    num_shown, num_long = np.zeros((2, max(lengths)), dtype=np.int64)
     for episode, length in zip(episodes, lengths, strict=True):
         own = episode.image_steps
         if not len(own) or own[0] != 0:
@@ -425,10 +421,8 @@ def usual_boxes_m(episodes: Sequence[EpisodeGrid]) -> dict[str, Float64[np.ndarr
     for episode in episodes:
         if len(episode.boxes_m):
             by_task[episode.task].append(episode.boxes_m)
-    return {
-        task: np.median(boxes, axis=0) if boxes else np.zeros((0, 6))
-        for task, boxes in by_task.items()
-    }
+    none = np.zeros((0, 6))
+    return {task: np.median(b, axis=0) if b else none for task, b in by_task.items()}
 
 
 def _size(
@@ -436,12 +430,10 @@ def _size(
 ) -> Float32[np.ndarray, "slots 2"]:
     """Width and height of an episode's objects relative to the usual ones; 1 in empty slots."""
     size = np.ones((MAX_OBJECTS, 2), dtype=np.float32)
-    if not len(episode.boxes_m):
-        return size
-    across, height = (slice(3, 5), slice(5, 6))
-    for column, part in enumerate((across, height)):
-        factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
-        size[: len(factors), column] = factors.clip(*SIZE_RANGE)
+    if len(episode.boxes_m):
+        for column, part in enumerate((slice(3, 5), slice(5, 6))):
+            factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
+            size[: len(factors), column] = factors.clip(*SIZE_RANGE)
     return size
 
 
@@ -455,7 +447,6 @@ def _padded(
 
 
 def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> list[ObjectTrack]:
-    """Object poses of the episodes, if these fit the configuration."""
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
     size_px = (config.image_px, config.image_px)

@@ -25,29 +25,18 @@ from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout, common_layout
-from services.networks.optimizer import (
-    Budget,
-    OptimizerLoop,
-    OptimizerOptions,
-    floored_cosine,
-    update_average,
-)
-from services.networks.principal_axes import root_pressure
-from services.world_model.checkpoints import (
-    Reconstruction,
-    StoredTokenizer,
-    TokenizerMetadata,
-    read_tokenizer,
-    write_tokenizer,
-)
+from services.networks import optimizer
+from services.world_model import checkpoints
+from services.world_model.dynamics.features import root_pressure
 from services.world_model.network.tactile import LearnedTokenizer, TactileTokenizer, build_tokenizer
 from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
 from services.world_model.training.scene_table import filled_touch
 
-_EVALUATION_BATCH = 1000
-_TIMING_ROUNDS = 5
-OnEvaluation = Callable[[float, Reconstruction], None]
+_EVALUATION_BATCH, _TIMING_ROUNDS = 1000, 5
+# Chosen: decay of the averaged weights, for runs of some thousand steps.
+_EMA_DECAY = 0.99
+OnEvaluation = Callable[[float, checkpoints.Reconstruction], None]
 # By scene: the touch of each episode, and its content.
 _Side = dict[str, list[tuple[np.ndarray, str]]]
 
@@ -106,7 +95,7 @@ class TokenizerReport:
     """Result of a run; times are medians of encoding and decoding on this machine."""
 
     checkpoint: Path
-    metadata: TokenizerMetadata
+    metadata: checkpoints.TokenizerMetadata
     digest: str
     ms_per_1000_hands: float
 
@@ -129,8 +118,8 @@ def train_tokenizer(
         torch.manual_seed(settings.seed)
         tokenizer = build_tokenizer(settings.network().with_layout(training.layout))
     tokenizer.fit(torch.from_numpy(training.tactile_kpa)[:, None].expand(-1, 2, -1))
-    budget = Budget(settings.cpu_budget_s, settings.max_steps)
-    curve: list[Reconstruction] = []
+    budget = optimizer.Budget(settings.cpu_budget_s, settings.max_steps)
+    curve: list[checkpoints.Reconstruction] = []
 
     def evaluate(current: TactileTokenizer) -> None:
         with budget.paused():
@@ -140,7 +129,7 @@ def train_tokenizer(
 
     if isinstance(tokenizer, LearnedTokenizer):
         tokenizer = _learn(tokenizer, training, settings, budget, evaluate)
-    metadata = TokenizerMetadata(
+    metadata = checkpoints.TokenizerMetadata(
         tokenizer=settings.tokenizer,
         palm_channels=settings.palm_channels,
         tactile_channels=settings.tactile_channels,
@@ -155,15 +144,17 @@ def train_tokenizer(
         data_hash=training.data_hash,
         layout=None if training.layout == DEXTOUCH_V1 else training.layout,
         curve=(
-            Reconstruction(step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0),
+            checkpoints.Reconstruction(
+                step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0
+            ),
         ),
     )
-    write_tokenizer(settings.output, tokenizer, metadata)
+    checkpoints.write_tokenizer(settings.output, tokenizer, metadata)
     # Evaluate the weights as stored, then store them again with the curve.
-    stored = read_tokenizer(settings.output).tokenizer
+    stored = checkpoints.read_tokenizer(settings.output).tokenizer
     evaluate(stored)
     metadata = metadata.model_copy(update={"curve": tuple(curve)})
-    digest = write_tokenizer(settings.output, stored, metadata)
+    digest = checkpoints.write_tokenizer(settings.output, stored, metadata)
     return TokenizerReport(settings.output, metadata, digest, _ms_per_1000_hands(stored, heldout))
 
 
@@ -171,7 +162,7 @@ def _learn(
     tokenizer: LearnedTokenizer,
     training: TactileHands,
     settings: TrainTokenizerSettings,
-    budget: Budget,
+    budget: optimizer.Budget,
     evaluate: Callable[[TactileTokenizer], None],
 ) -> LearnedTokenizer:
     """The moving average of the weights after training, evaluated at equal shares of the run."""
@@ -185,29 +176,20 @@ def _learn(
     generator = torch.Generator().manual_seed(settings.seed + 1)
     averaged = copy.deepcopy(tokenizer).eval().requires_grad_(requires_grad=False)
     given = settings.optimizer
-    options = OptimizerOptions(
-        learning_rate=given.learning_rate,
-        weight_decay=given.weight_decay,
-        max_gradient_norm=given.max_gradient_norm,
-        warmup_steps=given.warmup_steps,
-        schedule=floored_cosine,
+    options = optimizer.OptimizerOptions(
+        given.learning_rate, 0.0, warmup_steps=given.warmup_steps, schedule=optimizer.floored_cosine
     )
 
     def loss() -> Tensor:
-        drawn = torch.randint(len(touched), (given.batch,), generator=generator)
-        return reconstruction_loss(
-            tokenizer, touched[drawn], contact_weight=settings.contact_weight
-        )
+        drawn = touched[torch.randint(len(touched), (given.batch,), generator=generator)]
+        return reconstruction_loss(tokenizer, drawn, contact_weight=settings.contact_weight)
 
     evaluate(averaged)
     num_evaluated = 0
-    for _ in OptimizerLoop(tokenizer, options, budget).run(loss):
-        update_average(averaged, tokenizer, decay=given.ema_decay, num_updates=budget.step - 1)
-        if (
-            num_evaluated + 1
-            <= budget.share() * settings.num_evaluations
-            < settings.num_evaluations
-        ):
+    for _ in optimizer.OptimizerLoop(tokenizer, options, budget).run(loss):
+        optimizer.update_average(averaged, tokenizer, decay=_EMA_DECAY, num_updates=budget.step - 1)
+        due = budget.share() * settings.num_evaluations
+        if num_evaluated + 1 <= due < settings.num_evaluations:
             evaluate(averaged)
             num_evaluated += 1
     return averaged
@@ -230,21 +212,21 @@ def reconstruction_loss(
 
 
 def reconstruction(
-    tokenizer: TactileTokenizer, hands: TactileHands, budget: Budget
-) -> Reconstruction:
+    tokenizer: TactileTokenizer, hands: TactileHands, budget: optimizer.Budget
+) -> checkpoints.Reconstruction:
     """Accuracy of a tokenizer on hands, at this point of a run."""
     decoded = [
         _through(tokenizer, hands.tactile_kpa[begin : begin + _EVALUATION_BATCH])
         for begin in range(0, len(hands.tactile_kpa), _EVALUATION_BATCH)
     ]
-    both = {"predicted_kpa": np.concatenate(decoded), "true_kpa": hands.tactile_kpa}
-    return Reconstruction(
+    pair = {"predicted_kpa": np.concatenate(decoded), "true_kpa": hands.tactile_kpa}
+    return checkpoints.Reconstruction(
         step=budget.step,
         cpu_s=round(budget.cpu_s, 2),
-        mse_kpa2=tactile_metrics.mse(**both, layout=hands.layout),
-        mae_kpa=tactile_metrics.mae(**both, layout=hands.layout),
-        contact_iou=tactile_metrics.contact_iou(**both, layout=hands.layout),
-        contact_f1=tactile_metrics.contact_f1(**both, layout=hands.layout),
+        mse_kpa2=tactile_metrics.mse(**pair, layout=hands.layout),
+        mae_kpa=tactile_metrics.mae(**pair, layout=hands.layout),
+        contact_iou=tactile_metrics.contact_iou(**pair, layout=hands.layout),
+        contact_f1=tactile_metrics.contact_f1(**pair, layout=hands.layout),
     )
 
 
@@ -256,7 +238,6 @@ def _through(
 
 
 def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> float:
-    """Median CPU time of encoding and decoding a batch of 1000 hands."""
     batch = np.resize(hands.tactile_kpa, (1000, hands.tactile_kpa.shape[1]))
     times_ms = []
     for _ in range(_TIMING_ROUNDS):
@@ -266,7 +247,9 @@ def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> floa
     return float(np.median(times_ms))
 
 
-def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:
+def with_tokenizer(
+    settings: TrainSettings,
+) -> tuple[TrainSettings, checkpoints.StoredTokenizer | None]:
     """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
 
     Raises:
@@ -290,13 +273,13 @@ def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokeni
             "training: got --init and --tokenizer, expected one of them; the initial checkpoint "
             "holds the tokenizer that its latents come from"
         )
-    stored = read_tokenizer(settings.tokenizer)
+    stored = checkpoints.read_tokenizer(settings.tokenizer)
     network = stored.metadata.network(settings.network)
     return settings.model_copy(update={"network": network}), stored
 
 
 def split_unseen(
-    episodes: Sequence[E], stored: StoredTokenizer, *, heldout_percent: int
+    episodes: Sequence[E], stored: checkpoints.StoredTokenizer, *, heldout_percent: int
 ) -> tuple[list[E], list[E]]:
     """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
 
@@ -320,7 +303,7 @@ def split_unseen(
     )
 
 
-def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:
+def check_unseen(heldout: Sequence[TrainingEpisode], stored: checkpoints.StoredTokenizer) -> None:
     """Raise if the tokenizer was trained on the scene of a held-out episode."""
     seen = set(stored.metadata.train_scenes)
     both = [episode.episode_id for episode in heldout if episode.scene in seen]

@@ -1,7 +1,4 @@
-"""A state model that a training starts from, and its parts as a training continues them.
-
-Which parts are trained and which are kept is decided in `state_trainer`, by `--learn`.
-"""
+"""A state model that a training starts from, and its parts as a training continues them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -64,9 +61,8 @@ class Base:
     def has_tasks_of(self, config: DynamicsConfig) -> bool:
         """Whether the base has all of these tasks, with as many objects."""
         own = self.checkpoint.metadata.dynamics
-        counts = dict(zip(own.tasks, own.num_objects, strict=True))
-        wanted = zip(config.tasks, config.num_objects, strict=True)
-        return all(counts.get(task) == count for task, count in wanted)
+        counts = set(zip(own.tasks, own.num_objects, strict=True))
+        return counts >= set(zip(config.tasks, config.num_objects, strict=True))
 
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
         """A member's reader; weights of tasks that the base does not know are fresh."""
@@ -131,8 +127,7 @@ def _with_new_inputs(
 ) -> dict[str, Tensor]:
     """Weights of a core for one that also tells people from robots, or reads an instruction.
 
-    The new inputs have no effect at first, and people feel as robots do. The last inputs are
-    whether a person acts, and then the instruction.
+    The new inputs, the last ones, have no effect at first, and people feel as robots do.
     """
     shapes = {name: value.shape for name, value in core.named_parameters()}
     known = dict(kept)
@@ -140,14 +135,10 @@ def _with_new_inputs(
     for name, value in kept.items():
         missing = shapes[name][1] - value.shape[1] if value.ndim == 3 else 0
         if missing:
-            sentence = value[:, value.shape[1] - own.instruction_size :]
-            before = functional.pad(
-                value[:, : value.shape[1] - own.instruction_size],
-                (0, 0, 0, missing - new_sentence),
-            )
-            known[name] = functional.pad(
-                torch.cat([before, sentence], dim=1), (0, 0, 0, new_sentence)
-            )
+            others = value.shape[1] - own.instruction_size
+            before = functional.pad(value[:, :others], (0, 0, 0, missing - new_sentence))
+            both = torch.cat([before, value[:, others:]], dim=1)
+            known[name] = functional.pad(both, (0, 0, 0, new_sentence))
     for name in shapes:
         robots = name.removeprefix("human.")
         if name not in kept and robots in kept:
