@@ -23,7 +23,6 @@ from services.acquisition.devices.kinds import (
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.cameras_and_robot import (
     CameraSource,
     RobotStateSource,
@@ -40,7 +39,7 @@ from services.acquisition.mocks.replay import (
     device_rng,
 )
 from services.acquisition.mocks.trackers import mock_finger_tracker, mock_pose_tracker
-from services.acquisition.settings import SpoolSafety
+from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
 
 LATENCY_SIGMA_MS = 0.2

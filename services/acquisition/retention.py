@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import structlog
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import LOG_FILE, SpoolReader
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError, StorageError
-from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     MAX_CHECKED_TAKES,
     CheckTakes,
@@ -30,6 +29,7 @@ from dextouch.schemas import (
     RecordingStatus,
     SpooledTake,
 )
+from services.acquisition.settings import Retention
 
 if TYPE_CHECKING:
     from dextouch.clients import EpisodeStoreClient
@@ -45,23 +45,6 @@ DAY_S: Final = 86_400.0
 GIGABYTE: Final = 1e9
 # One line of JSON for each take that was removed because it was deleted in the store.
 REMOVALS_FILE: Final = "removals.jsonl"
-
-
-class Retention(FrozenModel):
-    """How long takes stay in the spool after the store acknowledged them."""
-
-    keep_uploaded_days: float = Field(
-        default=7.0,
-        ge=0,
-        allow_inf_nan=False,
-        description="days that a take stays in the spool after the store acknowledged it",
-    )
-    keep_uploaded_gb: float | None = Field(
-        default=None,
-        ge=0,
-        allow_inf_nan=False,
-        description="GB of acknowledged takes to keep at most, the newest (default: no limit)",
-    )
 
 
 class SpoolRetention:

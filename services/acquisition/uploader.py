@@ -38,12 +38,12 @@ from services.acquisition.retention import (
     REFUSED_FILE,
     UPLOADED_FILE,
     DeletedTakes,
-    Retention,
     SpoolRetention,
     acknowledgement,
     remove_take,
 )
 from services.acquisition.retention import spooled_takes as _spools
+from services.acquisition.settings import Retention
 
 logger = structlog.get_logger(__name__)
 

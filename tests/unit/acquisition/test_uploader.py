@@ -13,7 +13,7 @@ from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch
 from services.acquisition import uploader as uploader_module
-from services.acquisition.retention import Retention
+from services.acquisition.settings import Retention
 from services.acquisition.uploader import (
     UPLOADED_FILE,
     Uploader,
