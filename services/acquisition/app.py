@@ -103,10 +103,7 @@ def create_app(
 ) -> FastAPI:
     """A station; takes that an earlier process left unfinished are closed first.
 
-    Args:
-        settings: devices, spool and store.
-        uploader: how takes reach the store; made from the settings when not given.
-        follow: as of `Station`.
+    The uploader is made from the settings where none is given; `follow` is as of `Station`.
 
     Raises:
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.

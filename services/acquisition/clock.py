@@ -151,14 +151,9 @@ class _VirtualWaiter(Waiter):
 
 
 class PeriodicCall:
-    """Calls a function again and again, in a thread of its own, between `start` and `stop`.
+    """Calls a function in a thread of its own, `period_ns` from the end of one call to the next.
 
-    Args:
-        call: what is called.
-        period_ns: from the end of one call to the next.
-        clock: on which the thread waits.
-        name: of the thread.
-        on_wake: called before each call with the time and how late the thread woke, both in ns.
+    `on_wake` is called before each call with the time and how late the thread woke, both in ns.
     """
 
     def __init__(

@@ -91,13 +91,8 @@ def build_mocks(
 ) -> list[MockPair]:
     """The mock devices that a set of streams needs.
 
-    Args:
-        streams: of one episode; streams with ground truth only are omitted.
-        faults: what disturbs the devices.
-        seed: of noise, calibration and faults.
-        clock: of the station.
-        links: how the devices are connected, and their protocols.
-        unit_seed: of the devices' own offsets and gains; default: the seed.
+    Streams of ground truth alone are left out. `unit_seed` is that of the devices' own offsets and
+    gains, by default the seed.
 
     Raises:
         InvalidInputError: two streams of one name, or none that any device sends.
@@ -187,20 +182,10 @@ class MockTake:
 class MockStation:
     """A station whose devices are mocks that play one episode.
 
-    Args:
-        streams: of the episode.
-        faults: what disturbs the devices.
-        seed: of everything random.
-        clock: a `VirtualClock` records a take in a fraction of its length, exactly repeatable; a
-            `StationClock` lets real time and the operating system play their part.
-        spool_root: folder of the takes.
-        name: of the station.
-        calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
-        links: how the devices are connected, and their protocols.
-        safety: of the spool.
-        unit_seed: of the devices' own offsets and gains, and of what the station knows of path
-            delays; stations with one value have the same devices. Default: the seed.
-        follow: as of `Station`.
+    A `VirtualClock` records a take in a fraction of its length, exactly repeatable; with a
+    `StationClock` real time and the operating system play their part. `calibration` is what is
+    known beyond the gloves and path delays (`K_head`). Stations of one `unit_seed` (by default the
+    seed) have the same devices.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -269,10 +254,7 @@ class MockStation:
     ) -> MockTake:
         """Record the whole episode once and save it; may be repeated.
 
-        Args:
-            prompt: task and instruction.
-            recording_id: chosen by the recorder if None.
-            how: how it is saved; incomplete takes are accepted if None.
+        The recorder chooses an id if there is none; incomplete takes are accepted without `how`.
 
         Raises:
             ConflictError: the recorder is busy.

@@ -215,10 +215,7 @@ def add_latencies(
 ) -> dict[str, Matrix]:
     """A recording's calibration, updated with more accurate measured path delays.
 
-    Args:
-        calibration: of the recording, measured delays of before included.
-        measured: by stream.
-        stated: names that the station's calibration gives; these delays are never replaced.
+    Delays of the names `stated`, which the station's calibration gives, are never replaced.
     """
     added = dict(calibration)
     for stream, latency in measured.items():

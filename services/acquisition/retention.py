@@ -156,13 +156,8 @@ class DeletedTakes:
     """Asks the store which takes of the spool were deleted, removes them and confirms it.
 
     The store says by a revision whether there was a deletion, so that the spool is only read then,
-    and once after a start.
-
-    Args:
-        spool_root: folder of the takes.
-        station: name of this station; takes of an earlier name are asked about under that.
-        stored_as: the ids under which the store has a take, or would have it.
-        operators: of the session.
+    and once after a start. `stored_as` gives the ids under which the store has a take, or would
+    have it.
     """
 
     def __init__(

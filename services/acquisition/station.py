@@ -38,15 +38,8 @@ MOUNTS = {
 class Station:
     """Everything that runs beside the devices.
 
-    Args:
-        name: of the station.
-        drivers: of its devices.
-        spool_root: folder of the takes.
-        clock: stamps and waits.
-        calibration: matrices that travel with every recording.
-        safety: how often the spool reaches the disk, and how much space is kept.
-        simulated: whether the devices are mocks.
-        follow: makes the check whether the robot's hand can follow a tracked hand; None: no check.
+    `follow` makes the check whether the robot's hand can follow a tracked one; without it there is
+    none.
     """
 
     def __init__(  # noqa: PLR0913 - all by name

@@ -89,10 +89,7 @@ class StreamCounters:
 class DeviceSupervisor:
     """Reads one device while the station runs, and reopens it after every disconnection.
 
-    Args:
-        driver: of the device; used by the supervisor's thread alone.
-        sink: called in that thread with new readings.
-        clock: of the station.
+    The driver is used by the supervisor's thread alone, in which `sink` gets new readings.
 
     Attributes:
         connected: whether the device is open.

@@ -66,10 +66,7 @@ def root_cause(
 ) -> TakeCause | None:
     """The cause of the gravest problem; None without problems.
 
-    Args:
-        problems: of the take.
-        causes: that the station's health saw during the take, widest first.
-        simulated: streams of simulated devices.
+    Causes are those that the station's health saw during the take, widest first.
     """
     if not problems:
         return None
@@ -274,13 +271,7 @@ class TakeFindings:
 class TakeWatch:
     """What happens to the streams, devices and host of a take, from now until `end`.
 
-    Args:
-        drivers: whose streams are recorded, by name.
-        clock: of the station.
-        device_events: by device, counts of named events since the station's start; those of the
-            drivers if None.
-        health: of the station.
-        follow: whether the robot's hand could follow the tracked ones.
+    `device_events` gives counts of named events by device, since the station's start.
 
     Attributes:
         streams: counters by name of the samples that the take keeps.

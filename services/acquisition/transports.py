@@ -166,10 +166,8 @@ def find_port(serial_number: str) -> str:
 class SerialTransport(HandleTransport["serial.Serial"]):
     """One serial port, held exclusively; a write takes 0.5 s at most.
 
-    Args:
-        find: gives the port's name at every opening, so that a replugged device is found again.
-        baud_rate: bits per second (USB devices ignore it).
-        serial_number: of the device, for messages.
+    `find` gives the port's name at every opening, so that a replugged device is found again; USB
+    devices ignore the baud rate.
     """
 
     advice = "is it in use?"
@@ -379,10 +377,8 @@ class UsbTransport(HandleTransport[_Opened]):
     replugging, on any port. The kernel's HID driver is detached while the interface is open, and
     reattached on closing.
 
-    Args:
-        address: of the device.
-        backend: of pyusb; a new context of libusb at every opening if None, since an older one
-            learns of what is plugged in only by udev, which does not speak inside containers.
+    Without a `backend` there is a new context of libusb at every opening: an older one learns of
+    what is plugged in only by udev, which does not speak inside containers.
     """
 
     def __init__(self, address: UsbAddress, *, backend: "IBackend | None" = None) -> None:

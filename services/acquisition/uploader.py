@@ -70,12 +70,7 @@ class Uploader:
     take that the store refuses permanently is quarantined: it stays in the spool until `retry`. One
     that was deleted in the store is removed.
 
-    Args:
-        spool_root: folder of the takes.
-        store: where they go, closed by `stop`; None keeps them in the spool.
-        period_s: pause between two looks into the spool, and after a failure.
-        retention: how long a take stays in the spool when the store has it.
-        deleted: removes takes that were deleted in the store; None leaves them.
+    Without a store, which `stop` closes, takes stay in the spool.
     """
 
     def __init__(

@@ -119,16 +119,7 @@ def find_rules() -> Path:
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine that is checked, and how it is asked.
-
-    Attributes:
-        root: of the file system.
-        may_open: whether a device file may be opened.
-        is_free: whether a port is free.
-        output_of: what a program prints, None where it fails.
-        rules: the udev rules that give access to devices.
-        ports: that `dextouch up` listens on, by service.
-    """
+    """The machine that is checked, and how it is asked; `ports` are those of `dextouch up`."""
 
     root: Path = Path("/")
     may_open: Callable[[Path], bool] = may_open

@@ -33,12 +33,7 @@ STATIC = Path(__file__).parent / "static"
 def create_app(
     settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None = None
 ) -> FastAPI:
-    """Create the dashboard's application.
-
-    Args:
-        settings: services to show, and access control.
-        upstreams: clients of the services; created from the settings' URLs by default.
-    """
+    """The dashboard's application; clients are made from the settings' URLs if none are given."""
     upstreams, stations = _clients(settings, upstreams)
     clients = (*upstreams.values(), *stations.values())
     feeds = {

@@ -121,13 +121,9 @@ class AuditPage(FrozenModel):
 
 
 class RotatedLines:
-    """Lines in numbered files of a folder, of which old ones are deleted.
+    """Lines in numbered files of a folder, `max_bytes` together, of which old ones are deleted.
 
-    Args:
-        folder: of the files.
-        name: their beginning.
-        max_bytes: of all files together.
-        sync: whether a line survives a power loss, not only the end of the process.
+    With `sync` a line survives a power loss, not only the end of the process.
     """
 
     def __init__(self, folder: Path, name: str, *, max_bytes: int, sync: bool) -> None:
@@ -175,12 +171,7 @@ class RotatedLines:
 
 
 class AuditLog:
-    """Entries of the requests that change something, in a folder or in memory; thread-safe.
-
-    Args:
-        folder: of the files; None keeps the newest entries in memory.
-        max_bytes: of all files together.
-    """
+    """Entries of the requests that change something, in a folder or in memory; thread-safe."""
 
     def __init__(self, folder: Path | None, *, max_bytes: int) -> None:
         self.folder = folder
@@ -277,14 +268,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 class AuditTrail:
-    """Middleware that writes an entry before the response to a request begins.
-
-    Args:
-        app: the application.
-        log: where entries are kept.
-        sessions: who is signed in.
-        station: name of the station of requests that name none.
-    """
+    """Middleware that writes an entry before the response to a request begins."""
 
     def __init__(self, app: ASGIApp, *, log: AuditLog, sessions: Sessions, station: str) -> None:
         self._app, self._log, self._sessions, self._station = app, log, sessions, station

@@ -108,12 +108,7 @@ class _Run:
 
 
 class Comparisons:
-    """Runs one comparison at a time; a new one ends the one before.
-
-    Args:
-        feeds: clients of the services.
-        period_s: between two updates of its topic.
-    """
+    """Runs one comparison at a time; a new one ends the one before."""
 
     def __init__(self, feeds: Feeds, *, period_s: float) -> None:
         self._feeds = feeds

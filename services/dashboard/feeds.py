@@ -152,13 +152,7 @@ class TakesView(FrozenModel):
 
 
 class Topic:
-    """A topic: its newest messages, fetched at most once a period whatever the number of viewers.
-
-    Args:
-        name: of the topic.
-        period_s: between two fetches.
-        fetch: asks the services.
-    """
+    """A topic: its newest messages, fetched at most once a period for all of its viewers."""
 
     def __init__(
         self, name: str, period_s: float, fetch: Callable[[], Awaitable[list[Message]]]

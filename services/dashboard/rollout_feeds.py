@@ -62,12 +62,7 @@ class RolloutsView(FrozenModel):
 
 
 class RolloutFeeds:
-    """Reads open rollouts from the services of worlds, while somebody looks.
-
-    Args:
-        feeds: clients of the services.
-        settings: periods.
-    """
+    """Reads open rollouts from the services of worlds, while somebody looks."""
 
     def __init__(self, feeds: Feeds, settings: DashboardSettings) -> None:
         self._feeds = feeds

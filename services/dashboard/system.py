@@ -120,12 +120,7 @@ class SystemView(FrozenModel):
 
 
 class System:
-    """Asks every service for its health and metrics.
-
-    Args:
-        stations: clients of the stations by name.
-        upstreams: clients of the other services by name.
-    """
+    """Asks every service for its health and metrics."""
 
     def __init__(self, stations: Mapping[str, Upstream], upstreams: Mapping[str, Upstream]) -> None:
         probes = {

@@ -78,13 +78,7 @@ class Appearance:
     def varied(
         self, generator: np.random.Generator, geom_object: np.ndarray, table: int
     ) -> "Appearance":
-        """Other colours of objects and table, another light.
-
-        Args:
-            generator: source of the variation.
-            geom_object: object of each geom, −1 for none.
-            table: geom of the table.
-        """
+        """Other colours of objects (`geom_object`: one a geom, −1 for none), table, light."""
         colours = self.colours.copy()
         for index in range(int(geom_object.max()) + 1):
             own = geom_object == index

@@ -71,11 +71,7 @@ def record(
 ) -> TruthEpisode:
     """Record one take; equal stage, seed, options and actions give equal bytes.
 
-    Args:
-        stage: a task with the hands of a domain.
-        seed: seed of the scene and of all random numbers.
-        options: options of the take; they determine the commands unless `played` is given.
-        played: actions from another source.
+    The options determine the commands, unless actions are `played`.
     """
     sizes = options.sizes
     plan = stage.plan(

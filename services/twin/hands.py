@@ -98,9 +98,7 @@ _HUMAN_SHAPE: Final = HandShape(
 class HumanHand(HandModel):
     """A human hand with the robot's kinematic tree and joint order, but human bones and limits.
 
-    Args:
-        side: "left" or "right".
-        fingers: finger tables of a person, thumb first; default: average size.
+    `fingers` are a person's finger tables, thumb first; by default those of average size.
 
     Raises:
         UnknownNameError: any other side.

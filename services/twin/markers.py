@@ -78,11 +78,9 @@ class _Print:
 
 
 class Markers:
-    """The markers of a scene, drawn into images that show the scene without them.
+    """The markers of a task's objects, drawn into images that show the scene without them.
 
-    Args:
-        objects: of one task.
-        is_white: cells of every marker, row by row from its upper left, by its id.
+    `is_white` has the cells of every marker by its id, row by row from its upper left.
     """
 
     def __init__(

@@ -148,11 +148,9 @@ def _sensors(hand: TwinHand) -> str:
 
 
 def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
-    """MJCF of the scene: table, a shelf behind the viewer for removed objects, hands and objects.
+    """MJCF of table, shelf behind the viewer for removed objects, hands (left first) and objects.
 
-    Args:
-        hands: hands to simulate, left before right.
-        objects: MJCF bodies; geoms of class "object".
+    `objects` are MJCF bodies with geoms of class "object".
     """
     bodies = "".join(_hand(hand) for hand in hands)
     return (

@@ -41,10 +41,6 @@ mujoco.set_mju_user_warning(_log_warning)
 class ObjectBodies:
     """Access to poses and speeds of a task's objects in MuJoCo's arrays.
 
-    Args:
-        model: the compiled scene.
-        names: body names of the objects, in the order of poses.
-
     Raises:
         InvalidInputError: a name without a body, or a body that is neither free nor attached to a
             mocap body by hinges and slides.

@@ -114,11 +114,7 @@ USUAL: Final = Sizes()
 
 
 class Geometry:
-    """The usual geometry of a scene's objects, and changes of it.
-
-    Args:
-        scene: compiled, with its usual sizes.
-    """
+    """The usual geometry of a scene's objects, and changes of it."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -159,10 +155,8 @@ class Geometry:
     ) -> Float64[np.ndarray, "objects 7"]:
         """Poses with the lowest point of every resized object where it was before.
 
-        Args:
-            poses: planned for the usual sizes.
-            sizes: of the take.
-            boxes_m: [objects, 6] middle and half sizes of the usual boxes in the objects' frames.
+        Poses are planned for the usual sizes; `boxes_m` are middle and half sizes of the usual
+        boxes in the objects' frames.
         """
         placed = np.array(poses)
         up = transform_from_pose(placed)[:, 2, :3]

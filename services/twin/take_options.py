@@ -160,15 +160,7 @@ class PlayedActions:
 def episode_id(
     task: str, domain: Domain, seed: int, options: TakeOptions, *, played: str | None = None
 ) -> str:
-    """Descriptive id of an episode, unique for each combination of options.
-
-    Args:
-        task: name of the task.
-        domain: robot or human hands.
-        seed: seed of the scene.
-        options: options of the take.
-        played: name of the `PlayedActions`, if there are any.
-    """
+    """Descriptive id of an episode, unique for each combination of options and actions `played`."""
     parts = ["twin", task, domain, f"{seed:06d}"]
     parts += [f"n{round(options.noise_m * 1e6)}um"] * (options.noise_m > 0)
     parts += ["miss"] * options.miss

@@ -50,9 +50,6 @@ class TwinWorld:
     replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
     treated as commands. The physics has no noise, so the seed of a step has no effect.
 
-    Args:
-        settings: cameras and their image size.
-
     Raises:
         UnknownNameError: an unknown camera.
     """

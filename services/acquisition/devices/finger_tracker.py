@@ -193,9 +193,7 @@ class FingerTracker(Driver):
 class BridgeFingerTrackerDecoder(BridgeDecoder):
     """Keypoints (float32 [25, 3], m, wrist frame) of one hand behind a finger tracker's SDK.
 
-    Args:
-        side: which hand.
-        serial_number: of the glove; the bridge's only one of this side if None.
+    Without a serial number it is the bridge's only one of this side.
     """
 
     def __init__(self, side: Side, *, serial_number: str | None = None) -> None:

@@ -69,11 +69,9 @@ class PoseGate:
 
     Reachable means: at 5 m/s and 2000 °/s at most. The time in between is the device's, at least
     half a period for every packet, so that a step of its clock cannot shut the gate for good. A
-    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from
-    another one. A quaternion and its negative are the same rotation.
-
-    Args:
-        dropped: where packets that become no sample are counted, by the reason.
+    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from another
+    one. A quaternion and its negative are the same rotation. `dropped` counts packets that become
+    no sample, by the reason.
     """
 
     def __init__(self, dropped: dict[str, int]) -> None:
@@ -94,14 +92,7 @@ class PoseGate:
     def take(
         self, pose: Sequence[float], *, sequence: int, t_device_ns: int, t_host_ns: int
     ) -> Sample | None:
-        """The sample of a running tracker's pose; None where it jumps.
-
-        Args:
-            pose: x y z (m) qw qx qy qz (unit) in the world frame.
-            sequence: of the packet.
-            t_device_ns: when the pose was taken.
-            t_host_ns: when it arrived.
-        """
+        """The sample of a pose x y z (m) qw qx qy qz (unit) in the world; None where it jumps."""
         self._pass_time(t_device_ns)
         if self._last is not None and not self._is_reachable(self._last, pose):
             self._dropped["jumped"] += 1
@@ -157,11 +148,7 @@ class SenderFrame:
     With p_ours = M p_theirs for the world and for the body, R_ours = M R Mᵀ and t_ours = s M t.
     This holds for a left-handed sender too: both mirrors cancel in the rotation, whose axis is
     det(M) M times the sender's and whose angle is the same. M only renames axes and turns some
-    round, so numbers are picked and signed.
-
-    Args:
-        convention: says M.
-        scale_m: s, metres of the sender's unit.
+    round, so numbers are picked and signed. `scale_m` is s, metres of the sender's unit.
     """
 
     def __init__(self, convention: FrameConvention, scale_m: float) -> None:
@@ -295,11 +282,8 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
 
     Only the result RUNNING_OK makes a sample. The pose-valid flag never does: such sources keep it
     set while a lost tracker drifts. A running pose that is flagged invalid is dropped too, and a
-    matrix that is no pose is counted as `refused`.
-
-    Args:
-        stream: `wrist_left`, `wrist_right`, `head`, or the name of another place.
-        serial_number: of the tracker; the bridge's only one at this place if None.
+    matrix that is no pose is counted as `refused`. Without a serial number it is the bridge's only
+    device at this place.
     """
 
     def __init__(self, stream: str, *, serial_number: str | None = None) -> None:

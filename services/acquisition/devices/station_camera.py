@@ -164,9 +164,7 @@ class CaptureLink(HandleTransport[Handle]):
 class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
     """A camera by OpenCV's V4L2 backend.
 
-    Args:
-        find: gives the device, such as /dev/video0, at every opening.
-        request: size, rate, pixel format and exposure that it must give.
+    `find` gives the device, such as /dev/video0, at every opening.
     """
 
     def __init__(self, find: Callable[[], str], request: StationCameraSettings) -> None:
@@ -280,11 +278,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
 
 
 def find_camera(serial_number: str, folder: Path = BY_ID) -> str:
-    """The device of the camera with this serial number, whatever its name is today.
-
-    Args:
-        serial_number: as the kernel has it in the names of `folder`.
-        folder: where the kernel's links are.
+    """The device of the camera with this serial number, by the kernel's links in `folder`.
 
     Raises:
         DeviceError: no such camera is plugged in, or two are; the message lists those that are.
@@ -398,12 +392,8 @@ class StationCamera(Driver):
     `t_host_ns` of a sample is when its image was fetched, `t_device_ns` the middle of its exposure
     by the driver's stamp, on the same clock.
 
-    Args:
-        settings: name, size, rate, encoding and timing.
-        link: opens the camera.
-        clock: of the station.
-        max_encode_wait_s: how long a read waits for the encoder, so that an image need not wait
-            for the next one; half a period if None.
+    A read waits `max_encode_wait_s` for the encoder, half a period if None, so that an image need
+    not wait for the next one.
     """
 
     def __init__(

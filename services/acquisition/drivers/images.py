@@ -225,10 +225,7 @@ def laplacian_variance(gray: UInt8[np.ndarray, "h w"]) -> float:
 class ImageEncoder:
     """Encodes the images of one camera in their order; used by one thread.
 
-    Args:
-        encoding: `rgb8` leaves the image as it is.
-        size_px: height and width; even for `h264`.
-        rate_hz: nominal.
+    `rgb8` leaves images as they are; for `h264` height and width must be even.
 
     Raises:
         InvalidInputError: a size that H.264 cannot have.
@@ -245,11 +242,9 @@ class ImageEncoder:
             self._video = self._new_video()
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"], *, begins: bool) -> np.ndarray:
-        """The values of the image's sample: uint8 [h, w, 3], or bytes as a 0-d object array.
+        """The values of a sample: uint8 [h, w, 3] RGB, or bytes as a 0-d object array.
 
-        Args:
-            image: RGB.
-            begins: whether it must begin a group of pictures.
+        `begins` says that the image must begin a group of pictures.
         """
         if self.encoding == "rgb8":
             return image
@@ -268,10 +263,6 @@ class EncodingQueue:
     """Passes images to an encoder in a separate thread; what finds the queue full is dropped.
 
     `put` and `collect` belong to the reader thread, `begin_group` to any.
-
-    Args:
-        encoder: of the camera; used by the queue's thread alone.
-        name: of the stream, for the thread.
     """
 
     def __init__(self, encoder: ImageEncoder, *, name: str) -> None:
@@ -288,11 +279,7 @@ class EncodingQueue:
             self._is_group_wanted = True
 
     def put(self, image: Sample) -> bool:
-        """Queue an image, whose pixels must not change any more; False when it was dropped.
-
-        Args:
-            image: uint8 [h, w, 3], RGB, with the stamps of its sample.
-        """
+        """Queue an image, uint8 [h, w, 3] RGB, which must not change any more; False if dropped."""
         num_waiting = sum(not future.done() for future in self._waiting)
         if num_waiting >= MAX_WAITING_IMAGES:
             self.num_dropped += 1
@@ -366,11 +353,8 @@ class WholeGroups:
     """Gives the H.264 samples of a device that encodes itself in whole groups only.
 
     A group that lost an image is dropped as a whole: the store could not take the rest of it. The
-    images' own numbers tell what was lost before the device numbered its packets.
-
-    Args:
-        stream: for messages.
-        statistics: where dropped images are counted as refused.
+    images' own numbers tell what was lost before the device numbered its packets. Dropped images
+    are counted as refused.
     """
 
     def __init__(self, stream: str, statistics: DecoderStatistics) -> None:

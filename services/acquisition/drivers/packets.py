@@ -74,10 +74,7 @@ class SequenceCounter:
     ) -> None:
         """One packet came.
 
-        Args:
-            sequence: its number.
-            t_device_ns: its time, if the device has a clock.
-            is_restarted: the device's clock says that it started anew, so the number may be any.
+        `is_restarted`: its clock says that the device started anew, so that the number may be any.
         """
         statistics = self._statistics
         statistics.packets += 1
@@ -194,9 +191,7 @@ class FrameSearch(PortionedSearch[Found]):
     After an invalid frame the search continues one byte further, not after its claimed end, so that
     only the damaged frame is lost.
 
-    Args:
-        mark: the bytes that every frame begins with.
-        sequence_bits: of the sequence number; `_take` gives each to `self.sequence.count`.
+    `_take` gives each sequence number to `self.sequence.count`.
     """
 
     def __init__(self, mark: bytes, *, sequence_bits: int) -> None:
@@ -261,12 +256,8 @@ def encode_packet(magic: bytes, packet: Packet) -> bytes:
 class PacketDecoder(FrameSearch[Packet]):
     """Finds packets of our documented devices; late and repeated ones are counted and left out.
 
-    Args:
-        magic: of the kind whose sequence is counted.
-        min_payload: smallest payload of this kind in bytes.
-        max_payload: largest.
-        others: further kinds on the same link with their smallest and largest payloads; their
-            packets are returned too, but are not part of the sequence.
+    Packets of `others`, further kinds on the same link with their smallest and largest payloads in
+    bytes, are returned too, but are not part of the sequence.
     """
 
     def __init__(

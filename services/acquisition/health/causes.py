@@ -88,11 +88,7 @@ def find_causes(
 ) -> tuple[HealthCause, ...]:
     """Why the station is not well, widest and gravest cause first.
 
-    Args:
-        streams: with their findings.
-        devices: of the streams, with what they share.
-        findings: of the station itself.
-        cpu_ratio: share of the processors' time that was used in the last 10 s.
+    `cpu_ratio` is the share of the processors' time that was used in the last 10 s.
     """
     left = _Unexplained(streams)
     known = {device.device: device for device in devices}

@@ -71,13 +71,7 @@ class Rows(NamedTuple):
 
 
 class StreamMeter:
-    """Measures one stream from one row of the history to the next.
-
-    Args:
-        statistics: the present counts of its device's packets.
-        descriptor: of the stream.
-        capacity: of the buffer that the blocks come from, in samples.
-    """
+    """Measures one stream from one row of the history to the next."""
 
     def __init__(
         self,
@@ -182,12 +176,7 @@ class HealthHistory:
     def rows(
         self, streams: Sequence[str] = (), *, since_ns: int = 0, limit: int = NUM_ROWS
     ) -> Rows:
-        """The newest rows, oldest first.
-
-        Args:
-            streams: all of them if empty.
-            since_ns: earlier rows are left out.
-            limit: at most so many.
+        """The newest `limit` rows from `since_ns` on, oldest first; of all streams by default.
 
         Raises:
             UnknownNameError: no such stream.

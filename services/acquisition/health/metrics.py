@@ -122,13 +122,7 @@ class HealthCollector(Collector):
 
 
 class RecorderCollector(Collector):
-    """Shows the recorder's state, uploads of takes, and how much of the disk takes occupy.
-
-    Args:
-        status: of the recorder.
-        takes: number of saved takes by state of their upload.
-        retention: of the spool.
-    """
+    """Shows the recorder's state, uploads of takes, and how much of the disk takes occupy."""
 
     def __init__(
         self,

@@ -173,14 +173,7 @@ class HealthMonitor:
     New findings are evaluated again after 0.2 s, so that a fault is confirmed quickly. Silent
     streams are detected every 0.1 s for the event log, and immediately in every report.
 
-    Args:
-        supervisors: of the station's devices.
-        station: its name.
-        calibration: of the station.
-        clock: of the station.
-        paths: measured path delays, which are compared with the calibration.
-        follow: says of tracked hands whether the robot's can follow them.
-        simulated: whether the devices are mocks, of which nothing can be plugged or replaced.
+    `simulated` devices are mocks, of which nothing can be plugged or replaced.
 
     Attributes:
         queues: of each stream's samples, filled by the reader threads with what they have spooled.

@@ -31,12 +31,7 @@ LOCKSTEP_WAIT_S = 20.0
 
 
 class CameraSource(PacketSource):
-    """Packets of one camera.
-
-    Args:
-        stream: uint8 [n, h, w, 3].
-        encoding: of the images on the wire.
-    """
+    """Packets of one camera, of a stream uint8 [n, h, w, 3]."""
 
     def __init__(self, stream: ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
         self.t_ns = stream.t_ns
@@ -120,11 +115,7 @@ class MockCapture(CaptureLink[VideoPort]):
 
 
 class VideoSource(PacketSource):
-    """Images with the stamps of the kernel.
-
-    Args:
-        stream: uint8 [n, h, w, 3].
-    """
+    """Images, uint8 [n, h, w, 3], with the stamps of the kernel."""
 
     def __init__(self, stream: ReplayStream) -> None:
         self.t_ns = stream.t_ns
@@ -148,13 +139,7 @@ class VideoDevice(MockDevice):
 
 
 def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
-    """A mock camera that plays a stream of images, and its driver.
-
-    Args:
-        place: where it stands; its name is that of the stream.
-        settings: what the station knows of the camera besides its size and rate, such as its
-            `encoding`.
-    """
+    """A mock camera that plays a stream of images, and its driver with other settings."""
     port, descriptor = VideoPort(place.name), place.stream.descriptor
     known = {
         "stream": place.name,
@@ -172,10 +157,7 @@ def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
 
 
 class RobotStateSource(PacketSource):
-    """Packets of one robot.
-
-    Args:
-        streams: the six of `STREAM_SIZES`, all with the same times.
+    """Packets of one robot, of the six streams of `STREAM_SIZES`, all with the same times.
 
     Raises:
         InvalidInputError: one is missing, or their times differ.

@@ -188,12 +188,7 @@ def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:
 
 
 def render(pose: np.ndarray, rays: Float64[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Grey image of the board at a pose: rotation vector, then the place of its middle (m).
-
-    Args:
-        pose: [6] of the board in the camera.
-        rays: direction of every pixel.
-    """
+    """Grey image of a board at a pose [6] in the camera: rotation vector, its middle (m)."""
     R = rotation_from_vector(pose[:3])
     middle = np.array([(COLUMNS - 1) * SQUARE_M / 2, (ROWS - 1) * SQUARE_M / 2, 0.0])
     T_camera_board = transform(R, pose[3:] - R @ middle)

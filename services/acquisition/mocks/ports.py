@@ -82,11 +82,7 @@ class WatchedTransport(HandleTransport[Transport]):
     What a read returned counts as processed when the reader comes back for more: by then it has
     been stamped, decoded and recorded.
 
-    Args:
-        transport: the host's end.
-        link: of the mock.
-        on_open: called when the host has opened the device.
-        on_write: takes how many bytes the host has just written, in the host's thread.
+    `on_write` takes how many bytes the host has just written, in the host's thread.
     """
 
     def __init__(
@@ -131,13 +127,7 @@ class WatchedTransport(HandleTransport[Transport]):
 
 
 class MockPort(ABC):
-    """The device's end of a link.
-
-    Attributes:
-        link: how far the host is.
-        transport: the host's end.
-        has_bit_errors: whether no checksum below ours guards the line.
-    """
+    """The device's end of a link, with the host's end as `transport`."""
 
     has_bit_errors: ClassVar[bool] = False
     transport: Transport
@@ -161,9 +151,7 @@ class MockPort(ABC):
 class PtyPort(MockPort):
     """A serial device: a pseudo terminal with a new name at every plugging.
 
-    Args:
-        name: of the device; also its serial number.
-        answer: what the device says to the bytes that the host writes.
+    The name is also its serial number.
     """
 
     has_bit_errors = True
@@ -289,10 +277,6 @@ class HidPort(ReportPort):
 
     `read` gives [] when idle and OSError when unplugged; a ring keeps 63 reports and silently
     loses the newest; `write` counts one byte more than it was given.
-
-    Args:
-        name: of the device; also its serial number.
-        answer: what the device says to a report of the host.
     """
 
     max_reports = 63

@@ -160,11 +160,9 @@ class MockDevice:
     ) -> bool:
         """Play the whole source once; the ledger is that of the last play.
 
-        Args:
-            clock: a virtual one makes the device wait for the host after each packet.
-            waiter: of the calling thread.
-            start_host_ns: when the device's first take started; its clock counts from there.
-            offset_ns: from there to the start of this play.
+        Its clock counts from `start_host_ns`, when the device's first take started; this play
+        begins `offset_ns` later. With a virtual clock the device waits for the host after each
+        packet.
 
         Returns:
             False when the waiter was cancelled.

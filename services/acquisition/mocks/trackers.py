@@ -64,12 +64,7 @@ JUMP_M = (1.0, 0.0, 0.0)
 
 
 class BridgeSource(PacketSource):
-    """What one bridge process says.
-
-    Attributes:
-        magic: of its packets.
-        frame: its coordinates.
-    """
+    """What one bridge process says."""
 
     magic: bytes
     frame: FrameConvention
@@ -140,14 +135,7 @@ def bridged_pair(place: MockSlot, source: BridgeSource, decoder: BridgeDecoder) 
 
 
 class TrackedFingers(PacketSource):
-    """What a finger tracker sees of a hand: points with noise, and nodes that are hidden.
-
-    Args:
-        stream: [n, 25, 3] in m, wrist frame.
-        side: which hand.
-        rng: of the device's node order and of the noise.
-        faults: position noise, and when the thumb is not seen.
-    """
+    """What a finger tracker sees of a hand [n, 25, 3] (m, wrist frame): noise, hidden nodes."""
 
     def __init__(
         self,
@@ -254,12 +242,9 @@ def mock_finger_tracker(place: MockSlot) -> MockPair:
 
 
 class TrackedPoses(PacketSource):
-    """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
+    """What a tracker says of a body: poses [n, 7] with noise and tracking faults, and their truth.
 
-    Args:
-        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis; occlusions and jumps.
-        rng: of the noise.
+    Poses are float64 x y z (m) qw qx qy qz in the world frame; noise is per axis.
     """
 
     def __init__(
