@@ -12,8 +12,7 @@ from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.health import HealthCollector
-from services.acquisition.health.metrics import RecorderCollector
+from services.acquisition.health.metrics import HealthCollector, RecorderCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.recorder import Recorder
 from services.acquisition.retention import DeletedTakes, OperatorNames

@@ -22,15 +22,14 @@ from dextouch.schemas import (
 )
 from dextouch.serving import JSON, MSGPACK, RequireScope
 from dextouch.streams import MAX_STREAMS, pack
-from services.acquisition.health import (
+from services.acquisition.health.history import (
     NUM_ROWS,
-    PERIOD_NS,
-    DiskCheck,
     history_facts,
     json_history,
-    judge_uploads,
     packed_history,
 )
+from services.acquisition.health.monitor import PERIOD_NS
+from services.acquisition.health.station import DiskCheck, judge_uploads
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 

@@ -24,8 +24,10 @@ from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.follow_watch import FollowCounts, FollowWatch
 from services.acquisition.glove_record import is_ours
-from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.health.causes import SIMULATED_ADVICE
+from services.acquisition.health.cells import count_taxels
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.supervisor import StreamCounters
 
 # What the check of the take reports itself, by the code of the health finding behind it.

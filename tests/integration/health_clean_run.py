@@ -9,7 +9,7 @@ import numpy as np
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import DESCRIPTOR_REPORT
 from services.acquisition.devices.robot_state import STREAM_SIZES
-from services.acquisition.health import TICK_NS, HealthMonitor
+from services.acquisition.health.monitor import TICK_NS, HealthMonitor
 from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams

@@ -10,7 +10,8 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import HealthEvent, TakePrompt
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.station_camera import StationCamera
-from services.acquisition.health import STATION, DiskCheck
+from services.acquisition.health.monitor import STATION
+from services.acquisition.health.station import DiskCheck
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript, Ledger
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
