@@ -39,6 +39,7 @@ logger = structlog.get_logger(__name__)
 RECORDING_FILE: Final = "recording.json"
 UPLOADED_FILE: Final = "uploaded.json"
 REFUSED_FILE: Final = "refused.txt"
+UPLOAD_STATES: Final = ("waiting", "uploaded", "refused")
 # Below it, so that nothing takes an incompletely removed take for one.
 _REMOVED: Final = ".removed"
 DAY_S: Final = 86_400.0
@@ -79,20 +80,17 @@ class SpoolRetention:
 
     def use(self) -> dict[str, int]:
         """Bytes of the takes in the spool by state of their upload; a running one waits, too."""
-        num_bytes = {"waiting": 0, "uploaded": 0, "refused": 0}
+        num_bytes = dict.fromkeys(UPLOAD_STATES, 0)
         for path in spooled_takes(self._spool_root):
-            if acknowledgement(path) is not None:
-                num_bytes["uploaded"] += self._size(path)
-            else:
-                state = "refused" if (path / REFUSED_FILE).exists() else "waiting"
-                num_bytes[state] += folder_bytes(path)
+            state = upload_state(path)
+            num_bytes[state] += self._size(path) if state == "uploaded" else folder_bytes(path)
         return num_bytes
 
     def _acknowledged(self) -> list[tuple[float, Path]]:
         """Acknowledged takes with the time of that."""
         found = []
         for path in spooled_takes(self._spool_root):
-            if acknowledgement(path) is not None:
+            if upload_state(path) == "uploaded":
                 with suppress(FileNotFoundError):  # removed meanwhile
                     found.append(((path / UPLOADED_FILE).stat().st_mtime, path))
         return found
@@ -113,6 +111,13 @@ def acknowledgement(path: Path) -> RecordingStatus | None:
     except (ValidationError, FileNotFoundError):
         return None
     return note if note.state == "finished" else None
+
+
+def upload_state(path: Path) -> str:
+    """The one of `UPLOAD_STATES` of a take; a running one waits, too."""
+    if acknowledgement(path) is not None:
+        return "uploaded"
+    return "refused" if (path / REFUSED_FILE).exists() else "waiting"
 
 
 def spooled_takes(spool_root: Path) -> list[Path]:
@@ -193,14 +198,6 @@ class DeletedTakes:
             self._problem = error.message
         return removed
 
-    def remove_refused(self, path: Path) -> None:
-        """Remove a take whose upload the store refused since it was deleted.
-
-        Raises:
-            StorageError: it cannot be removed.
-        """
-        self._remove(path, "refused by the store as deleted")
-
     def _work_off(self, store: "EpisodeStoreClient", removed: list[str]) -> bool:
         """Remove all deleted takes; whether none of them is left to try again."""
         takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
@@ -276,22 +273,24 @@ class DeletedTakes:
         except StorageError:
             pass  # damaged, and deleted all the same
         try:
-            self._remove(path, "deleted in the store")
+            self.remove_take(path, "deleted in the store")
         except StorageError as error:
             logger.warning("fail_remove_deleted", recording_id=path.name, error=error.message)
             return False
         return True
 
-    def _remove(self, path: Path, why: str) -> None:
+    def remove_take(self, path: Path, why: str) -> None:
+        """Remove a take that was deleted in the store, and note it in `REMOVALS_FILE`.
+
+        Raises:
+            StorageError: it cannot be removed.
+        """
         remove_take(path)
         logger.warning("remove_deleted_take", recording_id=path.name, reason=why)
         line = {"at": datetime.now(UTC).isoformat(), "recording_id": path.name, "reason": why}
-        with disk_errors(f"write {REMOVALS_FILE}"), self._removals.open("a") as file:
+        removals = self._spool_root / REMOVALS_FILE
+        with disk_errors(f"write {REMOVALS_FILE}"), removals.open("a") as file:
             file.write(json.dumps(line) + "\n")
-
-    @property
-    def _removals(self) -> Path:
-        return self._spool_root / REMOVALS_FILE
 
     def _spooled(self) -> Iterator[tuple[str, SpooledTake]]:
         """All takes of the spool, with the station that recorded each."""

@@ -13,16 +13,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Noise,
-    Poses,
-    flat,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Noise, Poses, flat, is_left, one_handed, yawed
 
 # The cabinet's frame: on the table below the middle of its front; the drawer opens along -y.
 _CABINET_HALF_M: Final = (0.085, 0.060, 0.042)
@@ -155,7 +146,7 @@ class OpenDrawer:
             (3.8, hand((-_PULL_M + _UNLOAD_M, 0.06), put)),
             (4.7, moved(away, away_m + _BESIDE_M)),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Open by 6 cm or more, at rest, untouched."""

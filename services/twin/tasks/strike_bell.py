@@ -12,16 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Noise,
-    Poses,
-    flat,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Noise, Poses, flat, is_left, one_handed, yawed
 
 # The bell's frame: on the table below the plunger, y away from the viewer. Top of the plunger,
 # its travel and the part of it after which its arm meets the flag's crank.
@@ -165,7 +156,7 @@ class StrikeBell:
             (3.2, moved(hand(_ABOVE_M, aim), away_m + _AWAY_M)),
             (4.8, moved(hand(_ABOVE_M, aim), 1.1 * (away_m + _AWAY_M))),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """The flag thrown over, the plunger up again, all at rest and untouched."""

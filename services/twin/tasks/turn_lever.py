@@ -17,8 +17,8 @@ from services.twin.tasks.task import (
     Noise,
     Poses,
     is_left,
+    one_handed,
     with_palm,
-    with_right_hand,
     yawed,
 )
 
@@ -124,7 +124,7 @@ class TurnLever:
             (4.1, hand(_PUSH_RAD, _AWAY_M, 0.08, put)),
             (4.8, moved(hand(_PUSH_RAD, _AWAY_M + 0.08, 0.08, put), away_m)),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Turned by 60° or more, at rest, untouched."""

@@ -295,7 +295,7 @@ def test_takes_whose_folder_is_removed_by_hand_are_left_out(refusing, tmp_path, 
     assert (list(refusing.refused), listed(refusing)) == (["c"], ["c"])
     # Removed while the list is being made.
     paths = [tmp_path / "b", tmp_path / "c"]
-    monkeypatch.setattr(uploader_module, "_spools", lambda _: iter(paths))
+    monkeypatch.setattr(uploader_module, "spooled_takes", lambda _: iter(paths))
     assert [status.recording_id for status in refusing.status()] == ["c"]
 
 
