@@ -10,19 +10,13 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
+from services.dashboard import routes
 from services.dashboard.audit import AuditLog, AuditTrail
 from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
 from services.dashboard.fleet import Fleet
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
-from services.dashboard.routes import (
-    api_router,
-    comparison_router,
-    forwarding_router,
-    live_router,
-    system_router,
-)
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.system import System
 from services.dashboard.upstream import Upstream, upstream_histogram
@@ -63,11 +57,11 @@ def create_app(
         settings=settings,
         routers=[
             page_router(settings, sessions),
-            api_router(settings, fleet, sessions),
-            forwarding_router(fleet, sessions),
-            comparison_router(comparisons, sessions),
-            system_router(system, audit_log, sessions, upstreams.get("episode_store")),
-            live_router(
+            routes.api_router(settings, fleet, sessions),
+            routes.forwarding_router(fleet, sessions),
+            routes.comparison_router(comparisons, sessions),
+            routes.system_router(system, audit_log, sessions, upstreams.get("episode_store")),
+            routes.live_router(
                 fleet,
                 [
                     comparisons.topics.get,

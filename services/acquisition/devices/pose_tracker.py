@@ -24,16 +24,9 @@ from services.acquisition.devices.kinds import (
     TrackerSettings,
     tracker_transport,
 )
+from services.acquisition.drivers import sdk_link
 from services.acquisition.drivers.base import Driver, ReportDecoder, check_packet
 from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
-from services.acquisition.drivers.sdk_link import (
-    DROPPED,
-    BridgedDevice,
-    BridgeDecoder,
-    BridgeDriver,
-    BridgeHello,
-    FrameConvention,
-)
 
 NOMINAL_RATE_HZ = 100.0
 NORM_TOLERANCE = 1e-3
@@ -151,7 +144,7 @@ class SenderFrame:
     round, so numbers are picked and signed. `scale_m` is s, metres of the sender's unit.
     """
 
-    def __init__(self, convention: FrameConvention, scale_m: float) -> None:
+    def __init__(self, convention: sdk_link.FrameConvention, scale_m: float) -> None:
         M = convention.ours_from_theirs()
         # Which of the sender's axes is our x, y, z, and what it is multiplied by.
         self._places = np.abs(M).argmax(axis=1).tolist()
@@ -232,7 +225,7 @@ class PoseTrackerDecoder(ReportDecoder):
     def __init__(self, stream: str) -> None:
         packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
         super().__init__(pose_descriptor(stream), packets)
-        self.tracking = dict.fromkeys(DROPPED, 0)
+        self.tracking = dict.fromkeys(sdk_link.DROPPED, 0)
         self._gate = PoseGate(self.tracking)
         self._device = f"pose_tracker_{stream}"
         self._source = source_of(stream)
@@ -277,7 +270,7 @@ class TrackingResult(IntEnum):
     FALLBACK_ROTATION_ONLY = 300
 
 
-class BridgePoseTrackerDecoder(BridgeDecoder):
+class BridgePoseTrackerDecoder(sdk_link.BridgeDecoder):
     """Poses [x y z qw qx qy qz] (m, world frame) of one device of an OpenVR-like source.
 
     Only the result RUNNING_OK makes a sample. The pose-valid flag never does: such sources keep it
@@ -305,7 +298,7 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
         super().reset()
         self._gate.reset()
 
-    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
+    def _learn(self, hello: sdk_link.BridgeHello, chosen: sdk_link.BridgedDevice) -> None:
         self._index, self._frame = chosen.index, SenderFrame(hello.frame, hello.scale_m())
 
     def _new_sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
@@ -360,7 +353,7 @@ def build(settings: PoseTrackerSettings, clock: StationClock) -> Driver:
     transport = tracker_transport(settings)
     if settings.link == "bridge":
         bridged = BridgePoseTrackerDecoder(settings.stream, serial_number=settings.serial_number)
-        return BridgeDriver(name, transport=transport, decoder=bridged, clock=clock)
+        return sdk_link.BridgeDriver(name, transport=transport, decoder=bridged, clock=clock)
     decoder = PoseTrackerDecoder(settings.stream)
     return Driver(name, transport=transport, decoder=decoder, clock=clock)
 

@@ -15,16 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from dextouch.episodes import (
-    FULL_FORM,
-    GOP_IMAGES,
-    GopEncoder,
-    VideoSettings,
-    check_video_size,
-    decoder_of_this_thread,
-    first_gap,
-    is_keyframe,
-)
+from dextouch import episodes
 from dextouch.errors import CorruptDataError, DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.streams import Sample, encoded_values
@@ -237,7 +228,7 @@ class ImageEncoder:
         self.encoding: ImageEncoding = encoding
         self._size_px, self._rate_hz = size_px, rate_hz
         if encoding == "h264":
-            check_video_size(*size_px)
+            episodes.check_video_size(*size_px)
             # Now, since it takes longer than the first images would wait.
             self._video = self._new_video()
 
@@ -255,8 +246,10 @@ class ImageEncoder:
             self._video = self._new_video()
         return encoded_values([self._video.encode(image)]).reshape(())
 
-    def _new_video(self) -> GopEncoder:
-        return GopEncoder(*self._size_px, rate_hz=self._rate_hz, settings=VideoSettings())
+    def _new_video(self) -> episodes.GopEncoder:
+        return episodes.GopEncoder(
+            *self._size_px, rate_hz=self._rate_hz, settings=episodes.VideoSettings()
+        )
 
 
 class EncodingQueue:
@@ -326,9 +319,9 @@ class GroupPreview:
 
     def add(self, access_unit: bytes) -> None:
         """The next image."""
-        if is_keyframe(access_unit):
+        if episodes.is_keyframe(access_unit):
             self._group = (access_unit,)
-        elif 0 < len(self._group) < GOP_IMAGES:
+        elif 0 < len(self._group) < episodes.GOP_IMAGES:
             self._group = (*self._group, access_unit)
         else:
             self._group = ()
@@ -344,8 +337,8 @@ class GroupPreview:
         if not group:
             raise NotFoundError("H.264 preview: no key frame has come yet; ask again in a moment")
         pixels = np.empty((1, *self._size_px, 3), dtype=np.uint8)
-        decoder = decoder_of_this_thread(*self._size_px)
-        decoder.decode(group, [len(group) - 1], FULL_FORM, pixels)
+        decoder = episodes.decoder_of_this_thread(*self._size_px)
+        decoder.decode(group, [len(group) - 1], episodes.FULL_FORM, pixels)
         return pixels[0]
 
 
@@ -371,7 +364,7 @@ class WholeGroups:
         Raises:
             DeviceError: the device's groups have another length.
         """
-        begins = is_keyframe(sample.values.item())
+        begins = episodes.is_keyframe(sample.values.item())
         follows = _follow(self._group, sample)
         # Nothing is missing in either case: the device means its groups to be so long.
         is_too_short = begins and follows and self._is_meant_short()
@@ -385,16 +378,16 @@ class WholeGroups:
         if is_too_short or is_too_long:
             self._statistics.refused += 1
             raise DeviceError(
-                f"{self._stream}: its H.264 groups have another length than {GOP_IMAGES} images; "
-                "set the bridge's encoder, or let it send JPEG images"
+                f"{self._stream}: its H.264 groups have another length than "
+                f"{episodes.GOP_IMAGES} images; set the bridge's encoder, or send JPEG images"
             )
         if not (begins or follows):
             self._statistics.refused += 1
             return []
         self._group.append(sample)
-        if len(self._group) < GOP_IMAGES:
+        if len(self._group) < episodes.GOP_IMAGES:
             return []
-        self._last_length = GOP_IMAGES
+        self._last_length = episodes.GOP_IMAGES
         self._complete, self._group = self._group, []
         return self._complete
 
@@ -421,7 +414,7 @@ def _follow(samples: list[Sample], sample: Sample) -> bool:
 def _is_complete(samples: list[Sample]) -> bool:
     """Whether no picture is missing between these, by their own numbers."""
     try:
-        return first_gap([one.values.item() for one in samples]) is None
+        return episodes.first_gap([one.values.item() for one in samples]) is None
     except CorruptDataError:
         return False
 
