@@ -6,6 +6,7 @@ A new panel is a topic here with the function that fetches it, a section in
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -151,18 +152,16 @@ class TakesView(FrozenModel):
     note: str = ""
 
 
+@dataclass(eq=False)
 class Topic:
     """A topic: its newest messages, fetched at most once a period for all of its viewers."""
 
-    def __init__(
-        self, name: str, period_s: float, fetch: Callable[[], Awaitable[list[Message]]]
-    ) -> None:
-        self.name = name
-        self.period_s = period_s
-        self._fetch = fetch
-        self._messages: list[Message] = []
-        self._due_s = float("-inf")
-        self._fetching = asyncio.Lock()
+    name: str
+    period_s: float
+    fetch: Callable[[], Awaitable[list[Message]]]
+    _messages: list[Message] = field(default_factory=list)
+    _due_s: float = float("-inf")
+    _fetching: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @classmethod
     def of_json(cls, name: str, period_s: float, read: Callable[[], Awaitable[object]]) -> "Topic":
@@ -179,7 +178,7 @@ class Topic:
         async with self._fetching:
             if (started_s := now_s()) >= self._due_s:
                 try:
-                    messages = await self._fetch()
+                    messages = await self.fetch()
                     if messages != self._messages:
                         self._messages = messages
                 except Exception:
