@@ -22,8 +22,8 @@ from dextouch.schemas import (
     matrix_rows,
 )
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
+from services.twin.scene import object_boxes_m
 from services.twin.settings import TwinSettings
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage
 
 SIDES_PX: Final = (64, 320, 480)

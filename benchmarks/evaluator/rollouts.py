@@ -28,8 +28,8 @@ from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.success_classifier import DECISION_THRESHOLD
+from services.twin.scene import object_boxes_m
 from services.twin.scripted_actions import Actions
-from services.twin.sizes import object_boxes_m
 from services.twin.world import TwinWorld
 
 # Digests that each kind of row depends on, in addition to task, seed and policy.

@@ -23,9 +23,9 @@ from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
 from services.twin.episodes import GridLog
 from services.twin.names import CAMERAS
+from services.twin.scene import Sizes
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TACTILE
-from services.twin.sizes import Sizes
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
 

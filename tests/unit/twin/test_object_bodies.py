@@ -9,9 +9,8 @@ from dextouch.hands.actions import actions_from_poses, poses_from_actions
 from services.twin.cameras import HEAD_HOME
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TakeOptions, record
-from services.twin.scene import compile_scene
+from services.twin.scene import compile_scene, object_boxes_m
 from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Command, Simulation
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import _displaced, command_row
 from services.twin.tasks.task import relaxed
 
