@@ -198,9 +198,7 @@ class HostWatch:
 
     Neither touches the stamps: the station's clock counts on through sleep and nobody sets it. But
     both explain things (a gap in all streams; a `started_at` that does not fit), so they are told.
-
-    Attributes:
-        events: by name, when each was noticed on the station's clock and how long it was, in ns.
+    `events` are, by name, when each was noticed on the station's clock and how long it was, in ns.
     """
 
     def __init__(self, clock: StationClock) -> None:

@@ -91,12 +91,9 @@ class DeviceSupervisor:
 
     The driver is used by the supervisor's thread alone, in which `sink` gets new readings.
 
-    Attributes:
-        connected: whether the device is open.
-        reconnects: how often it was lost after it was open.
-        last_error: why it was lost, or could not be opened; None while it is open.
-        streams: counters of each of its streams.
-        shares: what it shares with other devices, where it was opened last.
+    `reconnects` says how often it was lost after it was open, `last_error` why, or why it could not
+    be opened (None while it is open), `shares` what it shared with other devices where it was
+    opened last.
     """
 
     def __init__(self, driver: Driver, *, sink: Sink, clock: StationClock) -> None:

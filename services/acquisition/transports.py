@@ -60,11 +60,9 @@ class TransportInfo:
 class HandleTransport(ABC, Generic[Handle]):
     """Way to one device, over what a library opens: a port, a device, a socket, a camera.
 
-    Every failure of the link is a DeviceError; an OSError of the library is one.
-
-    Attributes:
-        arrived_ns: when what the last `read` gave arrived, by the station's clock; None where that
-            is when `read` returned.
+    Every failure of the link is a DeviceError; an OSError of the library is one. `arrived_ns` is
+    when what the last `read` gave arrived, by the station's clock; None where that is when `read`
+    returned.
     """
 
     # What to look at where it cannot be opened.

@@ -100,14 +100,9 @@ class AuditEntry(FrozenModel):
 class AuditPage(FrozenModel):
     """The newest entries, newest first.
 
-    Attributes:
-        has_more: whether older entries match, too.
-        actions: all that there are.
-        people: whose entries were read on the way.
-        folder: where the log is kept; None if only in memory, until the dashboard ends.
-        num_damaged: unreadable lines among those that were read.
-        num_lost: entries that could not be written since the dashboard started.
-        no_used_tokens: why the entries of enrolled stations are missing; empty if they are not.
+    `people` are those whose entries were read on the way, `folder` is None for a log in memory
+    alone, `num_damaged` counts unreadable lines among those read, `num_lost` entries that could not
+    be written since the start; `no_used_tokens` says why entries of enrolled stations are missing.
     """
 
     entries: tuple[AuditEntry, ...]

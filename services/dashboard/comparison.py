@@ -49,12 +49,9 @@ class ChunkUncertainty(FrozenModel):
 class ComparisonView(FrozenModel):
     """State of a comparison; the errors are of steps 0, 1, 2, …, which are all computed so far.
 
-    Attributes:
-        pixel_error: mean absolute difference of the head images, 0 … 255.
-        pressure_error_kpa: mean absolute difference of the taxels of both hands.
-        contact_f1: of the taxels in contact; 1 where neither world has contact.
-        in_contact: whether either world has a taxel in contact.
-        real_success: of the twin at the newest step.
+    `pixel_error` is the mean absolute difference of the head images, 0 … 255, `pressure_error_kpa`
+    that of the taxels of both hands; `contact_f1` of the taxels in contact is 1 where neither world
+    has any.
     """
 
     id: str = ""

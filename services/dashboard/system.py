@@ -49,11 +49,8 @@ Metrics = Mapping[str, Mapping[str, float]]
 class ServiceStatus(FrozenModel):
     """A service at its last probe; what it did not say is None.
 
-    Attributes:
-        state: `waiting` for what `waiting_for` names, `down` for the reason `problem`.
-        latency_s: time of the request for its liveness.
-        cpu_ratio: of one processor, since the probe before.
-        shares_process: whether other services run in the same process, with the same figures.
+    `latency_s` is the time of the request for its liveness, `cpu_ratio` of one processor since the
+    probe before. Services that share a process have its figures.
     """
 
     name: str

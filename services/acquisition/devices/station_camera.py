@@ -132,8 +132,7 @@ class CapturedImage:
 class CaptureLink(HandleTransport[Handle]):
     """Base of transports to a camera, which gives images instead of bytes.
 
-    Attributes:
-        exposure_ns: what the opened camera states; None where it does not.
+    `exposure_ns` is what the opened camera states; None where it does not.
     """
 
     advice = "is it plugged in, is it in use, may this user read it?"

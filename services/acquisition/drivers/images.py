@@ -46,18 +46,11 @@ MAX_WAITING_IMAGES = 8
 class ImageQuality:
     """Quality of the newest images of one camera, and counters since the start.
 
-    Attributes:
-        frozen: more than three images in a row were equal, or over 40 % equal the one before.
-        blurred: sharpness below 0.3 of the session's median.
-        clipped_ratio: share of pixels at the dark or the bright end, 0 … 1.
-        gap: at least one image is missing in the driver's timestamps within the last second.
-        num_checked: images whose sharpness and exposure were checked.
-        num_images: all images seen.
-        num_frozen: images that were equal to at least three before them, or repeated regularly.
-        num_blurred: of the checked ones.
-        num_clipped: of the checked ones, those with more than 20 % clipped pixels.
-        num_gaps: gaps of the driver's stamps.
-        num_dropped: images that found the encoder's queue full.
+    `frozen`: more than three images in a row were equal, or over 40 % equal the one before;
+    `blurred`: sharpness is below 0.3 of the session's median; `clipped_ratio`: pixels at the dark
+    or the bright end; `gap`: an image is missing in the driver's timestamps within the last second.
+    Sharpness and exposure are those of the checked images; dropped ones found the encoder's queue
+    full.
     """
 
     frozen: bool = False

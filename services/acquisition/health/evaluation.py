@@ -109,14 +109,9 @@ class Finding(NamedTuple):
 class Evaluation:
     """One evaluation of a stream or of the station, to which each of its checks adds.
 
-    Attributes:
-        now_ns: time on the station's clock.
-        block: samples since the last evaluation; none of the station itself.
-        findings: what is wrong.
-        figures: numbers by metric name.
-        taxels: which taxels of a glove are out of order, in anatomical order, by their state.
-        suspicious: asks for another evaluation before the regular one, for faults that must last a
-            while before they count.
+    `block` has none of the station itself, `figures` are numbers by metric name, `taxels` those of
+    a glove that are out of order, in anatomical order, by state. `suspicious` requests another
+    evaluation before the regular one, for faults that must last a while before they count.
     """
 
     now_ns: int

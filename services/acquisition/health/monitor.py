@@ -165,12 +165,9 @@ class HealthMonitor:
     New findings are evaluated again after 0.2 s, so that a fault is confirmed quickly. Silent
     streams are detected every 0.1 s for the event log, and immediately in every report.
 
-    `simulated` devices are mocks, of which nothing can be plugged or replaced.
-
-    Attributes:
-        queues: of each stream's samples, filled by the reader threads with what they have spooled.
-        history: a row of each regular evaluation.
-        nominal_rates_hz: of the streams.
+    `simulated` devices are mocks, of which nothing can be plugged or replaced. `queues` are filled
+    by the reader threads with what they have spooled; `history` has a row of each regular
+    evaluation.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first by name

@@ -71,9 +71,7 @@ class ReplayStream:
 class PacketSource(ABC):
     """What one device says: packets made from replay streams.
 
-    Attributes:
-        t_ns: when each sample is taken.
-        edits: faults inside its packets; by default those of our documented devices.
+    `t_ns` is when each sample is taken; `edits` are by default those of our documented devices.
     """
 
     t_ns: Int64[np.ndarray, " n"]
