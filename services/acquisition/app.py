@@ -40,7 +40,6 @@ def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
 
 
 def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> "MockStation":
-    """A station whose mock devices play an episode, or a pattern."""
     from services.acquisition.mock_station import MockStation
     from services.acquisition.mocks.faults import FaultScript
     from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams

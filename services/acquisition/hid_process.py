@@ -87,7 +87,6 @@ class _Reader:
         return self._process.pid
 
     def await_start(self) -> None:
-        """Wait for the first record, which says that the device is open."""
         end_s = time.monotonic() + START_TIMEOUT_S
         while self.take()[0] is None:
             if time.monotonic() > end_s:

@@ -109,7 +109,8 @@ class Recorder:
         """Where it stands."""
         with self._lock:
             self._settle()
-            take = self.take
+            take, check = self.take, self._check
+            problems = [problem.message for problem in check.problems] if check else []
             return RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
@@ -119,8 +120,8 @@ class Recorder:
                 num_samples={n: c.num_samples for n, c in take.watch.streams.items()}
                 if take
                 else {},
-                problems=self._problems(),
-                check=self._check,
+                problems=(*(take.problems() if take else ()), *problems),
+                check=check,
                 session=self._session.now,
             )
 
@@ -261,7 +262,6 @@ class Recorder:
             self._note_end(self.take)
 
     def _note_end(self, take: Take) -> None:
-        """Tell the history of the station's health when the take ended."""
         if self._health is not None:
             stop_ns = take.watch.started_ns + round(take.watch.duration_s * 1e9)
             self._health.history.end_take(take.spool.attributes.recording_id, stop_ns)
@@ -331,11 +331,6 @@ class Recorder:
 
     def _recording_id(self) -> str | None:
         return self.take.spool.attributes.recording_id if self.take else None
-
-    def _problems(self) -> tuple[str, ...]:
-        own = self.take.problems() if self.take else ()
-        found = self._check.problems if self._check else ()
-        return (*own, *(problem.message for problem in found))
 
 
 class SessionCount:

@@ -17,18 +17,10 @@ from typing import TYPE_CHECKING, Final
 import structlog
 from pydantic import ValidationError
 
+from dextouch import schemas
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import LOG_FILE, SpoolReader
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError, StorageError
-from dextouch.schemas import (
-    MAX_CHECKED_TAKES,
-    CheckTakes,
-    ConfirmRemoval,
-    PendingDeletion,
-    RecordingAttributes,
-    RecordingStatus,
-    SpooledTake,
-)
 from services.acquisition.settings import Retention
 
 if TYPE_CHECKING:
@@ -87,7 +79,6 @@ class SpoolRetention:
         return num_bytes
 
     def _acknowledged(self) -> list[tuple[float, Path]]:
-        """Acknowledged takes with the time of that."""
         found = []
         for path in spooled_takes(self._spool_root):
             if upload_state(path) == "uploaded":
@@ -101,13 +92,13 @@ class SpoolRetention:
         return self._sizes[path.name]
 
 
-def acknowledgement(path: Path) -> RecordingStatus | None:
+def acknowledgement(path: Path) -> schemas.RecordingStatus | None:
     """What the store answered when it had all of a take; None where it has not, as far as known.
 
     A note that is damaged or says otherwise does not count: the take is sent again.
     """
     try:
-        note = RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
+        note = schemas.RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
     except (ValidationError, FileNotFoundError):
         return None
     return note if note.state == "finished" else None
@@ -170,7 +161,7 @@ class DeletedTakes:
         spool_root: Path,
         station: str,
         *,
-        stored_as: Callable[[Path, RecordingAttributes | None], Sequence[str]],
+        stored_as: Callable[[Path, schemas.RecordingAttributes | None], Sequence[str]],
         operators: OperatorNames,
     ) -> None:
         self._spool_root, self._station = spool_root, station
@@ -200,7 +191,7 @@ class DeletedTakes:
 
     def _work_off(self, store: "EpisodeStoreClient", removed: list[str]) -> bool:
         """Remove all deleted takes; whether none of them is left to try again."""
-        takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
+        takes: defaultdict[str, list[schemas.SpooledTake]] = defaultdict(list, {self._station: []})
         for station, take in self._spooled():
             takes[station].append(take)
         confirmed, unknown = [], []
@@ -218,8 +209,10 @@ class DeletedTakes:
                 if take.is_damaged and take.recording_id not in gone
             ]
             confirmed.append(
-                ConfirmRemoval(
-                    station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+                schemas.ConfirmRemoval(
+                    station=station,
+                    revision=revision,
+                    held=tuple(held[: schemas.MAX_CHECKED_TAKES]),
                 )
             )
         if unknown:
@@ -240,17 +233,17 @@ class DeletedTakes:
         self,
         store: "EpisodeStoreClient",
         station: str,
-        spooled: Sequence[SpooledTake],
+        spooled: Sequence[schemas.SpooledTake],
         removed: list[str],
-    ) -> tuple[list[PendingDeletion], str]:
+    ) -> tuple[list[schemas.PendingDeletion], str]:
         """Remove the deleted takes of a station; those that are held, and the first revision."""
         operators = tuple(self._operators.known())
-        held: list[PendingDeletion] = []
+        held: list[schemas.PendingDeletion] = []
         first_revision: str | None = None
-        for start in range(0, max(1, len(spooled)), MAX_CHECKED_TAKES):
-            part = tuple(spooled[start : start + MAX_CHECKED_TAKES])
+        for start in range(0, max(1, len(spooled)), schemas.MAX_CHECKED_TAKES):
+            part = tuple(spooled[start : start + schemas.MAX_CHECKED_TAKES])
             checked = store.check_takes(
-                CheckTakes(station=station, takes=part, operators=operators)
+                schemas.CheckTakes(station=station, takes=part, operators=operators)
             )
             # A deletion in between makes the confirmation of an earlier revision fail.
             first_revision = first_revision or checked.revision
@@ -292,7 +285,7 @@ class DeletedTakes:
         with disk_errors(f"write {REMOVALS_FILE}"), removals.open("a") as file:
             file.write(json.dumps(line) + "\n")
 
-    def _spooled(self) -> Iterator[tuple[str, SpooledTake]]:
+    def _spooled(self) -> Iterator[tuple[str, schemas.SpooledTake]]:
         """All takes of the spool, with the station that recorded each."""
         for path in spooled_takes(self._spool_root):
             try:
@@ -301,10 +294,12 @@ class DeletedTakes:
                 continue
             except StorageError:
                 ids = tuple(self._stored_as(path, None))
-                damaged = SpooledTake(recording_id=path.name, stored_as=ids, is_damaged=True)
+                damaged = schemas.SpooledTake(
+                    recording_id=path.name, stored_as=ids, is_damaged=True
+                )
                 yield self._station, damaged
                 continue
-            take = SpooledTake(
+            take = schemas.SpooledTake(
                 recording_id=path.name,
                 stored_as=tuple(self._stored_as(path, about)),
                 operator=about.operator,

@@ -74,7 +74,8 @@ def root_cause(
         return None
     worst = min(problems, key=_rank)
     for cause in causes:
-        if worst.stream in cause.streams and _explains(cause, worst):
+        codes = [IN_THE_CHECK.get(code, (code,)) for code in cause.findings]
+        if worst.stream in cause.streams and any(worst.code in explained for explained in codes):
             return TakeCause(message=cause.message, advice=cause.advice)
     alike = {p.stream for p in problems if (p.code, p.level) == (worst.code, worst.level)}
     others = len(alike) - 1
@@ -96,10 +97,6 @@ def incomplete_cause(check: TakeCheck) -> str:
 def _rank(problem: TakeProblem) -> tuple[bool, int]:
     known = problem.code in _ORDER
     return problem.level != "ERROR", _ORDER.index(problem.code) if known else len(_ORDER)
-
-
-def _explains(cause: HealthCause, problem: TakeProblem) -> bool:
-    return any(problem.code in IN_THE_CHECK.get(code, (code,)) for code in cause.findings)
 
 
 @dataclass(frozen=True)

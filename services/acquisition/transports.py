@@ -447,27 +447,17 @@ class UsbTransport(HandleTransport[_Opened]):
         import usb.core
         import usb.util
 
-        candidates = list(
-            usb.core.find(
-                find_all=True,
-                backend=self._context,
-                idVendor=self._address.vendor_id,
-                idProduct=self._address.product_id,
-            )
-        )
+        ids = {"idVendor": self._address.vendor_id, "idProduct": self._address.product_id}
+        found = usb.core.find(find_all=True, backend=self._context, **ids)
+        candidates = [(device, _serial_number(device)) for device in found]
         wanted = self._address.serial_number
-        numbers = [_serial_number(device) for device in candidates]
-        matching = [
-            device
-            for device, number in zip(candidates, numbers, strict=True)
-            if wanted is None or number == wanted
-        ]
-        for device in candidates:
-            if len(matching) != 1 or device is not matching[0]:
+        matching = [device for device, number in candidates if wanted in {None, number}]
+        for device, _ in candidates:
+            if matching != [device]:
                 usb.util.dispose_resources(device)
         if len(matching) == 1:
             return matching[0]
-        present = ", ".join(number or "(unreadable)" for number in numbers) or "none"
+        present = ", ".join(number or "(unreadable)" for _, number in candidates) or "none"
         if matching:
             raise DeviceError(
                 f"{self.info}: {len(matching)} devices match; set serial_number to one of: "

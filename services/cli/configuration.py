@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, SecretStr, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 from pydantic_settings import EnvSettingsSource, SettingsError
 
@@ -182,16 +181,15 @@ def _defaults(
     """Defaults of all settings, also of nested ones."""
     for name, field in kind.model_fields.items():
         keys = (*above, field.alias or name)
-        value = _default(field) if given is None else getattr(given, name)
+        value = field.get_default(call_default_factory=True, validated_data={})
+        if given is not None:
+            value = getattr(given, name)
+        elif value is PydanticUndefined:
+            value = REQUIRED
         if isinstance(value, BaseModel):
             yield from _defaults(type(value), value, keys)
         else:
             yield keys, to_jsonable_python(value, fallback=str)
-
-
-def _default(field: FieldInfo) -> object:
-    value = field.get_default(call_default_factory=True, validated_data={})
-    return REQUIRED if value is PydanticUndefined else value
 
 
 def _place(kind: type[BaseModel], keys: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:

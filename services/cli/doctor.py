@@ -288,7 +288,6 @@ def _optional(name: str, purpose: str) -> Finding:
 
 
 def _package(name: str, purpose: str) -> Finding:
-    """Whether a package is installed, and its version."""
     what = f"{name} ({purpose})"
     if importlib.util.find_spec(name) is None:
         return Finding(what, "no", ok=False, do=install_hint(name))

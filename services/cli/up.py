@@ -265,7 +265,6 @@ def held_data_folder(folder: Path) -> Iterator[Callable[[str], None]]:
 
 
 def _tell(descriptor: int, dashboard_url: str) -> None:
-    """Write who holds the lock."""
     text = f"process {os.getpid()}, dashboard at {dashboard_url}"
     with disk_errors("write the lock of the data folder"):
         os.ftruncate(descriptor, 0)

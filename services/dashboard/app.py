@@ -87,7 +87,6 @@ def create_app(
 def _clients(
     settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None
 ) -> tuple[Mapping[str, Upstream], dict[str, Upstream]]:
-    """Clients of the services, and of the stations by name."""
     if upstreams is not None:
         station = upstreams.get("acquisition")
         return upstreams, {} if station is None else {settings.station: station}

@@ -150,7 +150,11 @@ class RotatedLines:
         finally:
             os.close(descriptor)
         if is_new and self._sync:
-            _sync_folder(self._folder)
+            descriptor = os.open(self._folder, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{self._name}-{number:09}.jsonl"
@@ -254,14 +258,6 @@ def _prepare(folder: Path) -> None:
         )
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 class AuditTrail:
     """Middleware that writes an entry before the response to a request begins."""
 
@@ -276,7 +272,9 @@ class AuditTrail:
             return
         body = bytearray()
         written = False
-        person = self._person(scope)
+        person = OPEN_ACCESS
+        if self._sessions.needs_key:
+            person = self._sessions.person(HTTPConnection(scope)) or NOT_SIGNED_IN
 
         async def receive_and_keep() -> Message:
             message = await receive()
@@ -311,11 +309,6 @@ class AuditTrail:
         finally:
             if not written:
                 await write(500)
-
-    def _person(self, scope: Scope) -> str:
-        if not self._sessions.needs_key:
-            return OPEN_ACCESS
-        return self._sessions.person(HTTPConnection(scope)) or NOT_SIGNED_IN
 
     def _place(self, scope: Scope, path: str) -> list[str]:
         if not path.startswith(OF_STATION):

@@ -84,8 +84,6 @@ class _Side:
 
 @dataclass
 class _Run:
-    """The running or newest comparison."""
-
     view: ComparisonView
     messages: list[bytes] = field(default_factory=list)
     task: "asyncio.Task[None] | None" = None

@@ -336,7 +336,7 @@ class Feeds:
                 kind="recording",
                 name=item.recording_id,
                 size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
-                f"{_plural(len(item.num_samples), 'stream')}",
+                f"{len(item.num_samples)} stream{'s' * (len(item.num_samples) != 1)}",
                 consent=item.consent,
                 **_labels(item),
             )
@@ -401,10 +401,6 @@ class Feeds:
             "GET", f"/v1/live/{what}", timeout_s=self._live_timeout_s
         )
         return unpack(answer.content, max_bytes=MAX_LIVE_BYTES)
-
-
-def _plural(count: int, name: str) -> str:
-    return f"{count} {name}" if count == 1 else f"{count} {name}s"
 
 
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:

@@ -283,7 +283,8 @@ class CameraRig:
             name: pinhole_matrix(width_px=width_px, height_px=height_px, fovy_rad=FOVY_RAD[name])
             for name in CAMERAS
         }
-        self._rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
+        # Unit rays of each camera's pixel centres, row by row, in its optical frame.
+        self.rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
         num_rays = height_px * width_px
         self._geom_ids = np.empty(num_rays, dtype=np.int32)
         self._distances = np.empty(num_rays)
@@ -296,10 +297,6 @@ class CameraRig:
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(height * width)], axis=1)
         rays = pixels @ np.linalg.inv(K).T
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-    def rays(self, camera: str) -> Float64[np.ndarray, "rays 3"]:
-        """Unit rays of a camera's pixel centres, row by row, in its optical frame."""
-        return self._rays[camera]
 
     def pose(self, simulation: Simulation, camera: str) -> Float64[np.ndarray, "4 4"]:
         """T_world_camera (optical frame) of one camera now."""
@@ -328,7 +325,7 @@ class CameraRig:
         """Geom that each pixel shows, -1 for none, and its depth along the optical axis (m)."""
         self._cast(simulation, camera)
         hit = self._geom_ids >= 0
-        depth_m = np.where(hit, self._distances * self._rays[camera][:, 2], np.inf)
+        depth_m = np.where(hit, self._distances * self.rays[camera][:, 2], np.inf)
         shape = self.shape_px
         return self._geom_ids.astype(np.int64).reshape(shape), depth_m.reshape(shape)
 
@@ -337,7 +334,7 @@ class CameraRig:
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "rays 3"]]:
         """Cast the rays of a camera; returns its position and the rays in the world."""
         T_world_camera = self.pose(simulation, camera)
-        rays_world = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
+        rays_world = np.ascontiguousarray(self.rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])
         mujoco.mj_multiRay(
             self._model,

@@ -200,7 +200,6 @@ class _StepLog:
         self._since_step: list[np.ndarray] = []
 
     def touch(self) -> None:
-        """Record the current tactile sample."""
         self._since_step.append(self._stage.simulation.tactile_kpa)
 
     def step(self) -> None:
@@ -213,7 +212,6 @@ class _StepLog:
         self._grid.sample()
 
     def draw(self) -> None:
-        """Render the images of the last completed step."""
         for camera, images in self._images.items():
             images.append(self._stage.rig.image(self._stage.simulation, camera))
 

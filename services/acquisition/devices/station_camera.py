@@ -29,13 +29,8 @@ from dextouch.streams import (
 )
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import CameraStream, DeviceKind, DeviceSettings
+from services.acquisition.drivers import images
 from services.acquisition.drivers.base import Decoder, Driver, Readings
-from services.acquisition.drivers.images import (
-    EncodingQueue,
-    ImageChecker,
-    ImageEncoder,
-    ImageQuality,
-)
 from services.acquisition.drivers.packets import DecoderStatistics
 from services.acquisition.transports import Handle, HandleTransport, TransportInfo
 
@@ -408,9 +403,9 @@ class StationCamera(Driver):
         self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
-        encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
-        self._queue = EncodingQueue(encoder, name=settings.stream)
-        self._checker = ImageChecker(period_ns=settings.period_ns)
+        encoder = images.ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
+        self._queue = images.EncodingQueue(encoder, name=settings.stream)
+        self._checker = images.ImageChecker(period_ns=settings.period_ns)
         period_s = settings.period_ns / 1e9
         self._encode_wait_s = period_s / 2 if max_encode_wait_s is None else max_encode_wait_s
         self._exposure_ns = settings.exposure_ns
@@ -418,7 +413,7 @@ class StationCamera(Driver):
         self._silence_ns = FIRST_IMAGE_NS
 
     @property
-    def quality(self) -> ImageQuality:
+    def quality(self) -> images.ImageQuality:
         """What the images are like."""
         return replace(self._checker.quality, num_dropped=self._queue.num_dropped)
 
@@ -493,7 +488,9 @@ class StationCamera(Driver):
         self._checker.check(image, t_driver_ns if has_time else None)
         t_device_ns = NO_DEVICE_TIME
         if has_time:
-            t_device_ns = self._middle_of_exposure_ns(self._on_station_clock(t_driver_ns))
+            half_ns = (self._exposure_ns or 0) // 2
+            to_middle_ns = half_ns if self._settings.stamp_point == "start" else -half_ns
+            t_device_ns = self._on_station_clock(t_driver_ns) + to_middle_ns
         if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
 
@@ -504,14 +501,6 @@ class StationCamera(Driver):
         ahead_ns = [raw_ns - monotonic_ns for monotonic_ns, raw_ns in self._clock_pairs]
         rest_ns = np.interp(0, since_ns, [ahead - ahead_ns[-1] for ahead in ahead_ns])
         return t_driver_ns + ahead_ns[-1] + round(float(rest_ns)) + self._clock.suspended_ns()
-
-    def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
-        half_ns = (self._exposure_ns or 0) // 2
-        return (
-            t_driver_ns + half_ns
-            if self._settings.stamp_point == "start"
-            else t_driver_ns - half_ns
-        )
 
     def _check_silence(self) -> None:
         if self._heard_ns is None:

@@ -177,16 +177,12 @@ def quarter_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b"]:
     Images of less than 12 pixels are taken as they are.
     """
     green = image[..., 1]
-    height, width = image.shape[0] // _QUARTER * _QUARTER, image.shape[1] // _QUARTER * _QUARTER
+    height, width = (size // _QUARTER * _QUARTER for size in green.shape)
     if min(height, width) < 3 * _QUARTER:
         return np.ascontiguousarray(green)
-    rows, columns = slice(0, height, _QUARTER), slice(0, width, _QUARTER)
-    lower, right = slice(2, height, _QUARTER), slice(2, width, _QUARTER)
-    total = green[rows, columns].astype(np.uint16)
-    total += green[rows, right]
-    total += green[lower, columns]
-    total += green[lower, right]
-    return (total >> 2).astype(np.uint8)
+    every_other = green[:height:2, :width:2].astype(np.uint16)
+    rows = every_other[::2] + every_other[1::2]
+    return ((rows[:, ::2] + rows[:, 1::2]) >> 2).astype(np.uint8)
 
 
 def laplacian_variance(gray: UInt8[np.ndarray, "h w"]) -> float:
@@ -361,10 +357,11 @@ class WholeGroups:
         follows = _follow(self._group, sample)
         # Nothing is missing in either case: the device means its groups to be so long.
         is_too_short = begins and follows and self._is_meant_short()
+        # A picture of a later group neither continues the last one nor repeats its last number.
         is_too_long = (
             not begins
             and _follow(self._complete, sample)
-            and not _is_of_later_group(self._complete, sample)
+            and any(_is_complete([*self._complete[:end], sample]) for end in (None, -1))
         )
         if begins or not follows:
             self.reset()
@@ -410,8 +407,3 @@ def _is_complete(samples: list[Sample]) -> bool:
         return episodes.first_gap([one.values.item() for one in samples]) is None
     except CorruptDataError:
         return False
-
-
-def _is_of_later_group(group: list[Sample], sample: Sample) -> bool:
-    """Whether a picture neither continues a group nor repeats its last number."""
-    return not (_is_complete([*group, sample]) or _is_complete([*group[:-1], sample]))

@@ -93,7 +93,9 @@ class SequenceCounter:
         if self._is_repeated(came) and not (is_restarted and t_device_ns is None):
             statistics.repeated += 1
             return
-        stands_still = step == 0 and self._stands_still(sequence)
+        # The newest two packets had this number, too: the device does not count.
+        numbers = [number for number, _ in self._came][-2:]
+        stands_still = step == 0 and numbers == [sequence, sequence]
         if (0 < step < self._modulus // 2 or stands_still) and not is_restarted:
             statistics.lost += max(0, step - 1)
             self._go_on(sequence, step)
@@ -111,11 +113,6 @@ class SequenceCounter:
         # As long before the oldest of the newest packets as that is before the newest one.
         reach_ns = max(2 * (newest_ns - min(times_ns)), MIN_LATE_NS)
         return newest_ns - reach_ns <= t_device_ns <= newest_ns
-
-    def _stands_still(self, sequence: int) -> bool:
-        """Whether the newest two packets had this number, too: the device does not count."""
-        came = self._came
-        return len(came) > 1 and came[-1][0] == came[-2][0] == sequence
 
     def _is_repeated(self, came: tuple[int, int | None]) -> bool:
         if self._last is None or (self._last - came[0]) % self._modulus >= LATE_PACKETS:

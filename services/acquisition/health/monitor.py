@@ -66,7 +66,6 @@ class _Watched:
         self.latest = Evaluation(0)
 
     def evaluate(self, now_ns: int) -> Evaluation:
-        """What the checks find now."""
         evaluation = Evaluation(now_ns, self.take())
         for judge in self.judges:
             judge(evaluation)
@@ -117,7 +116,6 @@ class _WatchedStream(_Watched):
         return "silent" if last_ns is None or now_ns - last_ns > limit_ns else None
 
     def health(self, now_ns: int) -> schemas.StreamHealth:
-        """The stream at this moment."""
         descriptor, driver = self._descriptor, self._supervisor.driver
         findings, figures = self.board.active(now_ns), self.latest.figures
         last_ns, stale = self.counters.last_t_host_ns, self.stale_code(now_ns)
@@ -299,7 +297,6 @@ class HealthMonitor:
             self._log.add(now_ns, watched.name, code, level)
 
     def _remember(self, now_ns: int) -> None:
-        """Add this evaluation to the history."""
         figures = self._itself.latest.figures
         station = {name: figures[key] for name, key in STATION_FIGURES.items() if key in figures}
         streams: dict[str, dict[str, float]] = {}

@@ -260,7 +260,6 @@ class MockDevice:
         return fate, flips
 
     def _send_held(self) -> None:
-        """Send the packet that another one has overtaken."""
         held, self._held = self._held, None
         if held is not None:
             self._put_on_line(held[1], Fate.LATE)

@@ -91,7 +91,6 @@ def _stand() -> str:
 
 
 def _in_cradle(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:
-    """T_cradle_phone, the pose of the phone in the stand."""
     T_world_phone, T_world_stand, _ = transform_from_pose(simulation.object_poses())
     return invert(T_world_stand @ _T_STAND_CRADLE) @ T_world_phone
 

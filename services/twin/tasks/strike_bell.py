@@ -44,12 +44,6 @@ _STRUCK_RAD, _RUNG_RAD = 0.1, 1.0
 _STAND, _PLUNGER, _FLAG = range(3)
 
 
-def _depth_m(simulation: Simulation) -> float:
-    """How far the plunger is pressed."""
-    poses = simulation.object_poses()
-    return float(_TOP_M - (poses[_PLUNGER, 2] - poses[_STAND, 2]))
-
-
 def _flag_rad(simulation: Simulation) -> float:
     """Angle of the flag from upright, outwards."""
     Ts = transform_from_pose(simulation.object_poses())
@@ -160,11 +154,10 @@ class StrikeBell:
 
     def succeeded(self, simulation: Simulation) -> bool:
         """The flag thrown over, the plunger up again, all at rest and untouched."""
-        return bool(
-            _flag_rad(simulation) > _RUNG_RAD
-            and _depth_m(simulation) < 0.1 * _TRAVEL_M
-            and is_left(simulation)
-        )
+        heights_m = simulation.object_poses()[:, 2]
+        depth_m = _TOP_M - (heights_m[_PLUNGER] - heights_m[_STAND])
+        is_up = bool(depth_m < 0.1 * _TRAVEL_M)
+        return _flag_rad(simulation) > _RUNG_RAD and is_up and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Plunger touched by a hand; flag moved; flag thrown over; released and at rest.

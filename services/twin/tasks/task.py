@@ -176,4 +176,4 @@ def at_rest(simulation: Simulation, index: int | slice = slice(None)) -> bool:
 
 def is_left(simulation: Simulation, index: int | slice = slice(None)) -> bool:
     """Whether objects are at rest, all or one, and no hand touches any."""
-    return at_rest(simulation, index) and not simulation.hand_touches_object()
+    return at_rest(simulation, index) and not simulation.hand_touches()

@@ -141,13 +141,13 @@ def test_contacts_are_told_by_hand_and_object(furnished):
     np.testing.assert_array_equal(furnished.hand_contacts(), [[0, 0, 0, 0], [0, 1, 0, 0]])
     assert furnished.hand_touches(1)
     assert not furnished.hand_touches(0)
-    assert furnished.hand_touches_object()
+    assert furnished.hand_touches()
     placed[1, :3] = [0.10, 0.20, 0.079]
     furnished.place(still(), placed, settle_s=0.0)
     assert furnished.objects_touch(1, 2)
     assert furnished.objects_touch(2, 1)
     assert not furnished.objects_touch(0, 1)
-    assert not furnished.hand_touches_object()
+    assert not furnished.hand_touches()
 
 
 def test_boxes_of_shapes_are_those_computed_by_hand():
