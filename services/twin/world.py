@@ -1,10 +1,11 @@
-"""The twin as a `World`: rollouts of commanded actions in the simulation."""
+"""The twin as a `World`, and its service: rollouts of commanded actions in the simulation."""
 
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,12 +20,13 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
+from dextouch.serving import load_settings
 from dextouch.streams import pack, unpack
-from dextouch.worlds import StartedRollout, SteppedRollout
+from dextouch.worlds import CopyFirstWorld, StartedRollout, SteppedRollout, World, serve_worlds
 from services.twin.episodes import GridLog
 from services.twin.names import CAMERAS
 from services.twin.scene import Sizes
-from services.twin.settings import TwinSettings
+from services.twin.settings import TwinServiceSettings, TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TACTILE
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
@@ -229,3 +231,20 @@ class _StepLog:
             reached_is_measured=True,
             success=self._stage.task.succeeded(self._stage.simulation),
         )
+
+
+def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
+    """The twin, and the baseline that every imagined world must beat."""
+    twin = TwinWorld(scene)
+    baseline = CopyFirstWorld.beside(twin.description)
+    return {"twin": twin, baseline.description.name: baseline}
+
+
+def serve(arguments: list[str]) -> None:
+    """Serve both over HTTP until SIGINT or SIGTERM.
+
+    Raises:
+        InvalidInputError: invalid settings.
+    """
+    settings = load_settings(TwinServiceSettings, arguments)
+    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin")
