@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections import deque
+from functools import partial
 
 from services.acquisition import hid_reader, transports
 from services.acquisition.hid_reader import GONE, RECORD
@@ -27,7 +28,7 @@ class HidProcessTransport(transports.HidTransport):
 
     def __init__(self, address: transports.UsbAddress) -> None:
         super().__init__(
-            transports.hid_opener(**vars(address)),
+            partial(transports.open_hid, address),
             address=str(address),
             serial_number=address.serial_number,
         )

@@ -248,19 +248,25 @@ class SerialTransport(HandleTransport["serial.Serial"]):
             logger.warning("fail_to_close_port", address=self.info.address, error=str(error))
 
 
-def hid_opener(
-    *, vendor_id: int, product_id: int, serial_number: str | None = None
-) -> Callable[[], HidDevice]:
-    """What opens the real device of these ids (hidraw; the libusb backend detaches other users)."""
+@dataclass(frozen=True)
+class UsbAddress:
+    """Which device: its ids and, where several are alike, its serial number."""
 
-    def open_device() -> object:
-        import hidraw
+    vendor_id: int
+    product_id: int
+    serial_number: str | None = None
 
-        device = hidraw.device()
-        device.open(vendor_id, product_id, serial_number)
-        return device
+    def __str__(self) -> str:
+        return f"{self.vendor_id:04x}:{self.product_id:04x}"
 
-    return open_device
+
+def open_hid(address: UsbAddress) -> HidDevice:
+    """Open the real device of these ids (hidraw; the libusb backend detaches other users)."""
+    import hidraw
+
+    device = hidraw.device()
+    device.open(address.vendor_id, address.product_id, address.serial_number)
+    return device
 
 
 class HidTransport(HandleTransport[HidDevice]):
@@ -346,18 +352,6 @@ def unix_transport(path: str) -> SocketTransport:
         return link
 
     return SocketTransport(connect, address=path)
-
-
-@dataclass(frozen=True)
-class UsbAddress:
-    """Which device: its ids and, where several are alike, its serial number."""
-
-    vendor_id: int
-    product_id: int
-    serial_number: str | None = None
-
-    def __str__(self) -> str:
-        return f"{self.vendor_id:04x}:{self.product_id:04x}"
 
 
 @dataclass(frozen=True)

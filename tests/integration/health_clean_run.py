@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.finger_tracker import DESCRIPTOR_REPORT
 from services.acquisition.devices.robot_state import STREAM_SIZES
+from services.acquisition.drivers.base import DESCRIPTOR_REPORT
 from services.acquisition.health.monitor import TICK_NS, HealthMonitor
 from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import FaultScript
