@@ -54,7 +54,12 @@ class SpoolRetention:
     def sweep(self) -> list[str]:
         """Remove what has been kept long enough; returns the ids."""
         empty_removed(self._spool_root)
-        kept = sorted(self._acknowledged(), reverse=True)
+        kept = []
+        for path in spooled_takes(self._spool_root):
+            if upload_state(path) == "uploaded":
+                with suppress(FileNotFoundError):  # removed meanwhile
+                    kept.append(((path / UPLOADED_FILE).stat().st_mtime, path))
+        kept.sort(reverse=True)
         oldest_s = self._now_s() - self.limits.keep_uploaded_days * DAY_S
         limit_gb, total, gone = self.limits.keep_uploaded_gb, 0, []
         for acknowledged_s, path in kept:
@@ -77,14 +82,6 @@ class SpoolRetention:
             state = upload_state(path)
             num_bytes[state] += self._size(path) if state == "uploaded" else folder_bytes(path)
         return num_bytes
-
-    def _acknowledged(self) -> list[tuple[float, Path]]:
-        found = []
-        for path in spooled_takes(self._spool_root):
-            if upload_state(path) == "uploaded":
-                with suppress(FileNotFoundError):  # removed meanwhile
-                    found.append(((path / UPLOADED_FILE).stat().st_mtime, path))
-        return found
 
     def _size(self, path: Path) -> int:
         if path.name not in self._sizes:

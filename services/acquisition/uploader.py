@@ -382,7 +382,13 @@ def _recover(path: Path) -> bool:
         logger.warning("remove_empty_take", recording_id=path.name)
         return False
     with SpoolWriter.resume(path) as spool:
-        spool.set_attributes(_with_losses(spool))
+        attributes, torn = spool.attributes.as_interrupted(), spool.torn_bytes
+        # The ledger says what was cut off the log.
+        marks = [(stream.name, "torn_bytes", torn) for stream in attributes.streams if torn]
+        marks += [(name, "lost_to_damage", count) for name, count in spool.lost_samples.items()]
+        added = (LedgerEntry(stream=name, event=event, count=count) for name, event, count in marks)
+        ledger = (*attributes.ledger, *added)
+        spool.set_attributes(attributes.model_copy(update={"ledger": ledger}))
     (path / DAMAGED_FILE).unlink(missing_ok=True)
     logger.warning(
         "recover_take",
@@ -392,15 +398,6 @@ def _recover(path: Path) -> bool:
         lost_samples=spool.lost_samples,
     )
     return True
-
-
-def _with_losses(spool: SpoolWriter) -> RecordingAttributes:
-    """The attributes of an interrupted take, whose ledger says what was cut off its log."""
-    attributes, torn = spool.attributes.as_interrupted(), spool.torn_bytes
-    marks = [(stream.name, "torn_bytes", torn) for stream in attributes.streams if torn]
-    marks += [(name, "lost_to_damage", count) for name, count in spool.lost_samples.items()]
-    added = (LedgerEntry(stream=name, event=event, count=count) for name, event, count in marks)
-    return attributes.model_copy(update={"ledger": (*attributes.ledger, *added)})
 
 
 def _note_damage(path: Path, damage: StorageError) -> None:

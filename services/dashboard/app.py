@@ -77,7 +77,13 @@ def create_app(
     app.add_middleware(
         AuditTrail, log=audit_log, sessions=sessions, station=next(iter(fleet.names))
     )
-    _add_metrics(app.state.registry, clients, sessions)
+    seconds = upstream_histogram()
+    for client in clients:
+        client.seconds = seconds
+    registry: CollectorRegistry = app.state.registry
+    registry.register(seconds)
+    num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
+    num_sessions.set_function(lambda: sessions.num_open)
     app.state.sessions = sessions
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
@@ -97,17 +103,6 @@ def _clients(
         {name: connect(name, url) for name, url in settings.upstream_urls().items()},
         {name: connect("acquisition", url) for name, url in settings.station_urls().items()},
     )
-
-
-def _add_metrics(
-    registry: CollectorRegistry, clients: Sequence[Upstream], sessions: Sessions
-) -> None:
-    seconds = upstream_histogram()
-    for client in clients:
-        client.seconds = seconds
-    registry.register(seconds)
-    num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
-    num_sessions.set_function(lambda: sessions.num_open)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -92,7 +92,9 @@ class Documents:
         tokens = self._markdown.parse(self._paths[name].read_text(encoding="utf-8"))
         for token, following in zip(tokens, [*tokens[1:], None], strict=True):
             if token.type == "heading_open" and following is not None:
-                token.attrSet("id", _anchor(following.content))
+                # By the rules of common hosts of Markdown.
+                words = re.sub(r"[^\w\- ]", "", following.content.lower()).strip()
+                token.attrSet("id", words.replace(" ", "-"))
             for part in token.children or ():
                 self._link(part, posixpath.dirname(name))
         html = self._markdown.renderer.render(tokens, self._markdown.options, {})
@@ -119,11 +121,6 @@ class Documents:
 def _title(path: Path) -> str:
     found = re.search(r"^# (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
     return found[1] if found else path.stem
-
-
-def _anchor(heading: str) -> str:
-    """Anchor of a heading, by the rules of common hosts of Markdown."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
 class TaskChoice(FrozenModel):

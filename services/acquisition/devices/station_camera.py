@@ -168,11 +168,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
         self._request = request
 
     def wait(self, timeout_s: float) -> bool:
-        """Fetch the next image; False when none came in time.
-
-        Raises:
-            DeviceError: the camera is gone, or not open.
-        """
+        """See `CaptureLink`."""
         import cv2
 
         timeout_ns = max(1, round(timeout_s * 1e9))
@@ -186,7 +182,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
         return bool(came)
 
     def retrieve(self) -> CapturedImage | None:
-        """Decode the image fetched by `wait`; None when it is damaged."""
+        """See `CaptureLink`."""
         import cv2
 
         video = self._opened()

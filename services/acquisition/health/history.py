@@ -101,7 +101,11 @@ class StreamMeter:
         """What was measured since the last row, by series; what is unknown is left out."""
         t_ns = np.concatenate([np.empty(0, dtype=np.int64), *self._blocks])
         row = {"level": float(level), "buffer_ratio": self._largest_block / self._capacity}
-        row |= self._loss()
+        statistics, counts = self._statistics(), self._counts
+        self._counts = statistics.packets, statistics.lost
+        num_packets, num_lost = statistics.packets - counts[0], max(0, statistics.lost - counts[1])
+        if offered := num_packets + num_lost:
+            row["loss_ratio"] = num_lost / offered
         last_ns = int(t_ns[-1]) if len(t_ns) else self._last_ns
         # A sample that is due counts in part, so that rates are not rounded to whole samples.
         phase = 0.0
@@ -132,14 +136,6 @@ class StreamMeter:
             found["interval_p95_s"] = float(np.percentile(ended_s, 95))
             found["interval_max_s"] = float(ended_s.max())
         return found
-
-    def _loss(self) -> dict[str, float]:
-        statistics = self._statistics()
-        packets, lost = statistics.packets, statistics.lost
-        num_packets, num_lost = packets - self._counts[0], max(0, lost - self._counts[1])
-        self._counts = packets, lost
-        offered = num_packets + num_lost
-        return {"loss_ratio": num_lost / offered} if offered else {}
 
 
 class HealthHistory:
