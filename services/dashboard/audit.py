@@ -313,8 +313,8 @@ class AuditTrail:
     def _place(self, scope: Scope, path: str) -> list[str]:
         if not path.startswith(OF_STATION):
             return []
-        asked = parse_qs(scope["query_string"].decode("latin-1")).get("station", [self._station])
-        return [asked[0]]
+        named = parse_qs(scope["query_string"].decode("latin-1")).get("station", [self._station])
+        return [named[0]]
 
 
 def _known(scope: Scope) -> tuple[str, str, list[str]] | None:
@@ -324,8 +324,8 @@ def _known(scope: Scope) -> tuple[str, str, list[str]] | None:
     for pattern, path, action in _ROUTES:
         if match := pattern.match(scope["path"]):
             names = match.groupdict()
-            asked = names.pop("action", None)
-            named = action if asked is None else f"{action}: {_clean(asked)}"
+            verb = names.pop("action", None)
+            named = action if verb is None else f"{action}: {_clean(verb)}"
             return path, named, list(names.values())
     return None
 

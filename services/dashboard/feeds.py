@@ -422,10 +422,10 @@ async def _clock_words(store: Upstream, episode_id: str) -> str:
     if not residuals_ms or not skews_ppm:
         return ""
     lost = sum(clock.num_dropped for clock in clocks)
-    doubted = ", ".join(clock.stream for clock in clocks if clock.warnings)
+    unreliable = ", ".join(clock.stream for clock in clocks if clock.warnings)
     return (
         f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
-        f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
+        f"{lost} samples lost{f'; unreliable times: {unreliable}' if unreliable else ''}"
     )
 
 

@@ -120,9 +120,9 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
 
     @router.post("", status_code=202)
     @takes({JSON: KIB})
-    async def start(asked: StartComparison) -> ComparisonView:
+    async def start(body: StartComparison) -> ComparisonView:
         """Replay an episode in the twin and in the world model; ends the comparison before."""
-        return await comparisons.start(asked.episode_id)
+        return await comparisons.start(body.episode_id)
 
     @router.post("/stop", status_code=204)
     async def stop() -> None:

@@ -361,8 +361,8 @@ def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
         for part in report.refused_parts
         if part.reason in {"jump", "frozen", "limits"}
     }
-    told = "".join(f"{cause}, " for cause in sorted(causes))
-    words += f"; stretches left out: {len(report.refused_parts)} ({told}dextouch align report)"
+    named = "".join(f"{cause}, " for cause in sorted(causes))
+    words += f"; stretches left out: {len(report.refused_parts)} ({named}dextouch align report)"
     return "WARN", words
 
 

@@ -146,8 +146,8 @@ class TwinWorld:
             state.anchor,
         )
         seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
-        told = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
-        return SteppedRollout(after, seen, told)
+        info = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
+        return SteppedRollout(after, seen, info)
 
     def snapshot(self, state: TwinState) -> bytes:
         """See `World`."""
