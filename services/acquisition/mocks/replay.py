@@ -156,14 +156,11 @@ class MockDevice:
     def play(
         self, clock: StationClock, waiter: Waiter, *, start_host_ns: int, offset_ns: int = 0
     ) -> bool:
-        """Play the whole source once; the ledger is that of the last play.
+        """Play the whole source once, unless the waiter is cancelled (False).
 
         Its clock counts from `start_host_ns`, when the device's first take started; this play
         begins `offset_ns` later. With a virtual clock the device waits for the host after each
-        packet.
-
-        Returns:
-            False when the waiter was cancelled.
+        packet. The ledger is that of the last play.
         """
         lockstep = isinstance(clock, VirtualClock)
         self._start_host_ns = start_host_ns
