@@ -207,11 +207,19 @@ class HealthHistory:
             return tuple(t for t in self._takes if t.stop_ns is None or t.stop_ns >= since_ns)
 
 
-def history_facts(
-    now_ns: int, takes: tuple[TakeSpan, ...], nominal_rate_hz: Mapping[str, float]
-) -> dict[str, object]:
-    """What a history tells besides its rows (`dextouch.schemas.HealthHistory`)."""
-    return {
+def encoded_history(
+    rows: Rows,
+    now_ns: int,
+    takes: tuple[TakeSpan, ...],
+    nominal_rate_hz: Mapping[str, float],
+    *,
+    packed: bool,
+) -> bytes:
+    """A history (`dextouch.schemas.HealthHistory`) as JSON, null where a value is unknown.
+
+    Packed, the arrays `t_ns`, `station` and `streams` stand beside the other fields.
+    """
+    facts: dict[str, object] = {
         "now_ns": now_ns,
         "now_unix_s": time.time(),
         "takes": [take.model_dump() for take in takes],
@@ -219,15 +227,8 @@ def history_facts(
         "station_series": list(STATION_SERIES),
         "stream_series": list(STREAM_SERIES),
     }
-
-
-def packed_history(facts: Mapping[str, object], rows: Rows) -> bytes:
-    """The facts as fields, and arrays `t_ns`, `station` and `streams` in the order of the facts."""
-    return pack(facts, {"t_ns": rows.t_ns, "station": rows.station, "streams": rows.values})
-
-
-def json_history(facts: Mapping[str, object], rows: Rows) -> bytes:
-    """The same as JSON, null where a value is unknown."""
+    if packed:
+        return pack(facts, {"t_ns": rows.t_ns, "station": rows.station, "streams": rows.values})
     streams = dict(zip(rows.streams, rows.values.tolist(), strict=True))
     body = {"t_ns": rows.t_ns.tolist(), "station": rows.station.tolist(), "streams": streams}
-    return to_json(dict(facts) | body, inf_nan_mode="null")
+    return to_json(facts | body, inf_nan_mode="null")
