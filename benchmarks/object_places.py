@@ -28,8 +28,8 @@ from dextouch.schemas import (
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 from dextouch.tactile.layout import SIDES
 from services.twin.episodes import record, write_episode
+from services.twin.scene import object_boxes_m
 from services.twin.settings import TwinSettings
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 

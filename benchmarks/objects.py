@@ -21,10 +21,10 @@ from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
 from dextouch.streams import HEAD_CAMERA
 from services.alignment.markers import MarkerTracker, cells_of_markers
-from services.twin.markers import Markers, marked_objects
+from services.twin.cameras import Markers, marked_objects
+from services.twin.scene import object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 

@@ -30,10 +30,10 @@ from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation, SaveTake, TakePrompt
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.acquisition.clock import VirtualClock
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.settings import MockLinks
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings

@@ -35,7 +35,7 @@ from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encod
 from services.acquisition.hid_process import HidProcessTransport
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.mocks.trackers import FingerTrackerSource
-from services.acquisition.transports import HidTransport, SerialTransport, UsbAddress, hid_opener
+from services.acquisition.transports import HidTransport, SerialTransport, UsbAddress, open_hid
 
 Way = Literal["thread", "process"]
 Load = Literal["idle", "starved"]
@@ -159,7 +159,7 @@ def read_starved(way: Way, num_threads: int, seconds: float) -> dict[str, float]
         hid = (
             HidProcessTransport(address)
             if way == "process"
-            else HidTransport(hid_opener(**vars(address)), address=path)
+            else HidTransport(partial(open_hid, address), address=path)
         )
         clock = StationClock()
         serial = SerialTransport(partial(str, os.ttyname(slave)))

@@ -49,6 +49,7 @@ from services.evaluation.matched_starts import first_digest, refuse_training_sta
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.success_classifier import DECISION_THRESHOLD, SuccessClassifier
 from services.networks.weight_files import digest_of
+from services.twin.scene import object_boxes_m
 from services.twin.scripted_actions import (
     ELSEWHERE,
     HOLD,
@@ -58,7 +59,6 @@ from services.twin.scripted_actions import (
     scripted_actions,
 )
 from services.twin.settings import TwinSettings
-from services.twin.sizes import object_boxes_m
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.model import DynamicsModel

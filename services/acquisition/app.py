@@ -16,8 +16,7 @@ from dextouch.tactile import TactileLayout, read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.health import HealthCollector
-from services.acquisition.health.metrics import RecorderCollector
+from services.acquisition.health.metrics import HealthCollector, RecorderCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.practice import PRACTICE_PATH, Practice
 from services.acquisition.recorder import Recorder
@@ -79,7 +78,6 @@ def _mock_layout(settings: AcquisitionSettings) -> TactileLayout | None:
 
 
 def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> "MockStation":
-    """A station whose mock devices play an episode, or a pattern."""
     from services.acquisition.mock_station import MockStation
     from services.acquisition.mocks.faults import FaultScript
     from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
@@ -143,10 +141,7 @@ def create_app(
 ) -> FastAPI:
     """A station; takes that an earlier process left unfinished are closed first.
 
-    Args:
-        settings: devices, spool and store.
-        uploader: how takes reach the store; made from the settings when not given.
-        follow: as of `Station`.
+    The uploader is made from the settings where none is given; `follow` is as of `Station`.
 
     Raises:
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.

@@ -22,15 +22,9 @@ from dextouch.schemas import (
 )
 from dextouch.serving import JSON, MSGPACK, RequireScope
 from dextouch.streams import MAX_STREAMS, pack
-from services.acquisition.health import (
-    NUM_ROWS,
-    PERIOD_NS,
-    DiskCheck,
-    history_facts,
-    json_history,
-    judge_uploads,
-    packed_history,
-)
+from services.acquisition.health.history import NUM_ROWS, encoded_history
+from services.acquisition.health.monitor import PERIOD_NS
+from services.acquisition.health.station import DiskCheck, judge_uploads
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
@@ -128,10 +122,9 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         rates_hz = {name: health.nominal_rates_hz[name] for name in rows.streams}
         now_ns = station.clock.now_ns()
         takes = health.history.takes(now_ns - NUM_ROWS * PERIOD_NS)
-        facts = history_facts(now_ns, takes, rates_hz)
-        if query.format == "msgpack":
-            return Response(packed_history(facts, rows), media_type=MSGPACK)
-        return Response(json_history(facts, rows), media_type=JSON)
+        is_packed = query.format == "msgpack"
+        body = encoded_history(rows, now_ns, takes, rates_hz, packed=is_packed)
+        return Response(body, media_type=MSGPACK if is_packed else JSON)
 
     return router
 

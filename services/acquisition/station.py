@@ -17,9 +17,9 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
 from services.acquisition.follow_watch import FollowWatch, MakeFollowCheck
 from services.acquisition.glove_record import NO_CELL, glove_record
-from services.acquisition.health import HealthMonitor
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.path_latency import PathWatch
-from services.acquisition.recorder import Recorder, TakeOptions
+from services.acquisition.recorder import Recorder
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -38,15 +38,8 @@ MOUNTS = {
 class Station:
     """Everything that runs beside the devices.
 
-    Args:
-        name: of the station.
-        drivers: of its devices.
-        spool_root: folder of the takes.
-        clock: stamps and waits.
-        calibration: matrices that travel with every recording.
-        safety: how often the spool reaches the disk, and how much space is kept.
-        simulated: whether the devices are mocks.
-        follow: makes the check whether the robot's hand can follow a tracked hand; None: no check.
+    `follow` makes the check whether the robot's hand can follow a tracked one; without it there is
+    none.
     """
 
     def __init__(  # noqa: PLR0913 - all by name
@@ -85,13 +78,11 @@ class Station:
             drivers=drivers,
             clock=clock,
             calibration=calibration,
-            options=TakeOptions(
-                safety or SpoolSafety(),
-                lambda: {s.driver.name: s.events() for s in self.supervisors},
-                self.health,
-                self.paths.latencies,
-                self.follow,
-            ),
+            safety=safety,
+            device_events=lambda: {s.driver.name: s.events() for s in self.supervisors},
+            health=self.health,
+            latencies=self.paths.latencies,
+            follow=self.follow,
         )
 
     def start(self) -> None:

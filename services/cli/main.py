@@ -42,7 +42,7 @@ COMMANDS = {
         "twin.command_line:main",
         "twin.parser:twin_parser",
     ),
-    "twin serve": Command("serve rollouts in the twin", "twin.serving:serve", "twin"),
+    "twin serve": Command("serve rollouts in the twin", "twin.world:serve", "twin"),
     "station": Command("record and calibrate a station's devices"),
     "station serve": Command(
         "record gloves, trackers and cameras", "pipelines.station:main", "acquisition"

@@ -6,6 +6,7 @@ A new panel is a topic here with the function that fetches it, a section in
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -166,24 +167,16 @@ class TakesView(FrozenModel):
     note: str = ""
 
 
+@dataclass(eq=False)
 class Topic:
-    """A topic: its newest messages, fetched at most once a period whatever the number of viewers.
+    """A topic: its newest messages, fetched at most once a period for all of its viewers."""
 
-    Args:
-        name: of the topic.
-        period_s: between two fetches.
-        fetch: asks the services.
-    """
-
-    def __init__(
-        self, name: str, period_s: float, fetch: Callable[[], Awaitable[list[Message]]]
-    ) -> None:
-        self.name = name
-        self.period_s = period_s
-        self._fetch = fetch
-        self._messages: list[Message] = []
-        self._due_s = float("-inf")
-        self._fetching = asyncio.Lock()
+    name: str
+    period_s: float
+    fetch: Callable[[], Awaitable[list[Message]]]
+    _messages: list[Message] = field(default_factory=list)
+    _due_s: float = float("-inf")
+    _fetching: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @classmethod
     def of_json(cls, name: str, period_s: float, read: Callable[[], Awaitable[object]]) -> "Topic":
@@ -200,7 +193,7 @@ class Topic:
         async with self._fetching:
             if (started_s := now_s()) >= self._due_s:
                 try:
-                    messages = await self._fetch()
+                    messages = await self.fetch()
                     if messages != self._messages:
                         self._messages = messages
                 except Exception:
@@ -358,7 +351,7 @@ class Feeds:
                 kind="recording",
                 name=item.recording_id,
                 size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
-                f"{_plural(len(item.num_samples), 'stream')}",
+                f"{len(item.num_samples)} stream{'s' * (len(item.num_samples) != 1)}",
                 consent=item.consent,
                 **_labels(item),
             )
@@ -425,10 +418,6 @@ class Feeds:
         return unpack(answer.content, max_bytes=MAX_LIVE_BYTES)
 
 
-def _plural(count: int, name: str) -> str:
-    return f"{count} {name}" if count == 1 else f"{count} {name}s"
-
-
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:
     labels = item.model_dump(include={"task", "domain", "operator"})
     return labels | {"outcome": OUTCOMES[item.success]}
@@ -448,10 +437,10 @@ async def _clock_words(store: Upstream, episode_id: str) -> str:
     if not residuals_ms or not skews_ppm:
         return ""
     lost = sum(clock.num_dropped for clock in clocks)
-    doubted = ", ".join(clock.stream for clock in clocks if clock.warnings)
+    unreliable = ", ".join(clock.stream for clock in clocks if clock.warnings)
     return (
         f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
-        f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
+        f"{lost} samples lost{f'; unreliable times: {unreliable}' if unreliable else ''}"
     )
 
 

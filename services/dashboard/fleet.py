@@ -124,16 +124,12 @@ class WatchedStation:
             cause, advice = ("no answer", "") if overview else self._failure
             return Tile(name=self.name, cause=cause, advice=advice, hours_today=self._hours_today)
         fresh = [camera for camera in overview.cameras if camera.age_s <= self._timeout_s]
+        # Of what they share, the station's name alone is the dashboard's.
+        shown = overview.model_dump(include=Tile.model_fields.keys() - {"name"})
         return Tile(
+            **shown,
             name=self.name,
-            level=overview.level,
-            cause=overview.cause,
-            recorder=overview.recorder,
-            task=overview.task,
-            duration_s=overview.duration_s,
             hours_today=self._hours_today,
-            disk_left_s=overview.disk_left_s,
-            disk_free_bytes=overview.disk_free_bytes,
             camera=fresh[0] if fresh else None,
             gloves=tuple(side for side in SIDES if f"tactile_{side}" in self._pressures),
             layouts=overview.layouts,

@@ -24,12 +24,12 @@ from dextouch.serving import configure_logging
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
+from services.twin.cameras import Markers, marked_objects
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
-from services.twin.markers import Markers, marked_objects
 from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
+from services.twin.scene import Sizes, object_boxes_m
 from services.twin.settings import TwinSettings
-from services.twin.sizes import Sizes, object_boxes_m
 from services.twin.stage import Stage
 from services.twin.take_options import MIXES, Mix, PlayedActions, TakeOptions, options_of
 from services.twin.tasks import EVALUATED, named_tasks

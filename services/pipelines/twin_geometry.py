@@ -100,7 +100,7 @@ class TwinGeometry:
 
 def _table_m(stage: Stage, T_world_camera: np.ndarray) -> Float64[np.ndarray, "h w"]:
     """Depth of the table's plane z = 0 at every pixel; far where a ray does not meet it."""
-    rays = stage.rig.rays("camera_head")
+    rays = stage.rig.rays["camera_head"]
     down = -(rays @ T_world_camera[:3, :3].T)[:, 2]
     distance_m = T_world_camera[2, 3] / np.where(down > 1e-6, down, 1e-6)
     return np.minimum(distance_m * rays[:, 2], FAR_M).reshape(stage.rig.shape_px)

@@ -9,10 +9,10 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import TakePrompt
 from dextouch.tactile import TactileLayout
 from services.acquisition.clock import VirtualClock
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
+from services.acquisition.settings import MockLinks
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from tests.unit.other_gloves import small_layout

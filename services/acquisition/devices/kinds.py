@@ -15,7 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, Field, SerializeAsAny, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
@@ -271,7 +271,8 @@ def _wrong(point: EntryPoint, got: str, expected: str) -> InvalidInputError:
     )
 
 
-def _validated(value: object) -> DeviceSettings:
+def chosen_device(value: object) -> DeviceSettings:
+    """Settings of a device by the kind that they name; ValueError says what is wrong."""
     if isinstance(value, DeviceSettings):
         return value
     if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
@@ -283,9 +284,6 @@ def _validated(value: object) -> DeviceSettings:
     except InvalidInputError as error:
         raise ValueError(error.message) from error
     return settings.model_validate(value)
-
-
-ChosenDevice = Annotated[SerializeAsAny[DeviceSettings], BeforeValidator(_validated)]
 
 
 def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> list[Driver]:

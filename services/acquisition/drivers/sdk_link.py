@@ -166,18 +166,9 @@ class FreshnessGate:
 class BridgeDecoder(StreamDecoder[Packet]):
     """Base of the decoders of one device behind a bridge: its hello, and which packets are new.
 
-    Args:
-        kind: what the bridge must be.
-        descriptor: of the stream.
-        source: where the wanted device sits.
-        serial_number: of the wanted device; the only one of its source if None.
-        magic: of its packets; those without a payload are heartbeats.
-        payload_bytes: of a packet with a sample.
-
-    Attributes:
-        hello: of this connection; None before it came.
-        tracking: counts of packets that became no sample, by the reason.
-        statistics: of all devices of the bridge; `refused` counts packets of a wrong size too.
+    Without a serial number the wanted device is the only one of its source. Packets without a
+    payload are heartbeats. `statistics` are of all devices of the bridge; `refused` counts packets
+    of a wrong size, too.
     """
 
     def __init__(

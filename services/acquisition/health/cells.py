@@ -149,10 +149,7 @@ class _PressureCheck(ABC):
     ) -> None:
         """Name the taxels in each state; a taxel has the first of the states that it is in.
 
-        Args:
-            evaluation: gets them.
-            states: masks of the taxels, or of the cells.
-            cells: the cell of each taxel where the masks are those of cells.
+        `cells` is the cell of each taxel where the masks are those of cells.
         """
         left = np.ones((), dtype=np.bool_)
         for state, mask in states.items():
@@ -184,11 +181,7 @@ class TaxelCheck(_PressureCheck):
     A taxel drifts if for 10 s it read 2 kPa or more above its tare, or below it, while three
     quarters of its neighbours read less than half of that: what presses there would press them,
     too. This is only marked and raises nothing, because a point that presses one taxel looks alike.
-
-    Args:
-        record: calibration of the glove.
-        refused: taxels whose gain the calibration refused.
-        layout: of the glove.
+    `refused` are taxels whose gain the calibration refused, `layout` is that of the glove.
     """
 
     def __init__(
@@ -289,10 +282,8 @@ class TaxelCheck(_PressureCheck):
 def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellCheck | None":
     """The check of the cells that a decoder reads; None where it tells of none.
 
-    Args:
-        decoder: of a device with one stream.
-        calibration: of the station; `<stream>_cells` (1 x taxels) gives for each taxel the number
-            of its cell, -1 for none. Without it the layout of the stream does, if there is one.
+    `<stream>_cells` (1 x taxels) of the calibration gives for each taxel the number of its cell, -1
+    for none. Without it the layout of the stream does, if there is one.
 
     Raises:
         InvalidInputError: the grid is not that of a sample, or the map names a cell that the glove

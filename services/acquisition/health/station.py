@@ -38,14 +38,7 @@ CLOCK_SET_SHOWN_NS = 60_000_000_000
 
 
 class DiskCheck:
-    """How long the spool's disk would last if everything that arrives now were recorded.
-
-    Args:
-        spool_root: folder of the takes.
-        supervisors: whose readers count payload bytes.
-        now_ns: by the station's clock; the measurement of what arrives begins here.
-        free_bytes: of the disk; asks the operating system if None.
-    """
+    """How long the spool's disk would last if everything that arrives now were recorded."""
 
     def __init__(
         self,
@@ -119,13 +112,7 @@ def tared_unix_s(descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
 
 
 class PathCheck:
-    """Compares a stream's measured path delay with the station's calibration.
-
-    Args:
-        stream: name of the stream.
-        paths: gives measured delays.
-        calibration: of the station; without a delay of the stream there is nothing to compare.
-    """
+    """Compares a stream's measured path delay with that of the station's calibration, if any."""
 
     def __init__(self, stream: str, paths: PathWatch, calibration: Mapping[str, Matrix]) -> None:
         self._stream = stream
@@ -189,10 +176,6 @@ class HostCheck:
     """How late a periodic thread of the station wakes, which an overloaded computer delays.
 
     The 90th percentile of 10 s: a single stop of the process, such as a laptop's sleep, is none.
-
-    Args:
-        load: tasks that run or wait for a processor, and the number of processors.
-        cpu_times: of the processors since the start of the computer: used, and all.
     """
 
     def __init__(

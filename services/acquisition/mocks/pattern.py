@@ -260,12 +260,7 @@ def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:
 
 
 def render(pose: np.ndarray, rays: Float64[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Grey image of the board at a pose: rotation vector, then the place of its middle (m).
-
-    Args:
-        pose: [6] of the board in the camera.
-        rays: direction of every pixel.
-    """
+    """Grey image of a board at a pose [6] in the camera: rotation vector, its middle (m)."""
     T_camera_board = board_pose(pose)
     normal, origin = T_camera_board[:3, 2], T_camera_board[:3, 3]
     points = rays * ((normal @ origin) / (rays @ normal))[..., None] - origin

@@ -59,7 +59,7 @@ def test_pixels_have_the_colour_of_what_their_label_says(take):
 def test_every_body_is_seen_where_it_projects_to(take):
     """An object's pixels, back in the world by their depth, lie close to its pose."""
     stage, _, views, seen, poses, objects = take
-    rays = stage.rig.rays("camera_head").reshape(PX, PX, 3)
+    rays = stage.rig.rays["camera_head"].reshape(PX, PX, 3)
     for step, (labels, depth_m) in seen:
         T_world_camera = poses.Ts_world_camera_head[step]
         for index, name in enumerate(views.names[4:]):
