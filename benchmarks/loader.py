@@ -107,21 +107,12 @@ class TrainingPace:
         torch.set_num_threads(1)
         plain = TrainSettings(episodes=url, streaming=True, loader_workers=0)
         windows = plain.windows.model_copy(update={"fit_windows": fit_windows})
-        self._settings = plain.model_copy(update={"windows": windows})
+        settings = plain.model_copy(update={"windows": windows})
         self._episodes = index_episodes(url)
-        self._run = TrainingRun(self._episodes, self._settings)
+        self.num_episodes, self.batch = len(self._episodes), settings.optimizer.batch
+        self._run = TrainingRun(self._episodes, settings)
         self._run.fit_codecs()
         self._run.model.train()
-
-    @property
-    def num_episodes(self) -> int:
-        """Episodes in the store."""
-        return len(self._episodes)
-
-    @property
-    def batch(self) -> int:
-        """Windows per step."""
-        return self._settings.optimizer.batch
 
     def loading(self, num_batches: int, *, num_workers: int) -> float:
         """Windows per second of the loader alone."""
