@@ -323,3 +323,11 @@ def _check_worlds(sides: Mapping[str, _Side], task: str) -> None:
             f"{imagined[0]} by {imagined[1]} px at {imagined[2]:g} Hz, expected the same; start "
             "the twin with the world model's image size"
         )
+    gloves = {name: one.world.tactile_layout for name, one in sides.items()}
+    others = {name: glove.name for name, glove in gloves.items() if glove is not None}
+    if others:
+        # The twin has no other glove to compare with.
+        raise InvalidInputError(
+            f"worlds: got the tactile layouts {others}, expected dextouch_v1 in both; only its "
+            "taxels can be compared"
+        )

@@ -1,20 +1,27 @@
 """A glove of another layout: its packets, recording, episode and windows hold its own taxels."""
 
+import json
+
 import numpy as np
 import pytest
+import torch
 
 from dextouch.episodes import EpisodeStore, decode_window, encode_window
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import TakePrompt
-from dextouch.tactile import TactileLayout
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
+from services.acquisition.routes import station_overview
 from services.acquisition.settings import MockLinks
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
+from services.episode_store.reading import _played
+from services.world_model.dynamics.features import TouchCodec
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.tactile import build_tokenizer
 from tests.unit.other_gloves import small_layout
 
 PROMPT = TakePrompt(task="stack-bowls", instruction="stack the bowls")
@@ -36,6 +43,10 @@ def recorded(store, gloves, layout, tmp_path):
         links=MockLinks(gloves=gloves),
     ) as station:
         take = station.run_take(PROMPT, recording_id="take")
+        overview = station_overview(station.station).model_dump(mode="json")
+    # What the dashboard draws live hands by.
+    told = json.loads(layout.model_dump_json())
+    assert overview["layouts"] == {"left": told, "right": told}
     spool = SpoolReader(take.spool_path)
     attributes = spool.attributes.model_copy(update={"streams": ()})
     with store.writer(kind="recording", attributes=attributes) as writer:
@@ -85,6 +96,21 @@ def test_taxels_of_another_layout_arrive_in_windows(gloves, unit, full_scale, tm
     again = decode_window(encode_window(window), max_bytes=1 << 24)
     assert again.tactile_layout == layout
     np.testing.assert_array_equal(again.tactile_kpa, window.tactile_kpa)
+    # What the player draws recordings and episodes by.
+    for reader, size in ((recording, 150), (episode, 138)):
+        shown = _played(reader, reader.streams["tactile_left"]).model_dump(mode="json")
+        assert shown["layout"] == json.loads(layout.model_dump_json())
+        assert (shown["shape"], shown["unmeasured_taxels"]) == ([size], [])
+    # Touch codecs of both forms of world model, fitted to what the gloves felt.
+    touch = torch.from_numpy(window.tactile_kpa.copy())
+    codec = TouchCodec(96, layout.num_taxels)
+    codec.fit(touch.flatten(0, 1))
+    torch.testing.assert_close(codec.decode(codec.encode(touch)), touch, atol=0.01, rtol=0.001)
+    tokenizer = build_tokenizer(NetworkConfig(palm_channels=63).with_layout(layout))
+    tokenizer.fit(touch)
+    torch.testing.assert_close(
+        tokenizer.decode(tokenizer.encode(touch)), touch, atol=0.01, rtol=0.001
+    )
 
 
 def test_hands_of_two_layouts_are_refused_by_name(tmp_path):
@@ -110,8 +136,3 @@ def test_hands_of_two_layouts_are_refused_by_name(tmp_path):
             )
     with pytest.raises(InvalidInputError, match=r"'mixed': got tactile layouts 'small'.*'other'"):
         align_recording(store, "mixed", AlignmentOptions(min_num_steps=8))
-
-
-def test_layouts_are_read_back_by_value(tmp_path):
-    layout = small_layout()
-    assert TactileLayout.model_validate_json(layout.model_dump_json()) == layout

@@ -18,6 +18,7 @@ from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
 from services.acquisition.devices.kinds import build_drivers, device_kind
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.glove_record import glove_record
+from services.acquisition.health.cells import cell_judge
 from services.acquisition.health.station import needed_matrices
 from services.acquisition.mocks.gloves import (
     GloveCalibration,
@@ -25,7 +26,9 @@ from services.acquisition.mocks.gloves import (
     TactileGloveSource,
 )
 from services.acquisition.mocks.replay import ReplayStream
-from services.alignment.calibration.tactile_tare import TactileCalibration
+from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
+from services.alignment.calibration.tactile_tare import TactileCalibration, measure_tare
+from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, judged
 from tests.unit.other_gloves import PALM_AREA_M2, TIP_AREA_M2, small_layout
 
 EXAMPLE = Path(__file__).parents[2] / "shared/dextouch/tactile/example_138.json"
@@ -229,3 +232,47 @@ def test_the_settings_of_a_glove_name_its_layout(tmp_path):
         "tactile_left_tare_counts",
         "tactile_left_gain_counts_per_kpa",
     ]
+
+
+@pytest.mark.parametrize("unit", ["N", "mbar"])
+def test_a_glove_of_floats_is_calibrated_in_its_own_unit(unit):
+    """Tare and gain come back in the unit of the readings, from noisy ones of known pressures."""
+    full_scale = {"N": 4.0, "mbar": 500.0}[unit]
+    layout, rng = small_layout(unit=unit, full_scale=full_scale), np.random.default_rng(5)
+    step = full_scale / 65535
+    tare = rng.uniform(0.01, 0.02, 150) * full_scale
+    gain = rng.uniform(0.5, 1.0, 150) * full_scale / 50
+
+    def take(kpa):
+        return (tare + gain * kpa + rng.normal(0, 3 * step, (120, 150))) / step
+
+    rest = measure_tare(take(0.0), side="left", layout=layout)
+    everywhere = np.ones(138, dtype=bool)
+    presses = [TaxelPress(kpa, 0.01 * kpa, take(kpa), everywhere) for kpa in (10.0, 20.0, 40.0)]
+    found = calibrate_glove(rest, presses).matrices()
+    wired = list(layout.raw_cells.left)
+    np.testing.assert_allclose(found["tactile_left_tare_counts"][0], tare, atol=2 * step)
+    measured = found["tactile_left_gain_counts_per_kpa"][0][wired]
+    np.testing.assert_allclose(measured, gain[wired], rtol=0.01)
+    record = {name: matrix.tolist() for name, matrix in found.items()}
+    glove = TactileCalibration.from_record(record, "left", layout=layout)
+    readings = np.tile(tare + gain * 25, (2, 1))
+    np.testing.assert_allclose(glove.to_kpa(readings), 25, rtol=0.02)
+
+
+def test_health_finds_a_dead_cell_by_its_neighbours_on_the_pad():
+    layout = small_layout()
+    decoder = JustFloatGloveDecoder(
+        "left", num_values=150, full_scale=4.0, rate_hz=50.0, layout=layout
+    )
+    check = cell_judge(decoder, {})
+    # Row 3, column 4 of the palm, whose neighbours in the sample are other taxels.
+    dead, rng = 75 + 3 * 9 + 4, np.random.default_rng(6)
+    for second in range(3):
+        t_s = second + np.arange(1, 51) / 50
+        wave = 1.0 + np.sin(2 * np.pi * t_s[:, None] + 0.1 * np.arange(138))
+        taxels = wave + rng.normal(0.01, 0.001, wave.shape)
+        taxels[:, dead] = 0.0
+        values = layout.expand(taxels, side="left").astype(np.float32)
+        found = judged(check, block(t_s, values), (second + 1) * SECOND_NS)
+    assert found.taxels == {"dead": (dead,)}

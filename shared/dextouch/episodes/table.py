@@ -20,7 +20,7 @@ from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.validity import interpolated_actions, measured_actions
+from dextouch.episodes.validity import interpolated_actions, measured_actions, measured_taxels
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
@@ -277,7 +277,7 @@ class EpisodeGrid:
     @property
     def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
-        return self.reader.measured_taxels
+        return measured_taxels(self.about.calibration, self.tactile_layout.num_taxels)
 
     @property
     def tactile_layout(self) -> TactileLayout:

@@ -9,7 +9,7 @@ import torch
 from dextouch.episodes import EpisodeGrid, EpisodeStore
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.schemas import RolloutStart
-from dextouch.tactile import DEXTOUCH_V1
+from dextouch.tactile import DEXTOUCH_V1, TactileLayout
 from services.world_model.checkpoints import (
     read_checkpoint,
     read_state_checkpoint,
@@ -184,6 +184,8 @@ def test_sizes_beyond_the_glove_are_refused():
         DynamicsConfig(tasks=("a",), num_objects=(1,), touch_channels=139, layout=LAYOUT)
     with pytest.raises(InvalidInputError, match=r"palm_channels 64.*'small', expected at most 63"):
         build_tokenizer(NetworkConfig(palm_channels=64).with_layout(LAYOUT))
-    flat = LAYOUT.model_copy(update={"pads": LAYOUT.pads[:5]})
+    plain = LAYOUT.model_dump()
+    plain["raw_cells"] = {side: cells[:75] for side, cells in plain["raw_cells"].items()}
+    flat = TactileLayout.model_validate(plain | {"pads": plain["pads"][:5]})
     with pytest.raises(InvalidInputError, match="split_hands: got layout 'small' with pads"):
         build_tokenizer(NetworkConfig(tokenizer="split_hands").with_layout(flat))
