@@ -4,6 +4,10 @@ A row is identified by the digests of twin, world and judge, the task, the seed 
 a policy with a mistake also by the digest of the mistakes.
 Arrays that other rows need (endings, images at the ends of chunks) are stored next to the file. A
 line that a killed run left incomplete is skipped.
+
+A run repeats an earlier one if each figure is within a tolerance. Figures of few starts scatter,
+those of policies most: the tolerance of a difference is at least its own 95 % half width, the root
+of the sum of squares of those of both figures.
 """
 
 import json

@@ -41,10 +41,20 @@ _STUDY = "name of the study whose rollouts are rated; default: all rollouts of t
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
-class CloningSettings(FrozenModel):
-    """Training settings of behaviour cloning."""
+class TrainingSettings(FrozenModel):
+    """What the training of every network of this service is given."""
 
     seed: Seed = 0
+    num_training_steps: NumSteps
+    max_cpu_s: CpuBudget
+    batch_size: Batch
+    learning_rate: LearningRate
+    weight_decay: WeightDecay
+
+
+class CloningSettings(TrainingSettings):
+    """Training settings of behaviour cloning."""
+
     num_training_steps: NumSteps = 3000
     max_cpu_s: CpuBudget = 240.0
     batch_size: Batch = 72
@@ -53,10 +63,9 @@ class CloningSettings(FrozenModel):
     held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
-class ClassifierSettings(FrozenModel):
+class ClassifierSettings(TrainingSettings):
     """Training settings of a success classifier."""
 
-    seed: Seed = 0
     # For each task.
     num_training_steps: NumSteps = 2000
     max_cpu_s: CpuBudget = 200.0

@@ -426,10 +426,8 @@ def _optimized(
         odds = network(images, batch)
         return _loss(odds, learned.outcome[index], learned.known[index])
 
-    limits = (settings.num_training_steps, settings.max_cpu_s)
-    steps = optimized(network, loss, settings, limits=limits, title=name, max_gradient_norm=None)
     cpu_s = 0.0
-    for used in steps:
+    for used in optimized(network, loss, settings, title=name, max_gradient_norm=None):
         cpu_s = used.cpu_s
     return network.state_dict(), cpu_s
 

@@ -319,8 +319,7 @@ def train_cloned_policy(
 
     early: Checkpoint | None = None
     cpu_s = 0.0
-    limits = (settings.num_training_steps, settings.max_cpu_s)
-    for used in optimized(network, loss, settings, limits=limits, title="policy"):
+    for used in optimized(network, loss, settings, title="policy"):
         cpu_s = used.cpu_s
         if early_at is not None and early is None and used.share() >= early_at:
             with used.paused():
