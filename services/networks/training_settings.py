@@ -1,10 +1,11 @@
-"""Types of training settings: the bounds and the command-line help that all networks share."""
+"""Training settings: the bounds and the command-line help that all networks share."""
 
 from typing import Annotated
 
 from pydantic import Field
 
 from dextouch.episodes import Split
+from dextouch.frozen_model import FrozenModel
 
 Seed = Annotated[int, Field(description="seed of weights and sampling")]
 NumSteps = Annotated[int, Field(ge=1, description="training steps")]
@@ -40,3 +41,14 @@ Splits = Annotated[
     tuple[Split, ...],
     Field(description="A, B or C: thirds of all scenes to train on; default: all scenes"),
 ]
+
+
+class TrainingSettings(FrozenModel):
+    """What the training of a small network is given."""
+
+    seed: Seed = 0
+    num_training_steps: NumSteps
+    max_cpu_s: CpuBudget
+    batch_size: Batch
+    learning_rate: LearningRate
+    weight_decay: WeightDecay
