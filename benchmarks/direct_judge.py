@@ -41,7 +41,6 @@ from services.evaluation.calibration import (
     fit_calibration,
 )
 from services.evaluation.matched_starts import start_digest
-from services.evaluation.settings import TrainingSettings
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_classifier import Calibration
 from services.evaluation.trained_networks import (
@@ -53,7 +52,7 @@ from services.evaluation.trained_networks import (
     optimized,
     save_checkpoint,
 )
-from services.networks.training_settings import USUAL_IMAGE_PX
+from services.networks.training_settings import USUAL_IMAGE_PX, TrainingSettings
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -403,12 +402,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     reader_steps, num_steps = options.reader_steps, options.steps
     if options.quick:
         reader_steps, num_steps = min(reader_steps, _QUICK_STEPS), min(num_steps, _QUICK_STEPS)
-    settings = JudgeSettings(
-        seed=options.seed,
-        reader_steps=reader_steps,
-        num_training_steps=num_steps,
-        max_cpu_s=options.cpu_s,
-    )
+    limits = {"num_training_steps": num_steps, "max_cpu_s": options.cpu_s}
+    settings = JudgeSettings(seed=options.seed, reader_steps=reader_steps, **limits)
     names = [url.rstrip("/").rpartition("/")[2] for url in options.episodes]
     command = shlex.join(["python", "-m", "benchmarks", "direct-judge", "--episodes", *names])
     episodes, starts = read_takes(options.episodes, tasks=options.tasks)

@@ -19,10 +19,10 @@ from services.networks.training_settings import (
     ImagePx,
     LearningRate,
     NumSteps,
-    Seed,
     Splits,
     Stores,
     Tasks,
+    TrainingSettings,
     WeightDecay,
 )
 
@@ -39,17 +39,6 @@ DEFAULT_MARKS = Path("runs/ratings.sqlite")
 _MARKS = "append-only SQLite file of the marks"
 _STUDY = "name of the study whose rollouts are rated; default: all rollouts of the store"
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
-
-
-class TrainingSettings(FrozenModel):
-    """What the training of every network of this service is given."""
-
-    seed: Seed = 0
-    num_training_steps: NumSteps
-    max_cpu_s: CpuBudget
-    batch_size: Batch
-    learning_rate: LearningRate
-    weight_decay: WeightDecay
 
 
 class CloningSettings(TrainingSettings):

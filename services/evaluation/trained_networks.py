@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.progress import Progress
-from services.evaluation.settings import TrainingSettings
 from services.networks.optimizer import Budget, OptimizerLoop, OptimizerOptions
+from services.networks.training_settings import TrainingSettings
 from services.networks.weight_files import (
     load_strictly,
     read_weights,

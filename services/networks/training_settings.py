@@ -1,4 +1,4 @@
-"""Types of training settings: the bounds and the command-line help that all networks share."""
+"""Training settings: the bounds and the command-line help that all networks share."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,3 +78,14 @@ class AdamWSettings(FrozenModel):
             schedule=floored_cosine,
             betas=(0.9, 0.95),
         )
+
+
+class TrainingSettings(FrozenModel):
+    """What the training of a small network is given."""
+
+    seed: Seed = 0
+    num_training_steps: NumSteps
+    max_cpu_s: CpuBudget
+    batch_size: Batch
+    learning_rate: LearningRate
+    weight_decay: WeightDecay
