@@ -63,8 +63,12 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/v1/alignment/alignments/{alignment_id}/cancel": "cancel alignment",
     "/v1/alignment/calibration/runs": "start calibration",
     "/v1/alignment/calibration/run/answer": "answer calibration",
+    "/v1/alignment/calibration/run/take": "keep calibration place",
+    "/v1/alignment/calibration/run/drop": "drop calibration place",
     "/v1/alignment/calibration/run/finish": "finish calibration",
     "/v1/alignment/calibration/run/cancel": "cancel calibration",
+    "/v1/alignment/calibration/practice/start": "start practice devices",
+    "/v1/alignment/calibration/practice/stop": "stop practice devices",
 }
 OF_STATION: Final = ("/v1/recorder/", "/v1/uploads/")
 # Fields of bodies that name what is changed, or how; all others may be private.

@@ -172,8 +172,8 @@ def make_actions(
         left, right = (gridded.poses(f"wrist_{side}_commanded") for side in SIDES)
         by_side = np.split(gridded.vectors("joints_commanded"), 2, axis=1)
         # Nobody commands the head: where it was is where it should have been.
-        trajectory = HandTrajectory(left, right, by_side[0], by_side[1], head)
-        commanded = actions_from_poses(trajectory, anchor)
+        requested = HandTrajectory(left, right, by_side[0], by_side[1], head)
+        commanded = actions_from_poses(requested, anchor)
         wrists = [f"wrist_{side}_commanded" for side in SIDES]
         absent += [name for name in wrists if name not in gridded.streams]
     return GridActions(

@@ -187,6 +187,13 @@ class LayoutDescription(FrozenModel):
             starts.append(starts[-1] + pad.num_taxels)
         return tuple(starts)
 
+    # Not field by field as pydantic does, whose comparison includes what is cached: arrays.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, LayoutDescription) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that the layout says; equal layouts have equal ones."""

@@ -19,7 +19,9 @@ def settings(tmp_path, monkeypatch):
     monkeypatch.setattr(
         pattern,
         "pattern_streams",
-        lambda round_s=1.0: [s for s in whole(round_s) if s.descriptor.name in HEADS],
+        lambda round_s=1.0, *, layout=None: [
+            s for s in whole(round_s, layout=layout) if s.descriptor.name in HEADS
+        ],
     )
     return AcquisitionSettings(spool=tmp_path / "spool", mock=True)
 
