@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.chart import draw
-from benchmarks.machine import refuse_shape_checks
-from benchmarks.report import StageReport, show, to_markdown
+from benchmarks.report import StageReport, refuse_shape_checks, show, to_markdown
 from benchmarks.stages import STAGES, load_stage
 from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.errors import UnknownNameError
@@ -43,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     options = parser.parse_args(rest)
     refuse_shape_checks()
     with _folder(options.out) as folder:
-        report = stage.measure(options, folder, _bar)
+        report: StageReport = stage.measure(options, folder, _bar)
     publish(report, options)
     return EXIT_MISSED if options.check and not report.is_met else 0
 
@@ -92,11 +91,13 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
     console = Console()
     show(report, console if console.is_terminal else Console(width=WIDTH))
     write_json_text(options.json, report.to_json())
-    if options.out is not None:
-        write_json_text(options.out / f"bench_{report.stage}.json", report.to_json())
-        text = options.out / f"bench_{report.stage}.md"
-        text.write_text(to_markdown(report), encoding="utf-8")
-        chart = options.out / f"bench_{report.stage}.svg"
+    if options.out is None:
+        return
+    kept = options.out / f"bench_{report.stage}"
+    write_json_text(kept.with_suffix(".json"), report.to_json())
+    kept.with_suffix(".md").write_text(to_markdown(report), encoding="utf-8")
+    if report.panels:
+        chart = kept.with_suffix(".svg")
         chart.write_text(draw(report.panels, title=f"bench {report.stage}"), encoding="utf-8")
         print(f"\nchart: {chart}")
 

@@ -11,7 +11,7 @@ import copy
 import shlex
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
@@ -52,7 +52,7 @@ from services.evaluation.trained_networks import (
     optimized,
     save_checkpoint,
 )
-from services.networks.training_settings import USUAL_IMAGE_PX
+from services.networks.training_settings import USUAL_IMAGE_PX, TrainingSettings
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -206,13 +206,11 @@ class DirectJudge:
         return float(calibration.probabilities(odds.double().numpy())[0])
 
 
-@dataclass(frozen=True)
-class JudgeSettings:
+class JudgeSettings(TrainingSettings):
     """Training of a direct judge; the recurrent network stops at its first limit."""
 
-    seed: int = 0
     reader_steps: int = 5000
-    num_steps: int = 6000
+    num_training_steps: int = 6000
     max_cpu_s: float = 240.0
     batch_size: int = 64
     learning_rate: float = 2e-3
@@ -294,7 +292,7 @@ def train_direct_judge(
         training_starts=tuple(sorted(starts)),
         settings={
             "config": config.model_dump(mode="json"),
-            "training": asdict(settings),
+            "training": settings.model_dump(),
             "calibration": calibration,
         },
         metrics=metrics | measured,
@@ -342,8 +340,7 @@ def _train(
         return binary_cross_entropy_with_logits(odds, table.success[rows])
 
     least, best, weights = float("inf"), 0, network.state_dict()
-    limits = (settings.num_steps, settings.max_cpu_s)
-    for used in optimized(network, loss, settings, limits=limits, title="direct judge"):
+    for used in optimized(network, loss, settings, title="direct judge"):
         if used.step % _CHECK_EVERY:
             continue
         odds = _log_odds(network, tested[0])
@@ -394,7 +391,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     steps = "training steps of the start reader (%(default)s)"
     add("--reader-steps", type=int, default=usual.reader_steps, help=steps)
     steps = "largest number of steps of the recurrent network (%(default)s)"
-    add("--steps", type=int, default=usual.num_steps, help=steps)
+    add("--steps", type=int, default=usual.num_training_steps, help=steps)
     cpu_s = "CPU seconds after which the recurrent network stops (%(default)s)"
     add("--cpu-s", type=float, default=usual.max_cpu_s, help=cpu_s)
 
@@ -405,7 +402,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     reader_steps, num_steps = options.reader_steps, options.steps
     if options.quick:
         reader_steps, num_steps = min(reader_steps, _QUICK_STEPS), min(num_steps, _QUICK_STEPS)
-    settings = JudgeSettings(options.seed, reader_steps, num_steps, options.cpu_s)
+    limits = {"num_training_steps": num_steps, "max_cpu_s": options.cpu_s}
+    settings = JudgeSettings(seed=options.seed, reader_steps=reader_steps, **limits)
     names = [url.rstrip("/").rpartition("/")[2] for url in options.episodes]
     command = shlex.join(["python", "-m", "benchmarks", "direct-judge", "--episodes", *names])
     episodes, starts = read_takes(options.episodes, tasks=options.tasks)
@@ -416,7 +414,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     return StageReport(
         stage="direct-judge",
         packages=("numpy", "torch"),
-        options={"episodes": names, "tasks": options.tasks, "training": asdict(settings)},
+        options={"episodes": names, "tasks": options.tasks, "training": settings.model_dump()},
         tables=[ResultTable(f"{options.output}, on held-out episodes", ("", "figure"), rows)],
         requirements=[],
         data={"metrics": metrics},

@@ -1,8 +1,8 @@
-"""Repeated measurements with median and spread, and requirements on them."""
+"""Repeated measurements in interleaved rounds, with median and spread, and requirements on them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -101,3 +101,37 @@ def at_least(what: str, figure: float | None, bound: float, unit: str = "") -> R
 def at_most(what: str, figure: float | None, bound: float, unit: str = "") -> Requirement:
     """The requirement that a figure is not above a bound."""
     return Requirement(what, figure, "at most", bound, unit)
+
+
+T = TypeVar("T")
+
+
+def every_round(measure: Callable[[], T]) -> Callable[[int], T]:
+    """A subject of `interleaved` that is measured in the same way in every round."""
+    return lambda _: measure()
+
+
+def interleaved(
+    subjects: Mapping[str, Callable[[int], T]],
+    num_rounds: int,
+    *,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> dict[str, list[T]]:
+    """Measure all subjects once per round, rotating the first one; returns the results of each.
+
+    Other load of the machine and cache effects then affect all subjects alike. A subject is given
+    the round's index, `on_step` its name before it is measured.
+
+    Raises:
+        InvalidInputError: no round.
+    """
+    if num_rounds < 1:
+        raise InvalidInputError(f"rounds: got {num_rounds}, expected at least 1")
+    names = list(subjects)
+    results: dict[str, list[T]] = {name: [] for name in names}
+    for round_index in range(num_rounds):
+        turn = round_index % max(1, len(names))
+        for name in names[turn:] + names[:turn]:
+            on_step(name)
+            results[name].append(subjects[name](round_index))
+    return results

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.figures import Figure, Requirement, at_least
+from benchmarks.figures import Figure, Requirement, at_least, every_round, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data
@@ -63,7 +62,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         options={**plan, "episodes": pace.num_episodes, "batch": pace.batch, "workers": workers},
         tables=[rate_table(rates, pace.num_episodes)],
         requirements=[requirement(rates)],
-        data={"windows_per_s": {name: list(figure.values) for name, figure in rates.items()}},
+        data={"windows_per_s": rates},
         notes=["the episodes are in the page cache, so disk latency is not included"],
     )
 
@@ -108,21 +107,12 @@ class TrainingPace:
         torch.set_num_threads(1)
         plain = TrainSettings(episodes=url, streaming=True, loader_workers=0)
         windows = plain.windows.model_copy(update={"fit_windows": fit_windows})
-        self._settings = plain.model_copy(update={"windows": windows})
+        settings = plain.model_copy(update={"windows": windows})
         self._episodes = index_episodes(url)
-        self._run = TrainingRun(self._episodes, self._settings)
+        self.num_episodes, self.batch = len(self._episodes), settings.optimizer.batch
+        self._run = TrainingRun(self._episodes, settings)
         self._run.fit_codecs()
         self._run.model.train()
-
-    @property
-    def num_episodes(self) -> int:
-        """Episodes in the store."""
-        return len(self._episodes)
-
-    @property
-    def batch(self) -> int:
-        """Windows per step."""
-        return self._settings.optimizer.batch
 
     def loading(self, num_batches: int, *, num_workers: int) -> float:
         """Windows per second of the loader alone."""

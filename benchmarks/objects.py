@@ -13,8 +13,7 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.figures import at_most
-from benchmarks.object_clicks import ClickErrors, click_errors
-from benchmarks.object_touch import TouchErrors, touch_errors
+from benchmarks.object_places import ClickErrors, TouchErrors, click_errors, touch_errors
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.geometry import invert, transform, transform_from_pose
@@ -22,10 +21,10 @@ from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
 from dextouch.streams import HEAD_CAMERA
 from services.alignment.markers import MarkerTracker, cells_of_markers
-from services.twin.markers import Markers, marked_objects
+from services.twin.cameras import Markers, marked_objects
+from services.twin.scene import object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import EVALUATED, named_tasks
 

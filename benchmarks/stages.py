@@ -7,31 +7,13 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, NamedTuple, TypeVar
 
-from benchmarks.report import StageReport
 from dextouch.errors import InvalidInputError, UnknownNameError
 
 T = TypeVar("T")
 # Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
-
-
-@runtime_checkable
-class Stage(Protocol):
-    """Interface of a benchmark stage, implemented by modules with these two functions."""
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Add the stage's own options; every stage has --quick, --json, --out and --check."""
-
-    def measure(self, options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-        """Run the benchmark; the folder is for temporary files, which the caller removes.
-
-        Raises:
-            InvalidInputError: options that measure nothing, such as no round, or do not fit.
-            UnknownNameError: a name in the options that there is not.
-            ConflictError: a command that the stage runs failed.
-        """
 
 
 @dataclass(frozen=True)
@@ -99,6 +81,12 @@ def named(kind: str, known: Mapping[str, T], names: str) -> dict[str, T]:
     return {name: known[name] for name in found}
 
 
-def load_stage(name: str) -> Stage:
-    """Import the module of a known stage."""
-    return cast("Stage", importlib.import_module(STAGES[name].module))
+def load_stage(name: str) -> Any:  # noqa: ANN401 - a module
+    """The module of a known stage: options of its own, and a function that measures.
+
+    `add_options(parser)` adds to --quick, --json, --out and --check, which every stage has;
+    `measure(options, folder, bar)` returns a `StageReport` and may write to the folder, which the
+    caller removes. It raises InvalidInputError and UnknownNameError for options that measure
+    nothing or do not fit, and ConflictError if a command that it runs failed.
+    """
+    return importlib.import_module(STAGES[name].module)

@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.figures import at_least
-from benchmarks.object_clicks import clicked_image
-from benchmarks.object_touch import GRIPS, described_objects
+from benchmarks.object_places import GRIPS, clicked_image, described_objects
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.reproduction.steps import Step, run, step_with_result
 from benchmarks.stages import Bar

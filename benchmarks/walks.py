@@ -22,7 +22,7 @@ import numpy as np
 
 import dextouch
 import services
-from benchmarks.rollouts.worlds import resting_actions
+from benchmarks.rollouts.ways import resting_actions
 from dextouch.clients import EpisodeStoreClient, PolicyStart, Rollout, RolloutClient
 from dextouch.clocks import OnlineClock
 from dextouch.command_line import add_json, write_result
@@ -30,10 +30,10 @@ from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation, SaveTake, TakePrompt
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.acquisition.clock import VirtualClock
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.settings import MockLinks
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings

@@ -19,6 +19,7 @@ from dextouch.schemas import (
     matrix_rows,
     rollout_uncertainty,
 )
+from dextouch.tactile.layout import TactileLayout
 
 SHORT_CHUNK_STEPS: Final = 4
 
@@ -84,7 +85,9 @@ def imagine_episode(
             "quality": attributes.quality | rollout_uncertainty(seen).to_quality(),
         }
     )
-    write_rollout(store, imagined, seen, actions)
+    write_rollout(
+        store, imagined, seen, actions, layout=TactileLayout.of(description.tactile_layout)
+    )
     return name
 
 

@@ -1,7 +1,9 @@
-"""Packets that readers lose on a starved computer, measured in processes of their own.
+"""Readers of devices in processes of their own: packets lost on a starved computer, and load.
 
 A finger tracker (HID) and a glove (serial line) send at their rates from one process. Another reads
-both with our drivers, with other busy threads in it and among busy processes.
+both with our drivers, with other busy threads in it and among busy processes. The load is that of
+eight gloves on pseudo terminals, whose packets come from another process, so that only reading,
+stamping and decoding are counted.
 """
 
 import contextlib
@@ -33,7 +35,7 @@ from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encod
 from services.acquisition.hid_process import HidProcessTransport
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.mocks.trackers import FingerTrackerSource
-from services.acquisition.transports import HidTransport, SerialTransport, UsbAddress, hid_opener
+from services.acquisition.transports import HidTransport, SerialTransport, UsbAddress, open_hid
 
 Way = Literal["thread", "process"]
 Load = Literal["idle", "starved"]
@@ -118,17 +120,25 @@ def run_starved(load: Load, way: Way, seconds: float) -> dict[str, float]:
         DeviceError: the process failed.
     """
     num_threads, num_processes = NUM_BUSY[load]
-    command = [sys.executable, "-m", MODULE, "read", way, str(num_threads), str(seconds)]
     with contextlib.ExitStack() as stack:
         for _ in range(num_processes):
             busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
             stack.enter_context(busy)
             stack.callback(busy.kill)
-        done = subprocess.run(  # noqa: S603 - this very module
-            command, capture_output=True, text=True, check=False
-        )
+        return _read_apart("read", way, str(num_threads), str(seconds))
+
+
+def _read_apart(*words: str) -> dict[str, float]:
+    """What a fresh process of this module prints.
+
+    Raises:
+        DeviceError: the process failed.
+    """
+    done = subprocess.run(  # noqa: S603 - this very module
+        [sys.executable, "-m", MODULE, *words], capture_output=True, text=True, check=False
+    )
     if done.returncode != 0:
-        raise DeviceError(f"bench acquisition: reading under load failed: {done.stderr}")
+        raise DeviceError(f"bench acquisition: reading in a process failed: {done.stderr}")
     found: dict[str, float] = json.loads(done.stdout)
     return found
 
@@ -149,7 +159,7 @@ def read_starved(way: Way, num_threads: int, seconds: float) -> dict[str, float]
         hid = (
             HidProcessTransport(address)
             if way == "process"
-            else HidTransport(hid_opener(**vars(address)), address=path)
+            else HidTransport(partial(open_hid, address), address=path)
         )
         clock = StationClock()
         serial = SerialTransport(partial(str, os.ttyname(slave)))
@@ -254,11 +264,92 @@ def _spin(stopping: threading.Event) -> None:
         pass
 
 
+NUM_STREAMS = 8
+RATE_HZ = 60
+WARM_UP_S = 0.5
+
+
+def run_ptys(seconds: float) -> dict[str, float]:
+    """Read eight gloves in a fresh process: `seconds` measured, `cpu_s` of all readers, and so on.
+
+    `packets` are those that arrived in that time, `errors` those of any kind.
+
+    Raises:
+        DeviceError: the process failed.
+    """
+    return _read_apart("read-all", str(seconds))
+
+
+def read_all(seconds: float) -> dict[str, float]:
+    """Open eight terminals, let another process send on them, and read."""
+    pairs = [os.openpty() for _ in range(NUM_STREAMS)]
+    for _, slave in pairs:
+        tty.setraw(slave)
+    drivers = [
+        Driver(
+            f"glove_{index}",
+            transport=SerialTransport(partial(str, os.ttyname(slave))),
+            decoder=TactileGloveDecoder("left"),
+            clock=StationClock(),
+        )
+        for index, (_, slave) in enumerate(pairs)
+    ]
+    for driver in drivers:
+        driver.open()
+    masters = [master for master, _ in pairs]
+    command = [sys.executable, "-m", MODULE, "send-all", str(seconds + 2 * WARM_UP_S)]
+    with subprocess.Popen(  # noqa: S603 (this very module)
+        [*command, *map(str, masters)], pass_fds=masters
+    ) as sender:
+        stopping = threading.Event()
+        threads = [threading.Thread(target=_read, args=(d, stopping)) for d in drivers]
+        for thread in threads:
+            thread.start()
+        while any(driver.statistics.packets == 0 for driver in drivers):
+            if sender.poll() is not None:
+                raise DeviceError("bench acquisition: the sending process ended too early")
+            time.sleep(0.05)
+        before = _packets(drivers)
+        cpu_s, start_s = time.process_time(), time.monotonic()
+        time.sleep(seconds)
+        cpu_s, elapsed_s = time.process_time() - cpu_s, time.monotonic() - start_s
+        packets = _packets(drivers) - before
+        sender.wait()
+        stopping.set()
+        for thread in threads:
+            thread.join()
+    errors = sum(d.statistics.crc_errors + d.statistics.lost for d in drivers)
+    for driver in drivers:
+        driver.close()
+    return {"seconds": elapsed_s, "cpu_s": cpu_s, "packets": packets, "errors": errors}
+
+
+def send_all(seconds: float, masters: Sequence[int]) -> None:
+    """Send a packet on each terminal, sixty times a second, evenly spread."""
+    rng = np.random.default_rng(0)
+    start_s = time.monotonic()
+    for tick in range(round(seconds * RATE_HZ)):
+        for turn, master in enumerate(masters):
+            due_s = start_s + (tick + turn / len(masters)) / RATE_HZ
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            packet = Packet(VERSION, SOURCES["left"], tick, tick, rng.bytes(720))
+            os.write(master, encode_packet(MAGIC, packet))
+
+
+def _packets(drivers: Sequence[Driver]) -> int:
+    return sum(driver.statistics.packets for driver in drivers)
+
+
 if __name__ == "__main__":
     sys.path.insert(0, str(STAND_IN))
-    if sys.argv[1] == "read":
-        # Argument 2 is one of the two ways.
-        chosen: Way = "process" if sys.argv[2] == "process" else "thread"
-        print(json.dumps(read_starved(chosen, int(sys.argv[3]), float(sys.argv[4]))))
+    mode, *words = sys.argv[1:]
+    if mode == "read":
+        # The first word is one of the two ways.
+        chosen: Way = "process" if words[0] == "process" else "thread"
+        print(json.dumps(read_starved(chosen, int(words[1]), float(words[2]))))
+    elif mode == "send":
+        send_both(words[0], int(words[1]), float(words[2]))
+    elif mode == "read-all":
+        print(json.dumps(read_all(float(words[0]))))
     else:
-        send_both(sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))
+        send_all(float(words[0]), [int(number) for number in words[1:]])

@@ -10,22 +10,27 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.evaluator.drawn import Line, Rolled
-from benchmarks.evaluator.keeping import KeptRows, Row
-from benchmarks.evaluator.kind_lines import VERDICTS
-from benchmarks.evaluator.kinds import NONE, STRENGTHS, KindsPlan
-from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.page import write_page
+from benchmarks.evaluator.keeping import KeptRows, Row, read_lines, repetition
+from benchmarks.evaluator.lines import VERDICTS, TaskFigures
 from benchmarks.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
+    NONE,
+    STRENGTHS,
     ClonedPolicy,
+    KindsPlan,
     OutsidePolicy,
     StudyPlan,
     trained_seeds,
 )
-from benchmarks.evaluator.repetition import read_lines, repetition
-from benchmarks.evaluator.single_members import write_single_members
-from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
+from benchmarks.evaluator.work import (
+    NEEDED,
+    Missing,
+    Study,
+    open_study,
+    unit_rows,
+    write_single_members,
+)
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
@@ -142,7 +147,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, tables, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
@@ -166,7 +170,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *(repetition(lines, earlier) if options.repeats else ()),
         ],
         data={name: value for name, value in content.items() if name != "notes"},
-        notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
+        notes=[*notes, f"rollouts and JSON: {plan.keep}"],
     )
 
 

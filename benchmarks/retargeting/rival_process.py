@@ -15,8 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.retargeting.ours import Timed
-from benchmarks.retargeting.rivals import RIVALS, Rival, Setup, set_up
+from benchmarks.retargeting.rivals import RIVALS, Rival, Setup, Timed, set_up
 from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
 from dextouch.hands.robot_hand import RobotHand

@@ -9,13 +9,21 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rollouts.crowd import Crowd, crowd
 from benchmarks.rollouts.watcher import listing_s, watched
-from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
-from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
-from benchmarks.rounds import interleaved
+from benchmarks.rollouts.ways import (
+    MAX_CHUNKS,
+    MAX_STEPS,
+    Chunk,
+    Crowd,
+    StillWorld,
+    Way,
+    compared,
+    crowd,
+    opened,
+    resting_actions,
+)
 from benchmarks.stages import Amounts, Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector
@@ -121,7 +129,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             ),
         ],
         data={
-            "seconds": {name: list(figure.values) for name, figure in times_s.items()},
+            "seconds": times_s,
             "bytes": {_name(way): size for way, size in sizes.items()},
             "bare_step_seconds": {_name(way): bare_s[way.selector] for way in ways},
             "crowds": {world: found._asdict() for world, found in crowds.items()},

@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from benchmarks.rollouts.worlds import BatchDevice, Device, StillWorld
+from benchmarks.rollouts.ways import BatchDevice, Device, StillWorld
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.worlds import WorldServiceSettings, create_world_app

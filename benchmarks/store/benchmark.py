@@ -1,21 +1,179 @@
-"""Entry point of the benchmark stage `store`."""
+"""The benchmark stage `store`: its measurements, tables and requirements."""
 
 import argparse
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 
-from benchmarks.report import StageReport
+from benchmarks.chart import Panel, Point
+from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.report import ResultTable, StageReport, cells
 from benchmarks.stages import Amounts, Bar, named
-from benchmarks.store.appends import measure_appends
-from benchmarks.store.compare import Effort, compare
-from benchmarks.store.designs import Design
-from benchmarks.store.live import write_live
-from benchmarks.store.mcap_design import McapDesign
-from benchmarks.store.our_design import OurDesign
-from benchmarks.store.tables import OURS, panels, requirements, tables
-from benchmarks.store.take import make_take
-from benchmarks.store.workload import CAMERAS
-from benchmarks.store.zarr_design import ZarrDesign
+from benchmarks.store.compare import (
+    SPEED,
+    SPOOL,
+    SPOOL_SYNCED,
+    AppendResult,
+    DesignResult,
+    Effort,
+    LiveResult,
+    compare,
+    measure_appends,
+    write_live,
+)
+from benchmarks.store.designs import Design, McapDesign, OurDesign, ZarrDesign
+from benchmarks.store.workload import CAMERAS, make_take
+
+# The default configuration that requirements refer to, and the design compared with.
+OURS, RIVAL = "ours-h264", "zarr-jpeg"
+
+
+def tables(
+    results: Mapping[str, DesignResult],
+    appends: Sequence[AppendResult],
+    live: Sequence[LiveResult],
+) -> list[ResultTable]:
+    """All tables of the stage; those without rows are omitted."""
+    found = [
+        write_table(results),
+        read_table(results),
+        ResultTable(
+            "Appending one glove sample (ms)",
+            ("way", "p50", "p99", "appends a round"),
+            [(a.name, *cells(a.p50_ms, a.p99_ms, a.num_appends)) for a in appends],
+        ),
+        ResultTable(
+            "Live recording of a full station (late: accepted more than 0.1 s after it was due)",
+            ("speed", "rows", "late", "dropped", "worst lag (ms)", "closing (s)"),
+            [cells(*astuple(run)) for run in live],
+        ),
+    ]
+    return [table for table in found if table.rows]
+
+
+def write_table(results: Mapping[str, DesignResult]) -> ResultTable:
+    """Time, bytes and image error of writing: medians, with the spread of the rounds."""
+    rows = [
+        (
+            result.name,
+            result.write_s.inverse(result.seconds).text(),
+            result.cpu_s.scaled(1 / result.seconds).text(),
+            _megabytes(result),
+            str(result.num_files),
+            " ".join(f"{decibels:.1f}" for decibels in result.psnr_db.values()),
+        )
+        for result in results.values()
+    ]
+    return ResultTable(
+        "Writing (speed: 1 is real time; CPU per recorded second; PSNR: head, left, right)",
+        ("design", "speed", "CPU (s)", "MB/min", "files", "PSNR (dB)"),
+        rows,
+    )
+
+
+def read_table(results: Mapping[str, DesignResult]) -> ResultTable:
+    """How many windows a second: medians, with the spread of the rounds."""
+    rows = [
+        (
+            result.name,
+            result.window_ms.inverse(1e3).text(),
+            result.three_cameras_ms.inverse(1e3).text(),
+            result.three_cameras_threaded_ms.inverse(1e3).text(),
+            "" if result.touch_ms is None else result.touch_ms.text(),
+        )
+        for result in results.values()
+    ]
+    return ResultTable(
+        "Random windows of 17 images per second, and time for their touch",
+        ("design", "1 camera", "3 cameras", "3, threads", "touch (ms)"),
+        rows,
+    )
+
+
+def panels(results: Mapping[str, DesignResult]) -> list[Panel]:
+    """Time against image error, for writing and for reading."""
+    write = {name: result.write_s.scaled(1 / result.seconds) for name, result in results.items()}
+    read = {name: result.window_ms for name, result in results.items()}
+    error = "image error (RMS, levels of 255)"
+    return [
+        Panel("Writing", "seconds a recorded second", error, _points(results, write)),
+        Panel("Reading, one camera", "ms a window of 17 images", error, _points(results, read)),
+    ]
+
+
+def _points(results: Mapping[str, DesignResult], times: Mapping[str, Figure]) -> list[Point]:
+    return [
+        Point.of(
+            f"{name}, {_megabytes(result)} MB/min",
+            times[name],
+            rms_levels(result.mean_psnr_db),
+            is_ours=name.startswith("ours"),
+        )
+        for name, result in results.items()
+    ]
+
+
+def rms_levels(psnr_db: float) -> float:
+    """Root mean square error (levels of 8-bit images) for a PSNR."""
+    return float(255.0 * 10.0 ** (-psnr_db / 20.0))
+
+
+def _megabytes(result: DesignResult) -> str:
+    return f"{result.num_bytes / 1e6 * 60 / result.seconds:.0f}"
+
+
+def requirements(
+    results: Mapping[str, DesignResult],
+    appends: Sequence[AppendResult],
+    live: Sequence[LiveResult],
+) -> list[Requirement]:
+    """Build the table of requirements; some may be unmeasured in this run."""
+    ours, rival = results.get(OURS), results.get(RIVAL)
+    return [
+        *_against_rival(ours, rival),
+        at_most(
+            "processor seconds of writing a recorded second",
+            None if ours is None else ours.cpu_s.median / ours.seconds,
+            0.35,
+            "s",
+        ),
+        at_most(
+            f"rows late or dropped, station live at {SPEED:g} times real time",
+            float(max(run.num_late + run.num_dropped for run in live)) if live else None,
+            0.0,
+        ),
+        _append("numeric append, p99", SPOOL, appends, bound_ms=0.1),
+        _append("numeric append on the disk, p99", SPOOL_SYNCED, appends, bound_ms=1.0),
+        at_most(
+            "34 samples of both gloves at native rate",
+            None if ours is None or ours.touch_ms is None else ours.touch_ms.median,
+            0.4,
+            "ms",
+        ),
+    ]
+
+
+def _against_rival(ours: DesignResult | None, rival: DesignResult | None) -> list[Requirement]:
+    write = bytes_ = decibels = windows = None
+    if ours is not None and rival is not None:
+        write = rival.write_s.over(ours.write_s).median
+        bytes_ = ours.num_bytes / rival.num_bytes
+        decibels = rival.mean_psnr_db - ours.mean_psnr_db
+        windows = rival.window_ms.over(ours.window_ms).median
+    return [
+        at_least(f"write speed, times {RIVAL}", write, 2.0),
+        at_most(f"bytes, times {RIVAL}", bytes_, 0.2),
+        at_most(f"mean PSNR below {RIVAL}", decibels, 2.0, "dB"),
+        at_least(f"one-camera windows a second, times {RIVAL}", windows, 1.8),
+    ]
+
+
+def _append(
+    what: str, way: str, appends: Sequence[AppendResult], *, bound_ms: float
+) -> Requirement:
+    found = [append.p99_ms.median for append in appends if append.name == way]
+    return at_most(what, found[0] if found else None, bound_ms, "ms")
+
 
 DESIGNS: tuple[Design, ...] = (
     OurDesign("h264"),
@@ -70,10 +228,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=tables(results, appends, live),
         panels=panels(results),
         requirements=requirements(results, appends, live),
-        data={
-            "designs": {name: asdict(result) for name, result in results.items()},
-            "appends": [asdict(append) for append in appends],
-            "live": [asdict(run) for run in live],
-        },
+        data={"designs": results, "appends": appends, "live": live},
         notes=notes,
     )

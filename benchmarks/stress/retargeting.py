@@ -4,8 +4,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from benchmarks.simulated.hand_motions import Motion, motion_of, robot_motion
-from benchmarks.simulated.tracking_faults import fuzzed
+from benchmarks.simulated.hand_motions import Motion, fuzzed, motion_of, robot_motion
 from benchmarks.stress.cells import Check, StageCells
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetStatus

@@ -1,21 +1,176 @@
-"""Entry point of the benchmark stage `twin`."""
+"""The benchmark stage `twin`: chunks by requested images, and errors of coarser solvers."""
 
 import argparse
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+import mujoco
 import numpy as np
+from jaxtyping import Float64
 
 from benchmarks.chart import Panel, Point
-from benchmarks.figures import Figure, Requirement, at_least, at_most
+from benchmarks.figures import Figure, Requirement, at_least, at_most, every_round, interleaved
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import every_round, interleaved
 from benchmarks.stages import Amounts, Bar
-from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
-from benchmarks.twin.physics import AS_SERVED, SOLVERS, ContactChunks, ContactError, contact_error
+from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
+from services.twin.scripted_actions import script_name, scripted_actions
+from services.twin.settings import TwinSettings
+from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Simulation
+from services.twin.stage import Plan, Stage, command_row
 from services.twin.tasks import TASK_NAMES
+from services.twin.world import TwinState, TwinWorld
+
+# Both scripts have contact in their second chunk.
+CHUNK: Final = 1
+EVERY_CAMERA: Final = "three cameras, 16 steps"
+HEAD: Final = "head camera, 16 steps"
+HEAD_LAST: Final = "head camera, last step"
+SELECTORS: Final = {
+    EVERY_CAMERA: EVERYTHING,
+    "three cameras, last step": ReturnSelector(steps="last"),
+    HEAD: ReturnSelector(cameras=("camera_head",)),
+    HEAD_LAST: ReturnSelector(cameras=("camera_head",), steps="last"),
+    "no camera": ReturnSelector(cameras=(), steps="last"),
+}
+
+
+class TimedChunk:
+    """One chunk of a demonstration with contact, stepped repeatedly from the same state."""
+
+    def __init__(self, task: str, seed: int) -> None:
+        self._world = TwinWorld(TwinSettings())
+        state: TwinState = self._world.reset(RolloutStart(task, seed, "")).state
+        rows = scripted_actions(self._world.stage(task), seed, script_name(0.0))
+        for chunk in range(CHUNK):
+            before = rows[chunk * CHUNK_STEPS :][:CHUNK_STEPS]
+            state = self._world.step(state, before, seed=0).state
+        self._state, self._actions = state, rows[CHUNK * CHUNK_STEPS :][:CHUNK_STEPS]
+
+    def subjects(self) -> dict[str, Callable[[int], float]]:
+        """Functions that measure processor milliseconds of the chunk with each selector."""
+        return {
+            name: every_round(partial(self._timed, selector))
+            for name, selector in SELECTORS.items()
+        }
+
+    def states_are_equal(self) -> bool:
+        """Whether the state after the chunk is bit-identical for every selector."""
+        snapshots = {self._world.snapshot(self._step(selector)) for selector in SELECTORS.values()}
+        return len(snapshots) == 1
+
+    def _step(self, selector: ReturnSelector) -> TwinState:
+        return self._world.step(self._state, self._actions, seed=0, selector=selector).state
+
+    def _timed(self, selector: ReturnSelector) -> float:
+        begin_s = time.process_time()
+        self._step(selector)
+        return 1e3 * (time.process_time() - begin_s)
+
+
+AS_SERVED: Final = "as served"
+
+
+# Options of MuJoCo that differ from the twin's.
+SOLVERS: Final[Mapping[str, Mapping[str, int]]] = {
+    AS_SERVED: {},
+    "3 Newton steps": {"iterations": 3},
+    "2 Newton steps": {"iterations": 2},
+    "1 Newton step": {"iterations": 1},
+    "pyramidal cones": {"cone": int(mujoco.mjtCone.mjCONE_PYRAMIDAL)},
+    "CG": {"solver": int(mujoco.mjtSolver.mjSOL_CG)},
+}
+
+
+@dataclass(frozen=True)
+class Played:
+    """Result of a chunk with contact: pad forces at 60 Hz and final object positions."""
+
+    pad_forces_n: Float64[np.ndarray, "samples 2 6"]
+    object_positions_m: Float64[np.ndarray, "objects 3"]
+    ms: float
+
+
+@dataclass(frozen=True)
+class ContactError:
+    """Errors of chunks relative to the default solver, from the same initial states.
+
+    Forces are root mean squares: the error over pads and samples with contact, and the true forces
+    that are not zero. `object_mm` is the median error of final positions over chunks and objects.
+    """
+
+    force_n: float
+    force_rms_n: float
+    object_mm: float
+
+
+class ContactChunks:
+    """Chunks of demonstrations, started from the states that the default solver reaches.
+
+    Errors are therefore those of one chunk and do not accumulate.
+    """
+
+    def __init__(self, task: str, seeds: Sequence[int]) -> None:
+        stage = Stage(task, "robot", TwinSettings())
+        self._simulation = stage.simulation
+        self._begins: list[tuple[Plan, int, Float64[np.ndarray, " numbers"]]] = []
+        for seed in seeds:
+            plan = stage.plan(seed)
+            stage.start(plan)
+            for first in range(1, len(plan.commands.joints_left_rad), CHUNK_STEPS):
+                state = stage.simulation.state()
+                if _play(stage.simulation, plan, first).pad_forces_n.any():
+                    self._begins.append((plan, first, state))
+
+    def __len__(self) -> int:
+        return len(self._begins)
+
+    def play(self, solver: Mapping[str, int]) -> list[Played]:
+        """Play every chunk with other options; the default ones are restored afterwards."""
+        played, simulation = [], self._simulation
+        option = simulation.scene.model.opt
+        kept = {name: getattr(option, name) for name in solver}
+        for plan, first, state in self._begins:
+            simulation.set_state(state, step_index=(first - 1) * STEPS_PER_GRID)
+            for name, value in solver.items():
+                setattr(option, name, value)
+            played.append(_play(simulation, plan, first))
+            for name, value in kept.items():
+                setattr(option, name, value)
+        return played
+
+
+def contact_error(played: Sequence[Played], truth: Sequence[Played]) -> ContactError:
+    """Errors of chunks relative to the default solver."""
+    true_n = np.concatenate([one.pad_forces_n for one in truth])
+    off_n = np.concatenate([one.pad_forces_n for one in played]) - true_n
+    off_m = np.concatenate([one.object_positions_m for one in played]) - np.concatenate(
+        [one.object_positions_m for one in truth]
+    )
+    felt = (true_n > 0) | (off_n != 0)
+    return ContactError(
+        force_n=float(np.sqrt(np.mean(off_n[felt] ** 2))) if felt.any() else 0.0,
+        force_rms_n=float(np.sqrt(np.mean(true_n[true_n > 0] ** 2))),
+        object_mm=1e3 * float(np.median(np.linalg.norm(off_m, axis=1))),
+    )
+
+
+def _play(simulation: Simulation, plan: Plan, first: int) -> Played:
+    last = min(first + CHUNK_STEPS, len(plan.commands.joints_left_rad))
+    forces_n: list[np.ndarray] = []
+    begin_s = time.process_time()
+    for row in range(first, last):
+        forces_n.extend(
+            simulation.pad_forces_n
+            for step_index in simulation.advance(command_row(plan.commands, row))
+            if step_index % STEPS_PER_TACTILE == 0
+        )
+    elapsed_s = time.process_time() - begin_s
+    return Played(np.stack(forces_n), simulation.object_poses()[:, :3], 1e3 * elapsed_s)
+
 
 # Of demonstrations that nothing is trained on.
 FIRST_SEED: Final = 30_000
@@ -65,12 +220,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=[Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)],
         requirements=requirements(times_ms, states_are_equal=chunk.states_are_equal()),
         data={
-            "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
-            "solver_ms": {name: list(figure.values) for name, figure in solver_ms.items()},
-            "contact_error": {
-                name: {"force_n": error.force_n, "object_mm": error.object_mm}
-                for name, error in errors.items()
-            },
+            "chunk_ms": times_ms,
+            "solver_ms": solver_ms,
+            "contact_error": errors,
         },
         notes=["times are processor time of the whole process, with one thread"],
     )

@@ -2,19 +2,23 @@
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
+from dextouch.data_folder import practice_spool
 from dextouch.episodes import disk_errors
+from dextouch.errors import InvalidInputError
 from dextouch.serving import create_service_app, serve
+from dextouch.tactile import TactileLayout, read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.health import HealthCollector
-from services.acquisition.health.metrics import RecorderCollector
+from services.acquisition.health.metrics import HealthCollector, RecorderCollector
 from services.acquisition.memory import keep_for_life
+from services.acquisition.practice import PRACTICE_PATH, Practice
 from services.acquisition.recorder import Recorder
 from services.acquisition.retention import DeletedTakes, OperatorNames
 from services.acquisition.routes import live_router, recorder_router, station_router, uploads_router
@@ -40,23 +44,57 @@ def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
     )
 
 
+def practice_app(settings: AcquisitionSettings) -> FastAPI:
+    """A mock station to practise calibration with; its takes are not uploaded."""
+    from services.acquisition.mock_station import MockStation
+    from services.acquisition.mocks import pattern
+    from services.acquisition.mocks.faults import FaultScript
+
+    spool = practice_spool(settings.spool)
+    practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
+    with disk_errors(f"make the spool {spool}"):
+        spool.mkdir(parents=True, exist_ok=True)
+    recover_spool(spool)
+    mock = MockStation(
+        pattern.practice_streams(settings.seed, layout=_mock_layout(settings)),
+        FaultScript(devices=pattern.PRACTICE_FAULTS),
+        settings.seed,
+        StationClock(),
+        spool_root=spool,
+        name=f"{settings.station} practice",
+        links=settings.mock_links,
+        safety=settings,
+        unknown_delays=(*pattern.T_HEAD_WRISTS, "camera_head"),
+    )
+    return _station_app(
+        practice, mock.station, mock, _make_uploader(practice, mock.station.recorder)
+    )
+
+
+def _mock_layout(settings: AcquisitionSettings) -> TactileLayout | None:
+    """Layout of the mock gloves; None for `dextouch_v1`."""
+    path = settings.mock_links.layout
+    return None if path is None else read_layout(path)
+
+
 def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> "MockStation":
-    """A station whose mock devices play an episode, or a pattern."""
     from services.acquisition.mock_station import MockStation
     from services.acquisition.mocks.faults import FaultScript
     from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 
-    streams, known = pattern_streams(), pattern_calibration()
+    layout = _mock_layout(settings)
+    streams, known = pattern_streams(layout=layout), pattern_calibration()
     if settings.mock_store is not None and settings.mock_episode_id is not None:
         from dextouch.episodes import EpisodeStore
         from services.acquisition.mocks.replay import replay_calibration, replay_streams
 
+        if layout is not None:
+            raise InvalidInputError(
+                f"mock station: got layout {layout.name!r} and an episode to play, expected one of "
+                "them: an episode says the layout of its gloves"
+            )
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
-    elif settings.mock_practice:
-        from services.acquisition.mocks.pattern import practice_streams
-
-        streams, known = practice_streams(settings.seed), {}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
@@ -103,10 +141,7 @@ def create_app(
 ) -> FastAPI:
     """A station; takes that an earlier process left unfinished are closed first.
 
-    Args:
-        settings: devices, spool and store.
-        uploader: how takes reach the store; made from the settings when not given.
-        follow: as of `Station`.
+    The uploader is made from the settings where none is given; `follow` is as of `Station`.
 
     Raises:
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.
@@ -119,6 +154,18 @@ def create_app(
     mock = _mock_station(settings, follow) if settings.mock else None
     station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
+    practice = Practice(partial(practice_app, settings) if settings.mock else None)
+    return _station_app(settings, station, mock, uploads, practice)
+
+
+def _station_app(
+    settings: AcquisitionSettings,
+    station: Station,
+    mock: "MockStation | None",
+    uploads: Uploader,
+    practice: Practice | None = None,
+) -> FastAPI:
+    """The application around a station; `practice` is what runs below its `/practice`."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -136,6 +183,8 @@ def create_app(
         try:
             yield
         finally:
+            if practice is not None:
+                await practice.stop()
             await run_in_threadpool(uploads.stop)
             await run_in_threadpool((mock or station).stop)
             for collector in collectors:
@@ -154,11 +203,14 @@ def create_app(
             station_router(station, uploads),
             uploads_router(uploads),
             live_router(station),
+            *([practice.router()] if practice is not None else []),
         ],
         lifespan=lifespan,
         readiness=missing,
     )
     app.state.is_working = station.is_working
+    if practice is not None:
+        app.mount(PRACTICE_PATH, practice)
     return app
 
 

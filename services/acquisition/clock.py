@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import KW_ONLY, dataclass
 
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
@@ -150,37 +151,25 @@ class _VirtualWaiter(Waiter):
             self._time.advance()
 
 
+@dataclass(eq=False)
 class PeriodicCall:
-    """Calls a function again and again, in a thread of its own, between `start` and `stop`.
+    """Calls a function in a thread of its own, `period_ns` from the end of one call to the next.
 
-    Args:
-        call: what is called.
-        period_ns: from the end of one call to the next.
-        clock: on which the thread waits.
-        name: of the thread.
-        on_wake: called before each call with the time and how late the thread woke, both in ns.
+    `on_wake` is called before each call with the time and how late the thread woke, both in ns.
     """
 
-    def __init__(
-        self,
-        call: Callable[[], None],
-        *,
-        period_ns: int,
-        clock: StationClock,
-        name: str,
-        on_wake: Callable[[int, int], None] | None = None,
-    ) -> None:
-        self._call = call
-        self._on_wake = on_wake
-        self._period_ns = period_ns
-        self._clock = clock
-        self._name = name
-        self._running: tuple[Waiter, threading.Thread] | None = None
+    call: Callable[[], None]
+    _: KW_ONLY
+    period_ns: int
+    clock: StationClock
+    name: str
+    on_wake: Callable[[int, int], None] | None = None
+    _running: tuple[Waiter, threading.Thread] | None = None
 
     def start(self) -> None:
         """Start calling, one period from now."""
-        waiter = self._clock.waiter()
-        thread = threading.Thread(target=self._run, args=(waiter,), name=self._name, daemon=True)
+        waiter = self.clock.waiter()
+        thread = threading.Thread(target=self._run, args=(waiter,), name=self.name, daemon=True)
         self._running = waiter, thread
         thread.start()
 
@@ -197,11 +186,11 @@ class PeriodicCall:
 
     def _run(self, waiter: Waiter) -> None:
         with closing(waiter):
-            while waiter.wait_until(due_ns := self._clock.now_ns() + self._period_ns):
-                if self._on_wake is not None:
-                    now_ns = self._clock.now_ns()
-                    self._on_wake(now_ns, now_ns - due_ns)
-                self._call()
+            while waiter.wait_until(due_ns := self.clock.now_ns() + self.period_ns):
+                if self.on_wake is not None:
+                    now_ns = self.clock.now_ns()
+                    self.on_wake(now_ns, now_ns - due_ns)
+                self.call()
 
 
 class HostWatch:
@@ -209,9 +198,7 @@ class HostWatch:
 
     Neither touches the stamps: the station's clock counts on through sleep and nobody sets it. But
     both explain things (a gap in all streams; a `started_at` that does not fit), so they are told.
-
-    Attributes:
-        events: by name, when each was noticed on the station's clock and how long it was, in ns.
+    `events` are, by name, when each was noticed on the station's clock and how long it was, in ns.
     """
 
     def __init__(self, clock: StationClock) -> None:

@@ -150,11 +150,7 @@ class _Hand:
 class FollowWatch:
     """Checks the tracked hands of a station 30 times a second at most.
 
-    Args:
-        descriptors: of the station's streams; those of keypoints with a side are checked.
-        calibration: of the station.
-        make: makes the check of a hand, in the thread; None checks nothing.
-        clock: of the station.
+    Those of keypoints with a side are checked; without `make` none is.
     """
 
     def __init__(

@@ -10,7 +10,6 @@ from jaxtyping import Float64, Int64
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, raw_indices
 
 # In the calibration's map, of a taxel that no cell measures.
 NO_CELL = -1
@@ -18,7 +17,7 @@ NO_CELL = -1
 
 @dataclass(frozen=True)
 class GloveRecord:
-    """counts = tare + gain · pressure of each cell, and the cell of each of the 320 taxels.
+    """counts = tare + gain · pressure of each cell, and the cell of each of its taxels.
 
     The sigma of a tare that does not state it is 0.
     """
@@ -26,18 +25,21 @@ class GloveRecord:
     tare_counts: Float64[np.ndarray, " cells"]
     gain_counts_per_kpa: Float64[np.ndarray, " cells"]
     tare_sigma_counts: Float64[np.ndarray, " cells"]
-    cells: Int64[np.ndarray, "320"]
+    cells: Int64[np.ndarray, " taxels"]
 
 
 def is_ours(descriptor: StreamDescriptor) -> bool:
-    """Whether a stream is that of our own glove, whose cells need no map."""
-    return descriptor.unit == "counts" and descriptor.shape == (NUM_RAW_TAXELS,)
+    """Whether a stream holds counts of a glove whose layout wires its cells: they need no map."""
+    layout = descriptor.tactile_layout
+    return descriptor.unit == "counts" and descriptor.shape == (layout.num_raw_cells,)
 
 
 def mapped_cells(
     descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> Int64[np.ndarray, "320"] | None:
-    """For each taxel the number of its cell, -1 for none; None where no map (1 x 320) is known.
+) -> Int64[np.ndarray, " taxels"] | None:
+    """For each taxel the number of its cell, -1 for none; None where no map (1 x taxels) is known.
+
+    The map of the calibration comes before that of the stream's layout.
 
     Raises:
         NotFoundError: the map is of another size.
@@ -45,8 +47,9 @@ def mapped_cells(
     """
     num_cells, name = math.prod(descriptor.shape), f"{descriptor.name}_cells"
     if name not in calibration:
-        return None
-    cells = _row(calibration, name, NUM_TAXELS)
+        layout, side = descriptor.layout, descriptor.side
+        return None if layout is None or side is None else layout.raw_indices(side)
+    cells = _row(calibration, name, descriptor.tactile_layout.num_taxels)
     wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
     if wrong.any():
         taxel = int(np.argmax(wrong))
@@ -67,7 +70,11 @@ def glove_record(
         InvalidInputError: a map that names a cell that the glove has not.
     """
     names = [f"{descriptor.name}_{what}" for what in ("tare_counts", "gain_counts_per_kpa")]
-    if descriptor.kind != "tactile" or not set(names) <= calibration.keys():
+    if descriptor.kind != "tactile" or names[0] not in calibration:
+        return None
+    layout = descriptor.tactile_layout
+    kpa_per_unit = None if descriptor.layout is None else layout.nominal_kpa_per_unit
+    if names[1] not in calibration and kpa_per_unit is None:
         return None
     num_cells = math.prod(descriptor.shape)
     cells = mapped_cells(descriptor, calibration)
@@ -76,8 +83,13 @@ def glove_record(
             return None
         if descriptor.side is None:
             raise NotFoundError(f"stream {descriptor.name!r}: a glove without a side")
-        cells = raw_indices(side=descriptor.side)
-    tare, gain = (_row(calibration, name, num_cells) for name in names)
+        cells = layout.raw_indices(descriptor.side)
+    tare = _row(calibration, names[0], num_cells)
+    if names[1] in calibration or kpa_per_unit is None:
+        gain = _row(calibration, names[1], num_cells)
+    else:
+        gain = np.ones(num_cells)
+        gain[cells[cells != NO_CELL]] = 1.0 / kpa_per_unit[cells != NO_CELL]
     name = f"{descriptor.name}_tare_sigma_counts"
     stated = np.size(calibration.get(name, ())) > 0
     sigma = _row(calibration, name, num_cells) if stated else np.zeros(num_cells)

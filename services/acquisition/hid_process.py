@@ -6,16 +6,10 @@ import subprocess
 import sys
 import time
 from collections import deque
+from functools import partial
 
-from services.acquisition import hid_reader
+from services.acquisition import hid_reader, transports
 from services.acquisition.hid_reader import GONE, RECORD
-from services.acquisition.transports import (
-    READ_TIMEOUT_S,
-    HidDevice,
-    HidTransport,
-    UsbAddress,
-    hid_opener,
-)
 
 # It takes 0.1 s on an idle computer and seconds on a starved one.
 START_TIMEOUT_S = 20.0
@@ -24,7 +18,7 @@ PIPE_BYTES = 1 << 20
 READ_BYTES = 1 << 16
 
 
-class HidProcessTransport(HidTransport):
+class HidProcessTransport(transports.HidTransport):
     """One HID device that `services.acquisition.hid_reader` reads in a process of its own.
 
     `read` gives one report, and `arrived_ns` says when the process read it. Writing uses a handle
@@ -32,9 +26,11 @@ class HidProcessTransport(HidTransport):
     The process is started only for a device that this one could open, and ends at `close`.
     """
 
-    def __init__(self, address: UsbAddress) -> None:
+    def __init__(self, address: transports.UsbAddress) -> None:
         super().__init__(
-            hid_opener(**vars(address)), address=str(address), serial_number=address.serial_number
+            partial(transports.open_hid, address),
+            address=str(address),
+            serial_number=address.serial_number,
         )
         parts = address.vendor_id, address.product_id, address.serial_number
         self._arguments = [str(part) for part in parts if part is not None]
@@ -45,7 +41,7 @@ class HidProcessTransport(HidTransport):
         """Id of the process that reads; None while closed."""
         return None if self._reader is None else self._reader.pid
 
-    def _connect(self) -> HidDevice:
+    def _connect(self) -> transports.HidDevice:
         device = super()._connect()
         try:
             self._reader = _Reader(self._arguments)
@@ -55,12 +51,12 @@ class HidProcessTransport(HidTransport):
             raise
         return device
 
-    def _receive(self, handle: HidDevice) -> bytes:
+    def _receive(self, handle: transports.HidDevice) -> bytes:
         assert self._reader is not None  # noqa: S101 - there is one while the device is open
         self.arrived_ns, report = self._reader.take()
         return report
 
-    def _release(self, handle: HidDevice) -> None:
+    def _release(self, handle: transports.HidDevice) -> None:
         super()._release(handle)
         reader, self._reader = self._reader, None
         if reader is not None:
@@ -92,7 +88,6 @@ class _Reader:
         return self._process.pid
 
     def await_start(self) -> None:
-        """Wait for the first record, which says that the device is open."""
         end_s = time.monotonic() + START_TIMEOUT_S
         while self.take()[0] is None:
             if time.monotonic() > end_s:
@@ -100,7 +95,7 @@ class _Reader:
 
     def take(self) -> tuple[int | None, bytes]:
         """The oldest record: when it was read, and the report or b""; after 0.1 s (None, b"")."""
-        if not self._records and self._poll.poll(READ_TIMEOUT_S * 1e3):
+        if not self._records and self._poll.poll(transports.READ_TIMEOUT_S * 1e3):
             self._parse(os.read(self._pipe, READ_BYTES))
         if not self._records:
             return None, b""

@@ -1,7 +1,7 @@
 """A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -23,7 +23,6 @@ from services.acquisition.devices.kinds import (
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.cameras_and_robot import (
     CameraSource,
     RobotStateSource,
@@ -40,7 +39,7 @@ from services.acquisition.mocks.replay import (
     device_rng,
 )
 from services.acquisition.mocks.trackers import mock_finger_tracker, mock_pose_tracker
-from services.acquisition.settings import SpoolSafety
+from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
 
 LATENCY_SIGMA_MS = 0.2
@@ -92,13 +91,8 @@ def build_mocks(
 ) -> list[MockPair]:
     """The mock devices that a set of streams needs.
 
-    Args:
-        streams: of one episode; streams with ground truth only are omitted.
-        faults: what disturbs the devices.
-        seed: of noise, calibration and faults.
-        clock: of the station.
-        links: how the devices are connected, and their protocols.
-        unit_seed: of the devices' own offsets and gains; default: the seed.
+    Streams of ground truth alone are left out. `unit_seed` is that of the devices' own offsets and
+    gains, by default the seed.
 
     Raises:
         InvalidInputError: two streams of one name, or none that any device sends.
@@ -188,20 +182,10 @@ class MockTake:
 class MockStation:
     """A station whose devices are mocks that play one episode.
 
-    Args:
-        streams: of the episode.
-        faults: what disturbs the devices.
-        seed: of everything random.
-        clock: a `VirtualClock` records a take in a fraction of its length, exactly repeatable; a
-            `StationClock` lets real time and the operating system play their part.
-        spool_root: folder of the takes.
-        name: of the station.
-        calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
-        links: how the devices are connected, and their protocols.
-        safety: of the spool.
-        unit_seed: of the devices' own offsets and gains, and of what the station knows of path
-            delays; stations with one value have the same devices. Default: the seed.
-        follow: as of `Station`.
+    A `VirtualClock` records a take in a fraction of its length, exactly repeatable; with a
+    `StationClock` real time and the operating system play their part. `calibration` is what is
+    known beyond the gloves and path delays (`K_head`), `unknown_delays` are streams whose delay it
+    does not hold. Stations of one `unit_seed` (by default the seed) have the same devices.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -218,6 +202,7 @@ class MockStation:
         safety: SpoolSafety | None = None,
         unit_seed: int | None = None,
         follow: MakeFollowCheck | None = None,
+        unknown_delays: Collection[str] = (),
     ) -> None:
         unit_seed = seed if unit_seed is None else unit_seed
         self.pairs = build_mocks(
@@ -227,12 +212,15 @@ class MockStation:
         self._seed = seed
         # One round of all streams: the last sample and one period of its stream.
         self._lap_ns = max(int(s.t_ns[-1]) + s.descriptor.period_ns() for s in streams)
+        known = _known_of(self.pairs, unit_seed)
+        unknown = tuple(f"{stream}_latency_" for stream in unknown_delays)
+        known = {name: m for name, m in known.items() if not name.startswith(unknown)}
         self.station = Station(
             name=name,
             drivers=[pair.driver for pair in self.pairs],
             spool_root=spool_root,
             clock=clock,
-            calibration={**_known_of(self.pairs, unit_seed), **(calibration or {})},
+            calibration={**known, **(calibration or {})},
             safety=safety,
             simulated=True,
             follow=follow,
@@ -270,10 +258,7 @@ class MockStation:
     ) -> MockTake:
         """Record the whole episode once and save it; may be repeated.
 
-        Args:
-            prompt: task and instruction.
-            recording_id: chosen by the recorder if None.
-            how: how it is saved; incomplete takes are accepted if None.
+        The recorder chooses an id if there is none; incomplete takes are accepted without `how`.
 
         Raises:
             ConflictError: the recorder is busy.

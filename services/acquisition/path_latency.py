@@ -62,7 +62,6 @@ class _StreamPath:
         self._newest: tuple[int, int] | None = None
 
     def accept(self, samples: Sequence[Sample]) -> None:
-        """Remember stamps (called by the reader's thread)."""
         self._queue.extend((sample.t_host_ns, sample.t_device_ns) for sample in samples)
 
     def follow(self) -> None:
@@ -137,7 +136,6 @@ class _DevicePath:
             self._num_silent = 0
 
     def latencies(self) -> dict[str, PathLatency]:
-        """Path delays of the device's streams, as far as they are known."""
         found = {}
         for stream in self.streams:
             stream.follow()
@@ -215,10 +213,7 @@ def add_latencies(
 ) -> dict[str, Matrix]:
     """A recording's calibration, updated with more accurate measured path delays.
 
-    Args:
-        calibration: of the recording, measured delays of before included.
-        measured: by stream.
-        stated: names that the station's calibration gives; these delays are never replaced.
+    Delays of the names `stated`, which the station's calibration gives, are never replaced.
     """
     added = dict(calibration)
     for stream, latency in measured.items():

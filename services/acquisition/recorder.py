@@ -3,7 +3,6 @@
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -34,7 +33,7 @@ from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.follow_watch import FollowWatch
-from services.acquisition.health import HealthMonitor
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.settings import SpoolSafety
@@ -63,35 +62,18 @@ NEXT: Mapping[RecorderAction, RecorderState] = {
 }
 
 
-@dataclass(frozen=True)
-class TakeOptions:
-    """How takes are kept, and who knows what happens to devices besides their drivers.
-
-    `device_events` gives, by device, counts of named events since the station's start (those of the
-    drivers if None); `health` provides the findings of the station in the meantime, `latencies` the
-    measured path delays of streams whose delay the calibration does not name, `follow` whether the
-    robot's hand could follow the tracked ones.
-    """
-
-    safety: SpoolSafety = field(default_factory=SpoolSafety)
-    device_events: Callable[[], DeviceEvents] | None = None
-    health: HealthMonitor | None = None
-    latencies: Callable[[], Mapping[str, PathLatency]] = dict
-    follow: FollowWatch | None = None
-
-
 class Recorder:
     """idle → armed → recording → checking → saved or discarded, one take at a time.
 
     All samples are written to the spool first. A full disk ends the take, which can still be saved
     or discarded. Actions that name their recording are idempotent; an action for another take than
-    the current one is refused.
+    the current one is refused. `take` is the running or ended one, which reader threads append to.
 
-    Attributes:
-        take: the running or ended one, which reader threads append to; None before the first.
+    `device_events` gives, by device, counts of named events since the station's start (those of the
+    drivers if None), `latencies` the measured path delays of streams.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all by name
         self,
         *,
         station: str,
@@ -99,7 +81,11 @@ class Recorder:
         drivers: Sequence[Driver],
         clock: StationClock,
         calibration: Mapping[str, Matrix],
-        options: TakeOptions | None = None,
+        safety: SpoolSafety | None = None,
+        device_events: Callable[[], DeviceEvents] | None = None,
+        health: HealthMonitor | None = None,
+        latencies: Callable[[], Mapping[str, PathLatency]] = dict,
+        follow: FollowWatch | None = None,
     ) -> None:
         self.spool_root = spool_root
         self.spool_folder = ServedFolder(spool_root, "spool")
@@ -107,7 +93,9 @@ class Recorder:
         self._drivers = {driver.name: driver for driver in drivers}
         self._clock = clock
         self._calibration = dict(calibration)
-        self._options = options or TakeOptions()
+        self._safety = safety or SpoolSafety()
+        self._device_events, self._latencies = device_events, latencies
+        self._health, self._follow = health, follow
         # Names that the station's calibration gave to the present take.
         self._stated: frozenset[str] = frozenset()
         # Held for a whole action, disk included; readers never take it.
@@ -121,7 +109,8 @@ class Recorder:
         """Where it stands."""
         with self._lock:
             self._settle()
-            take = self.take
+            take, check = self.take, self._check
+            problems = [problem.message for problem in check.problems] if check else []
             return RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
@@ -131,8 +120,8 @@ class Recorder:
                 num_samples={n: c.num_samples for n, c in take.watch.streams.items()}
                 if take
                 else {},
-                problems=self._problems(),
-                check=self._check,
+                problems=(*(take.problems() if take else ()), *problems),
+                check=check,
                 session=self._session.now,
             )
 
@@ -252,20 +241,19 @@ class Recorder:
         attributes = self._attributes(recording_id)
         self.spool_folder.open()
         self.spool_folder.check(writing=True)
-        check_free_space(self.spool_root, self._options.safety)
+        check_free_space(self.spool_root, self._safety)
         spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
-        count, health = self._options.device_events, self._options.health
         watch = TakeWatch(
             self._drivers,
             self._clock,
-            device_events=count,
-            health=health,
-            follow=self._options.follow,
+            device_events=self._device_events,
+            health=self._health,
+            follow=self._follow,
         )
-        self.take = Take(spool, watch, clock=self._clock, safety=self._options.safety)
+        self.take = Take(spool, watch, clock=self._clock, safety=self._safety)
         self._done = set()
-        if health is not None:
-            health.history.begin_take(attributes.recording_id, watch.started_ns)
+        if self._health is not None:
+            self._health.history.begin_take(attributes.recording_id, watch.started_ns)
         logger.info("start_take", recording_id=attributes.recording_id)
 
     def _stop(self) -> None:
@@ -274,10 +262,9 @@ class Recorder:
             self._note_end(self.take)
 
     def _note_end(self, take: Take) -> None:
-        """Tell the history of the station's health when the take ended."""
-        if self._options.health is not None:
+        if self._health is not None:
             stop_ns = take.watch.started_ns + round(take.watch.duration_s * 1e9)
-            self._options.health.history.end_take(take.spool.attributes.recording_id, stop_ns)
+            self._health.history.end_take(take.spool.attributes.recording_id, stop_ns)
 
     def _save(self, how: SaveTake) -> None:
         take, check = self.take, self._check
@@ -287,7 +274,7 @@ class Recorder:
             reasons = "; ".join(p.message for p in check.problems if p.level == "ERROR")
             raise ConflictError(f"the take is incomplete: {reasons}. Accept or discard it")
         spool = take.spool
-        known, measured = spool.attributes.calibration, self._options.latencies()
+        known, measured = spool.attributes.calibration, self._latencies()
         changed = {
             "calibration": add_latencies(known, measured, stated=self._stated),
             "success": how.success,
@@ -337,18 +324,13 @@ class Recorder:
             station=self._station,
             started_at=now,
             started_t_host_ns=self._clock.now_ns(),
-            calibration=add_latencies(stated, self._options.latencies(), stated=self._stated),
+            calibration=add_latencies(stated, self._latencies(), stated=self._stated),
             streams=tuple(d for driver in self._drivers.values() for d in driver.descriptors),
             **prompt.model_dump(),
         )
 
     def _recording_id(self) -> str | None:
         return self.take.spool.attributes.recording_id if self.take else None
-
-    def _problems(self) -> tuple[str, ...]:
-        own = self.take.problems() if self.take else ()
-        found = self._check.problems if self._check else ()
-        return (*own, *(problem.message for problem in found))
 
 
 class SessionCount:

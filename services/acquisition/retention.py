@@ -15,21 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import structlog
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
+from dextouch import schemas
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import LOG_FILE, SpoolReader
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError, StorageError
-from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    MAX_CHECKED_TAKES,
-    CheckTakes,
-    ConfirmRemoval,
-    PendingDeletion,
-    RecordingAttributes,
-    RecordingStatus,
-    SpooledTake,
-)
+from services.acquisition.settings import Retention
 
 if TYPE_CHECKING:
     from dextouch.clients import EpisodeStoreClient
@@ -39,29 +31,13 @@ logger = structlog.get_logger(__name__)
 RECORDING_FILE: Final = "recording.json"
 UPLOADED_FILE: Final = "uploaded.json"
 REFUSED_FILE: Final = "refused.txt"
+UPLOAD_STATES: Final = ("waiting", "uploaded", "refused")
 # Below it, so that nothing takes an incompletely removed take for one.
 _REMOVED: Final = ".removed"
 DAY_S: Final = 86_400.0
 GIGABYTE: Final = 1e9
 # One line of JSON for each take that was removed because it was deleted in the store.
 REMOVALS_FILE: Final = "removals.jsonl"
-
-
-class Retention(FrozenModel):
-    """How long takes stay in the spool after the store acknowledged them."""
-
-    keep_uploaded_days: float = Field(
-        default=7.0,
-        ge=0,
-        allow_inf_nan=False,
-        description="days that a take stays in the spool after the store acknowledged it",
-    )
-    keep_uploaded_gb: float | None = Field(
-        default=None,
-        ge=0,
-        allow_inf_nan=False,
-        description="GB of acknowledged takes to keep at most, the newest (default: no limit)",
-    )
 
 
 class SpoolRetention:
@@ -78,7 +54,12 @@ class SpoolRetention:
     def sweep(self) -> list[str]:
         """Remove what has been kept long enough; returns the ids."""
         empty_removed(self._spool_root)
-        kept = sorted(self._acknowledged(), reverse=True)
+        kept = []
+        for path in spooled_takes(self._spool_root):
+            if upload_state(path) == "uploaded":
+                with suppress(FileNotFoundError):  # removed meanwhile
+                    kept.append(((path / UPLOADED_FILE).stat().st_mtime, path))
+        kept.sort(reverse=True)
         oldest_s = self._now_s() - self.limits.keep_uploaded_days * DAY_S
         limit_gb, total, gone = self.limits.keep_uploaded_gb, 0, []
         for acknowledged_s, path in kept:
@@ -96,23 +77,11 @@ class SpoolRetention:
 
     def use(self) -> dict[str, int]:
         """Bytes of the takes in the spool by state of their upload; a running one waits, too."""
-        num_bytes = {"waiting": 0, "uploaded": 0, "refused": 0}
+        num_bytes = dict.fromkeys(UPLOAD_STATES, 0)
         for path in spooled_takes(self._spool_root):
-            if acknowledgement(path) is not None:
-                num_bytes["uploaded"] += self._size(path)
-            else:
-                state = "refused" if (path / REFUSED_FILE).exists() else "waiting"
-                num_bytes[state] += folder_bytes(path)
+            state = upload_state(path)
+            num_bytes[state] += self._size(path) if state == "uploaded" else folder_bytes(path)
         return num_bytes
-
-    def _acknowledged(self) -> list[tuple[float, Path]]:
-        """Acknowledged takes with the time of that."""
-        found = []
-        for path in spooled_takes(self._spool_root):
-            if acknowledgement(path) is not None:
-                with suppress(FileNotFoundError):  # removed meanwhile
-                    found.append(((path / UPLOADED_FILE).stat().st_mtime, path))
-        return found
 
     def _size(self, path: Path) -> int:
         if path.name not in self._sizes:
@@ -120,16 +89,23 @@ class SpoolRetention:
         return self._sizes[path.name]
 
 
-def acknowledgement(path: Path) -> RecordingStatus | None:
+def acknowledgement(path: Path) -> schemas.RecordingStatus | None:
     """What the store answered when it had all of a take; None where it has not, as far as known.
 
     A note that is damaged or says otherwise does not count: the take is sent again.
     """
     try:
-        note = RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
+        note = schemas.RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
     except (ValidationError, FileNotFoundError):
         return None
     return note if note.state == "finished" else None
+
+
+def upload_state(path: Path) -> str:
+    """The one of `UPLOAD_STATES` of a take; a running one waits, too."""
+    if acknowledgement(path) is not None:
+        return "uploaded"
+    return "refused" if (path / REFUSED_FILE).exists() else "waiting"
 
 
 def spooled_takes(spool_root: Path) -> list[Path]:
@@ -173,13 +149,8 @@ class DeletedTakes:
     """Asks the store which takes of the spool were deleted, removes them and confirms it.
 
     The store says by a revision whether there was a deletion, so that the spool is only read then,
-    and once after a start.
-
-    Args:
-        spool_root: folder of the takes.
-        station: name of this station; takes of an earlier name are asked about under that.
-        stored_as: the ids under which the store has a take, or would have it.
-        operators: of the session.
+    and once after a start. `stored_as` gives the ids under which the store has a take, or would
+    have it.
     """
 
     def __init__(
@@ -187,7 +158,7 @@ class DeletedTakes:
         spool_root: Path,
         station: str,
         *,
-        stored_as: Callable[[Path, RecordingAttributes | None], Sequence[str]],
+        stored_as: Callable[[Path, schemas.RecordingAttributes | None], Sequence[str]],
         operators: OperatorNames,
     ) -> None:
         self._spool_root, self._station = spool_root, station
@@ -215,17 +186,9 @@ class DeletedTakes:
             self._problem = error.message
         return removed
 
-    def remove_refused(self, path: Path) -> None:
-        """Remove a take whose upload the store refused since it was deleted.
-
-        Raises:
-            StorageError: it cannot be removed.
-        """
-        self._remove(path, "refused by the store as deleted")
-
     def _work_off(self, store: "EpisodeStoreClient", removed: list[str]) -> bool:
         """Remove all deleted takes; whether none of them is left to try again."""
-        takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
+        takes: defaultdict[str, list[schemas.SpooledTake]] = defaultdict(list, {self._station: []})
         for station, take in self._spooled():
             takes[station].append(take)
         confirmed, unknown = [], []
@@ -243,8 +206,10 @@ class DeletedTakes:
                 if take.is_damaged and take.recording_id not in gone
             ]
             confirmed.append(
-                ConfirmRemoval(
-                    station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+                schemas.ConfirmRemoval(
+                    station=station,
+                    revision=revision,
+                    held=tuple(held[: schemas.MAX_CHECKED_TAKES]),
                 )
             )
         if unknown:
@@ -265,17 +230,17 @@ class DeletedTakes:
         self,
         store: "EpisodeStoreClient",
         station: str,
-        spooled: Sequence[SpooledTake],
+        spooled: Sequence[schemas.SpooledTake],
         removed: list[str],
-    ) -> tuple[list[PendingDeletion], str]:
+    ) -> tuple[list[schemas.PendingDeletion], str]:
         """Remove the deleted takes of a station; those that are held, and the first revision."""
         operators = tuple(self._operators.known())
-        held: list[PendingDeletion] = []
+        held: list[schemas.PendingDeletion] = []
         first_revision: str | None = None
-        for start in range(0, max(1, len(spooled)), MAX_CHECKED_TAKES):
-            part = tuple(spooled[start : start + MAX_CHECKED_TAKES])
+        for start in range(0, max(1, len(spooled)), schemas.MAX_CHECKED_TAKES):
+            part = tuple(spooled[start : start + schemas.MAX_CHECKED_TAKES])
             checked = store.check_takes(
-                CheckTakes(station=station, takes=part, operators=operators)
+                schemas.CheckTakes(station=station, takes=part, operators=operators)
             )
             # A deletion in between makes the confirmation of an earlier revision fail.
             first_revision = first_revision or checked.revision
@@ -298,24 +263,26 @@ class DeletedTakes:
         except StorageError:
             pass  # damaged, and deleted all the same
         try:
-            self._remove(path, "deleted in the store")
+            self.remove_take(path, "deleted in the store")
         except StorageError as error:
             logger.warning("fail_remove_deleted", recording_id=path.name, error=error.message)
             return False
         return True
 
-    def _remove(self, path: Path, why: str) -> None:
+    def remove_take(self, path: Path, why: str) -> None:
+        """Remove a take that was deleted in the store, and note it in `REMOVALS_FILE`.
+
+        Raises:
+            StorageError: it cannot be removed.
+        """
         remove_take(path)
         logger.warning("remove_deleted_take", recording_id=path.name, reason=why)
         line = {"at": datetime.now(UTC).isoformat(), "recording_id": path.name, "reason": why}
-        with disk_errors(f"write {REMOVALS_FILE}"), self._removals.open("a") as file:
+        removals = self._spool_root / REMOVALS_FILE
+        with disk_errors(f"write {REMOVALS_FILE}"), removals.open("a") as file:
             file.write(json.dumps(line) + "\n")
 
-    @property
-    def _removals(self) -> Path:
-        return self._spool_root / REMOVALS_FILE
-
-    def _spooled(self) -> Iterator[tuple[str, SpooledTake]]:
+    def _spooled(self) -> Iterator[tuple[str, schemas.SpooledTake]]:
         """All takes of the spool, with the station that recorded each."""
         for path in spooled_takes(self._spool_root):
             try:
@@ -324,10 +291,12 @@ class DeletedTakes:
                 continue
             except StorageError:
                 ids = tuple(self._stored_as(path, None))
-                damaged = SpooledTake(recording_id=path.name, stored_as=ids, is_damaged=True)
+                damaged = schemas.SpooledTake(
+                    recording_id=path.name, stored_as=ids, is_damaged=True
+                )
                 yield self._station, damaged
                 continue
-            take = SpooledTake(
+            take = schemas.SpooledTake(
                 recording_id=path.name,
                 stored_as=tuple(self._stored_as(path, about)),
                 operator=about.operator,

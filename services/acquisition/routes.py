@@ -22,15 +22,9 @@ from dextouch.schemas import (
 )
 from dextouch.serving import JSON, MSGPACK, RequireScope
 from dextouch.streams import MAX_STREAMS, pack
-from services.acquisition.health import (
-    NUM_ROWS,
-    PERIOD_NS,
-    DiskCheck,
-    history_facts,
-    json_history,
-    judge_uploads,
-    packed_history,
-)
+from services.acquisition.health.history import NUM_ROWS, encoded_history
+from services.acquisition.health.monitor import PERIOD_NS
+from services.acquisition.health.station import DiskCheck, judge_uploads
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
@@ -128,10 +122,9 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         rates_hz = {name: health.nominal_rates_hz[name] for name in rows.streams}
         now_ns = station.clock.now_ns()
         takes = health.history.takes(now_ns - NUM_ROWS * PERIOD_NS)
-        facts = history_facts(now_ns, takes, rates_hz)
-        if query.format == "msgpack":
-            return Response(packed_history(facts, rows), media_type=MSGPACK)
-        return Response(json_history(facts, rows), media_type=JSON)
+        is_packed = query.format == "msgpack"
+        body = encoded_history(rows, now_ns, takes, rates_hz, packed=is_packed)
+        return Response(body, media_type=MSGPACK if is_packed else JSON)
 
     return router
 
@@ -171,16 +164,20 @@ def live_router(station: Station) -> APIRouter:
 
     @router.get("/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
     async def taxels() -> Response:
-        """Newest pressures (kPa, float32 [320]) of the gloves that are heard, packed."""
+        """Newest pressures (kPa, float32 [taxels]) of the gloves that are heard, packed."""
         pressures = station.live.pressures_kpa(station.clock.now_ns())
         return Response(pack({}, pressures), media_type=MSGPACK)
 
     @router.get("/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def poses() -> Response:
-        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's."""
+    async def poses(mounted: Annotated[bool, Query()] = True) -> Response:  # noqa: FBT002 - a query's flag
+        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's.
+
+        Poses are those of the bodies; with `mounted=false` those of the trackers on them.
+        """
         now_ns = station.clock.now_ns()
         ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
-        return Response(pack({"age_s": ages_s}, station.live.poses(now_ns)), media_type=MSGPACK)
+        poses = station.live.poses(now_ns, mounted=mounted)
+        return Response(pack({"age_s": ages_s}, poses), media_type=MSGPACK)
 
     @router.get("/cameras")
     async def cameras() -> CameraList:
@@ -213,6 +210,13 @@ def station_overview(station: Station) -> StationOverview:
         disk_left_s=health.figures.get("disk_left_seconds"),
         disk_free_bytes=health.figures.get("disk_free_bytes"),
         cameras=tuple(station.live.cameras(station.clock.now_ns())),
+        layouts={
+            stream.hand: stream.layout
+            for stream in health.streams
+            if stream.layout is not None
+            and stream.hand
+            and stream.stream == f"tactile_{stream.hand}"
+        },
     )
 
 

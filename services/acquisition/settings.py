@@ -1,23 +1,88 @@
 """Settings of a station: flags, the environment (`DEXTOUCH_ACQUISITION_…`) and its enrolment."""
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import structlog
-from pydantic import Field, SecretStr, ValidationError, field_serializer, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    SecretStr,
+    SerializeAsAny,
+    ValidationError,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
 from dextouch.data_folder import default_enrolment, default_spool
-from dextouch.episodes import disk_errors, replace_file
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import first_problems
 from dextouch.serving import ServiceSettings, service_config
-from services.acquisition.devices.kinds import ChosenDevice
-from services.acquisition.mock_links import MockLinks
-from services.acquisition.retention import Retention
 
-logger = structlog.get_logger(__name__)
+# The flags can be shown without drivers, which import numpy.
+if TYPE_CHECKING:
+    from services.acquisition.devices.kinds import DeviceSettings
+else:
+    DeviceSettings = FrozenModel
+
+
+def _chosen_device(value: object) -> DeviceSettings:
+    from services.acquisition.devices.kinds import chosen_device
+
+    return chosen_device(value)
+
+
+ChosenDevice = Annotated[SerializeAsAny[DeviceSettings], BeforeValidator(_chosen_device)]
+
+
+class MockLinks(FrozenModel):
+    """Which of the ways that real stations know the mock devices of a station take."""
+
+    gloves: str = Field(
+        default="tactile_glove", description="kind of both gloves, built in or of another package"
+    )
+    layout: Path | None = Field(
+        default=None, description="file with the layout of both gloves, of a pattern that is played"
+    )
+    trackers: Literal["hid", "bridge"] = Field(
+        default="hid", description="connection of finger and pose trackers"
+    )
+    wrists: Literal["robot", "trackers"] = Field(
+        default="robot", description="source of the wrist poses if there is a robot"
+    )
+    cameras: Literal["bridge", "station"] = Field(
+        default="bridge", description="images over a socket, or from a camera on the station's bus"
+    )
+    images: Literal["rgb8", "jpeg", "h264"] = Field(
+        default="rgb8", description="image encoding of the bridge or the station"
+    )
+
+    @field_validator("gloves")
+    @classmethod
+    def _is_known(cls, gloves: str) -> str:
+        from services.acquisition.devices.kinds import kind_names
+
+        if gloves not in kind_names():
+            raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(kind_names())}")
+        return gloves
+
+
+class Retention(FrozenModel):
+    """How long takes stay in the spool after the store acknowledged them."""
+
+    keep_uploaded_days: float = Field(
+        default=7.0,
+        ge=0,
+        allow_inf_nan=False,
+        description="days that a take stays in the spool after the store acknowledged it",
+    )
+    keep_uploaded_gb: float | None = Field(
+        default=None,
+        ge=0,
+        allow_inf_nan=False,
+        description="GB of acknowledged takes to keep at most, the newest (default: no limit)",
+    )
 
 
 class SpoolSafety(FrozenModel):
@@ -66,11 +131,6 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety, Retention):
         default="none",
         description="first_light: losses, delays and drifts of an ordinary station; worn_glove: a "
         "left glove with dead, stuck, saturated and drifted taxels",
-    )
-    mock_practice: bool = Field(
-        default=False,
-        description="to practise calibration: a moving board before the mock head camera, gloves "
-        "at rest",
     )
     mock_links: MockLinks = MockLinks()
     seed: int = Field(default=0, ge=0, description="random seed of mock devices")
@@ -123,12 +183,16 @@ class Enrolment(FrozenModel):
 
 def write_enrolment(path: Path, enrolment: Enrolment) -> None:
     """Write the file, readable only by its owner; StorageError if that fails."""
+    from dextouch.episodes import disk_errors, replace_file
+
     with disk_errors(f"write {path}"):
         replace_file(path, enrolment.model_dump_json(indent=1).encode(), mode=0o600)
 
 
 def check_writable(path: Path) -> None:
     """Refuse a place where `write_enrolment` would fail, before a token is used up for it."""
+    from dextouch.episodes import disk_errors, replace_file
+
     with disk_errors(f"write {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = path.with_name(f"{path.name}.probe")
@@ -146,6 +210,11 @@ def with_enrolment(settings: AcquisitionSettings) -> AcquisitionSettings:
     """
     if settings.episode_store_key is not None or not settings.enrolment.is_file():
         return settings
+    import structlog
+
+    from dextouch.episodes import disk_errors
+    from dextouch.schemas import first_problems
+
     with disk_errors(f"read {settings.enrolment}"):
         text = settings.enrolment.read_bytes()
     try:
@@ -166,7 +235,7 @@ def with_enrolment(settings: AcquisitionSettings) -> AcquisitionSettings:
         changed["station"] = enrolment.station
     elif settings.station != enrolment.station:
         # The station still records: takes wait in the spool.
-        logger.warning(
+        structlog.get_logger(__name__).warning(
             "refused_station_name",
             station=settings.station,
             enrolled_as=enrolment.station,

@@ -17,9 +17,9 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
 from services.acquisition.follow_watch import FollowWatch, MakeFollowCheck
 from services.acquisition.glove_record import NO_CELL, glove_record
-from services.acquisition.health import HealthMonitor
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.path_latency import PathWatch
-from services.acquisition.recorder import Recorder, TakeOptions
+from services.acquisition.recorder import Recorder
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -38,15 +38,8 @@ MOUNTS = {
 class Station:
     """Everything that runs beside the devices.
 
-    Args:
-        name: of the station.
-        drivers: of its devices.
-        spool_root: folder of the takes.
-        clock: stamps and waits.
-        calibration: matrices that travel with every recording.
-        safety: how often the spool reaches the disk, and how much space is kept.
-        simulated: whether the devices are mocks.
-        follow: makes the check whether the robot's hand can follow a tracked hand; None: no check.
+    `follow` makes the check whether the robot's hand can follow a tracked one; without it there is
+    none.
     """
 
     def __init__(  # noqa: PLR0913 - all by name
@@ -85,13 +78,11 @@ class Station:
             drivers=drivers,
             clock=clock,
             calibration=calibration,
-            options=TakeOptions(
-                safety or SpoolSafety(),
-                lambda: {s.driver.name: s.events() for s in self.supervisors},
-                self.health,
-                self.paths.latencies,
-                self.follow,
-            ),
+            safety=safety,
+            device_events=lambda: {s.driver.name: s.events() for s in self.supervisors},
+            health=self.health,
+            latencies=self.paths.latencies,
+            follow=self.follow,
         )
 
     def start(self) -> None:
@@ -180,7 +171,7 @@ class LiveView:
             self._newest[name] = samples[-1]
             self._num_images[name] = self._num_images.get(name, 0) + len(samples)
 
-    def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
+    def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, " taxels"]]:
         """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones.
 
         Taxels that the glove has not, or from which it has no reading, are 0.
@@ -203,12 +194,13 @@ class LiveView:
             if descriptor.kind in kinds
         }
 
-    def poses(self, now_ns: int) -> dict[str, Float32[np.ndarray, "n m"]]:
+    def poses(self, now_ns: int, *, mounted: bool = True) -> dict[str, Float32[np.ndarray, "n m"]]:
         """Newest poses and keypoints by stream, of those heard within the last 0.5 s.
 
         Returns:
             Of a body its pose T_world_NAME [4, 4], of a hand its keypoints [25, 3] in wrist axes,
-            metres; a node that is not seen is NaN. The mounts of the calibration are applied.
+            metres; a node that is not seen is NaN. The mounts of the calibration are applied; if
+            not `mounted`, poses are those of the trackers.
         """
         found: dict[str, np.ndarray] = {}
         for name, descriptor in self._descriptors.items():
@@ -220,7 +212,8 @@ class LiveView:
                 mount = self._calibration.get(f"T_{name}_wrist_{descriptor.side}")
                 found[name] = values if mount is None else apply(invert(mount), values)
             elif descriptor.kind == "pose" and _is_pose(values):
-                found[name] = self._in_world(descriptor, transform_from_pose(values))
+                T = transform_from_pose(values)
+                found[name] = self._in_world(descriptor, T) if mounted else T
         return {name: values.astype(np.float32) for name, values in found.items()}
 
     def _in_world(self, descriptor: StreamDescriptor, T: np.ndarray) -> np.ndarray:

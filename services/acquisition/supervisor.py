@@ -66,13 +66,15 @@ class StreamCounters:
     def add(self, samples: Sequence[Sample]) -> None:
         """Count new samples."""
         for sample in samples:
+            values = sample.values
             if self.last_t_host_ns is None:
-                self._start(sample)
+                self.first_t_host_ns = sample.t_host_ns
+                if values.dtype == np.uint16 and values.ndim == 1:
+                    self.low_counts, self.high_counts = values.copy(), values.copy()
             else:
                 gap_ns = sample.t_host_ns - self.last_t_host_ns
                 self.largest_gap_ns = max(self.largest_gap_ns, gap_ns)
             self.last_t_host_ns = sample.t_host_ns
-            values = sample.values
             encoded = values.dtype == np.object_
             self.num_bytes += len(values.item()) if encoded else values.nbytes
             if self.low_counts is not None and self.high_counts is not None:
@@ -80,26 +82,15 @@ class StreamCounters:
                 np.maximum(self.high_counts, values, out=self.high_counts)
         self.num_samples += len(samples)
 
-    def _start(self, sample: Sample) -> None:
-        self.first_t_host_ns = sample.t_host_ns
-        if sample.values.dtype == np.uint16 and sample.values.ndim == 1:
-            self.low_counts, self.high_counts = sample.values.copy(), sample.values.copy()
-
 
 class DeviceSupervisor:
     """Reads one device while the station runs, and reopens it after every disconnection.
 
-    Args:
-        driver: of the device; used by the supervisor's thread alone.
-        sink: called in that thread with new readings.
-        clock: of the station.
+    The driver is used by the supervisor's thread alone, in which `sink` gets new readings.
 
-    Attributes:
-        connected: whether the device is open.
-        reconnects: how often it was lost after it was open.
-        last_error: why it was lost, or could not be opened; None while it is open.
-        streams: counters of each of its streams.
-        shares: what it shares with other devices, where it was opened last.
+    `reconnects` says how often it was lost after it was open, `last_error` why, or why it could not
+    be opened (None while it is open), `shares` what it shared with other devices where it was
+    opened last.
     """
 
     def __init__(self, driver: Driver, *, sink: Sink, clock: StationClock) -> None:
@@ -168,7 +159,10 @@ class DeviceSupervisor:
         self.shares = shared_link(self.driver.info)
         self.last_error = None
         self.connected.set()
-        self._release_waiter()
+        with self._waiter_lock:
+            if self._waiter is not None:
+                self._waiter.close()
+                self._waiter = None
         while not self._stopping.is_set():
             # A decoder may name a stream without a sample.
             readings = {name: samples for name, samples in self.driver.read().items() if samples}
@@ -210,12 +204,6 @@ class DeviceSupervisor:
         self.connected.clear()
         self.driver.close()
         self._waiter.wait_until(self._clock.now_ns() + RETRY_NS)
-
-    def _release_waiter(self) -> None:
-        with self._waiter_lock:
-            if self._waiter is not None:
-                self._waiter.close()
-                self._waiter = None
 
 
 def shared_link(info: TransportInfo, *, sysfs: Path = SYSFS) -> SharedLink | None:

@@ -19,13 +19,14 @@ from dextouch.schemas import (
     TakeProblem,
 )
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.follow_watch import FollowCounts, FollowWatch
 from services.acquisition.glove_record import is_ours
-from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.health.causes import SIMULATED_ADVICE
+from services.acquisition.health.cells import count_taxels
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.supervisor import StreamCounters
 
 # What the check of the take reports itself, by the code of the health finding behind it.
@@ -66,16 +67,14 @@ def root_cause(
 ) -> TakeCause | None:
     """The cause of the gravest problem; None without problems.
 
-    Args:
-        problems: of the take.
-        causes: that the station's health saw during the take, widest first.
-        simulated: streams of simulated devices.
+    Causes are those that the station's health saw during the take, widest first.
     """
     if not problems:
         return None
     worst = min(problems, key=_rank)
     for cause in causes:
-        if worst.stream in cause.streams and _explains(cause, worst):
+        codes = [IN_THE_CHECK.get(code, (code,)) for code in cause.findings]
+        if worst.stream in cause.streams and any(worst.code in explained for explained in codes):
             return TakeCause(message=cause.message, advice=cause.advice)
     alike = {p.stream for p in problems if (p.code, p.level) == (worst.code, worst.level)}
     others = len(alike) - 1
@@ -97,10 +96,6 @@ def incomplete_cause(check: TakeCheck) -> str:
 def _rank(problem: TakeProblem) -> tuple[bool, int]:
     known = problem.code in _ORDER
     return problem.level != "ERROR", _ORDER.index(problem.code) if known else len(_ORDER)
-
-
-def _explains(cause: HealthCause, problem: TakeProblem) -> bool:
-    return any(problem.code in IN_THE_CHECK.get(code, (code,)) for code in cause.findings)
 
 
 @dataclass(frozen=True)
@@ -148,7 +143,7 @@ class StreamFacts:
         side, low, high = self.descriptor.side, self.counters.low_counts, self.counters.high_counts
         if side is None or low is None or high is None or not is_ours(self.descriptor):
             return {}
-        return count_taxels(low, high, side=side)
+        return count_taxels(low, high, side=side, layout=self.descriptor.tactile_layout)
 
     def problems(self) -> Iterator[TakeProblem]:
         """What is wrong with the stream's samples."""
@@ -176,7 +171,8 @@ class StreamFacts:
         for event, count in self.taxels().items():
             if count:
                 text = f"{count} {event.replace('_', ' ')} during the whole take"
-                is_error = count >= CODES["taxels_dead"].error * NUM_TAXELS
+                num_taxels = self.descriptor.tactile_layout.num_taxels
+                is_error = count >= CODES["taxels_dead"].error * num_taxels
                 yield _problem(name, event, "ERROR" if is_error else "WARN", text)
 
 
@@ -274,13 +270,7 @@ class TakeFindings:
 class TakeWatch:
     """What happens to the streams, devices and host of a take, from now until `end`.
 
-    Args:
-        drivers: whose streams are recorded, by name.
-        clock: of the station.
-        device_events: by device, counts of named events since the station's start; those of the
-            drivers if None.
-        health: of the station.
-        follow: whether the robot's hand could follow the tracked ones.
+    `device_events` gives counts of named events by device, since the station's start.
 
     Attributes:
         streams: counters by name of the samples that the take keeps.

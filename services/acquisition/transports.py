@@ -60,11 +60,9 @@ class TransportInfo:
 class HandleTransport(ABC, Generic[Handle]):
     """Way to one device, over what a library opens: a port, a device, a socket, a camera.
 
-    Every failure of the link is a DeviceError; an OSError of the library is one.
-
-    Attributes:
-        arrived_ns: when what the last `read` gave arrived, by the station's clock; None where that
-            is when `read` returned.
+    Every failure of the link is a DeviceError; an OSError of the library is one. `arrived_ns` is
+    when what the last `read` gave arrived, by the station's clock; None where that is when `read`
+    returned.
     """
 
     # What to look at where it cannot be opened.
@@ -166,10 +164,8 @@ def find_port(serial_number: str) -> str:
 class SerialTransport(HandleTransport["serial.Serial"]):
     """One serial port, held exclusively; a write takes 0.5 s at most.
 
-    Args:
-        find: gives the port's name at every opening, so that a replugged device is found again.
-        baud_rate: bits per second (USB devices ignore it).
-        serial_number: of the device, for messages.
+    `find` gives the port's name at every opening, so that a replugged device is found again; USB
+    devices ignore the baud rate.
     """
 
     advice = "is it in use?"
@@ -252,19 +248,25 @@ class SerialTransport(HandleTransport["serial.Serial"]):
             logger.warning("fail_to_close_port", address=self.info.address, error=str(error))
 
 
-def hid_opener(
-    *, vendor_id: int, product_id: int, serial_number: str | None = None
-) -> Callable[[], HidDevice]:
-    """What opens the real device of these ids (hidraw; the libusb backend detaches other users)."""
+@dataclass(frozen=True)
+class UsbAddress:
+    """Which device: its ids and, where several are alike, its serial number."""
 
-    def open_device() -> object:
-        import hidraw
+    vendor_id: int
+    product_id: int
+    serial_number: str | None = None
 
-        device = hidraw.device()
-        device.open(vendor_id, product_id, serial_number)
-        return device
+    def __str__(self) -> str:
+        return f"{self.vendor_id:04x}:{self.product_id:04x}"
 
-    return open_device
+
+def open_hid(address: UsbAddress) -> HidDevice:
+    """Open the real device of these ids (hidraw; the libusb backend detaches other users)."""
+    import hidraw
+
+    device = hidraw.device()
+    device.open(address.vendor_id, address.product_id, address.serial_number)
+    return device
 
 
 class HidTransport(HandleTransport[HidDevice]):
@@ -353,18 +355,6 @@ def unix_transport(path: str) -> SocketTransport:
 
 
 @dataclass(frozen=True)
-class UsbAddress:
-    """Which device: its ids and, where several are alike, its serial number."""
-
-    vendor_id: int
-    product_id: int
-    serial_number: str | None = None
-
-    def __str__(self) -> str:
-        return f"{self.vendor_id:04x}:{self.product_id:04x}"
-
-
-@dataclass(frozen=True)
 class _Opened:
     device: "Device"
     endpoint_in: int
@@ -379,10 +369,8 @@ class UsbTransport(HandleTransport[_Opened]):
     replugging, on any port. The kernel's HID driver is detached while the interface is open, and
     reattached on closing.
 
-    Args:
-        address: of the device.
-        backend: of pyusb; a new context of libusb at every opening if None, since an older one
-            learns of what is plugged in only by udev, which does not speak inside containers.
+    Without a `backend` there is a new context of libusb at every opening: an older one learns of
+    what is plugged in only by udev, which does not speak inside containers.
     """
 
     def __init__(self, address: UsbAddress, *, backend: "IBackend | None" = None) -> None:
@@ -453,27 +441,17 @@ class UsbTransport(HandleTransport[_Opened]):
         import usb.core
         import usb.util
 
-        candidates = list(
-            usb.core.find(
-                find_all=True,
-                backend=self._context,
-                idVendor=self._address.vendor_id,
-                idProduct=self._address.product_id,
-            )
-        )
+        ids = {"idVendor": self._address.vendor_id, "idProduct": self._address.product_id}
+        found = usb.core.find(find_all=True, backend=self._context, **ids)
+        candidates = [(device, _serial_number(device)) for device in found]
         wanted = self._address.serial_number
-        numbers = [_serial_number(device) for device in candidates]
-        matching = [
-            device
-            for device, number in zip(candidates, numbers, strict=True)
-            if wanted is None or number == wanted
-        ]
-        for device in candidates:
-            if len(matching) != 1 or device is not matching[0]:
+        matching = [device for device, number in candidates if wanted in {None, number}]
+        for device, _ in candidates:
+            if matching != [device]:
                 usb.util.dispose_resources(device)
         if len(matching) == 1:
             return matching[0]
-        present = ", ".join(number or "(unreadable)" for number in numbers) or "none"
+        present = ", ".join(number or "(unreadable)" for _, number in candidates) or "none"
         if matching:
             raise DeviceError(
                 f"{self.info}: {len(matching)} devices match; set serial_number to one of: "

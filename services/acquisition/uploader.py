@@ -2,6 +2,7 @@
 
 import hashlib
 import threading
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -36,14 +37,16 @@ from services.acquisition.memory import give_back_free_memory
 from services.acquisition.retention import (
     RECORDING_FILE,
     REFUSED_FILE,
+    UPLOAD_STATES,
     UPLOADED_FILE,
     DeletedTakes,
-    Retention,
     SpoolRetention,
     acknowledgement,
     remove_take,
+    spooled_takes,
+    upload_state,
 )
-from services.acquisition.retention import spooled_takes as _spools
+from services.acquisition.settings import Retention
 
 logger = structlog.get_logger(__name__)
 
@@ -70,12 +73,7 @@ class Uploader:
     take that the store refuses permanently is quarantined: it stays in the spool until `retry`. One
     that was deleted in the store is removed.
 
-    Args:
-        spool_root: folder of the takes.
-        store: where they go, closed by `stop`; None keeps them in the spool.
-        period_s: pause between two looks into the spool, and after a failure.
-        retention: how long a take stays in the spool when the store has it.
-        deleted: removes takes that were deleted in the store; None leaves them.
+    Without a store, which `stop` closes, takes stay in the spool.
     """
 
     def __init__(
@@ -115,23 +113,20 @@ class Uploader:
     @property
     def refused(self) -> Mapping[str, str]:
         """The store's reason for each quarantined take, as stored in the spool."""
-        paths = sorted(path.parent for path in self._spool_root.glob(f"*/{REFUSED_FILE}"))
-        reasons = {path.name: _refusal(path) for path in paths}
+        paths = sorted(self._spool_root.glob(f"*/{REFUSED_FILE}"))
+        reasons = {path.parent.name: _text(path) for path in paths}
         return {name: reason for name, reason in reasons.items() if reason is not None}
 
     def counts(self) -> dict[str, int]:
         """Takes of the spool that wait, are uploaded, or were refused; a running one waits too."""
-        paths = _spools(self._spool_root)
-        uploaded = sum(acknowledgement(path) is not None for path in paths)
-        refused = sum((path / REFUSED_FILE).exists() for path in paths)
-        waiting = len(paths) - uploaded - refused
-        return {"waiting": waiting, "uploaded": uploaded, "refused": refused}
+        found = Counter(map(upload_state, spooled_takes(self._spool_root)))
+        return {state: found[state] for state in UPLOAD_STATES}
 
     def status(self, *, only_refused: bool = False) -> list[UploadStatus]:
         """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []
         refused = [self._spool_root / name for name in self.refused]
-        for path in refused if only_refused else _spools(self._spool_root):
+        for path in refused if only_refused else spooled_takes(self._spool_root):
             try:
                 is_closed, damage = _condition(path)
             except NotFoundError:
@@ -180,8 +175,8 @@ class Uploader:
         """
         done = []
         self._retry_after_s = 0.0
-        for path in _spools(self._spool_root):
-            if acknowledgement(path) is not None or (path / REFUSED_FILE).exists():
+        for path in spooled_takes(self._spool_root):
+            if upload_state(path) != "waiting":
                 continue
             if self._stopping.is_set():
                 break
@@ -203,7 +198,7 @@ class Uploader:
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
         last_error, _ = self._failures.get(path.name, (None, 0))
         error = damage or last_error
-        note, stored_as, reason = acknowledgement(path), None, _refusal(path)
+        note, stored_as, reason = acknowledgement(path), None, _text(path / REFUSED_FILE)
         if note is not None:
             stored_as = note.recording_id
         elif reason is not None:
@@ -223,7 +218,7 @@ class Uploader:
         if self._deleted is None or refusal.details.get("reason") != TAKE_DELETED:
             return False
         try:
-            self._deleted.remove_refused(path)
+            self._deleted.remove_take(path, "refused by the store as deleted")
         except StorageError as error:
             self._note_failure(path, error)
             return False
@@ -365,7 +360,7 @@ def recover_spool(spool_root: Path) -> list[str]:
     is left alone, and so is a damaged one, with the reason in its folder.
     """
     recovered = []
-    for path in _spools(spool_root):
+    for path in spooled_takes(spool_root):
         try:
             if not SpoolReader(path).closed and _recover(path):
                 recovered.append(path.name)
@@ -387,7 +382,13 @@ def _recover(path: Path) -> bool:
         logger.warning("remove_empty_take", recording_id=path.name)
         return False
     with SpoolWriter.resume(path) as spool:
-        spool.set_attributes(_with_losses(spool))
+        attributes, torn = spool.attributes.as_interrupted(), spool.torn_bytes
+        # The ledger says what was cut off the log.
+        marks = [(stream.name, "torn_bytes", torn) for stream in attributes.streams if torn]
+        marks += [(name, "lost_to_damage", count) for name, count in spool.lost_samples.items()]
+        added = (LedgerEntry(stream=name, event=event, count=count) for name, event, count in marks)
+        ledger = (*attributes.ledger, *added)
+        spool.set_attributes(attributes.model_copy(update={"ledger": ledger}))
     (path / DAMAGED_FILE).unlink(missing_ok=True)
     logger.warning(
         "recover_take",
@@ -397,22 +398,6 @@ def _recover(path: Path) -> bool:
         lost_samples=spool.lost_samples,
     )
     return True
-
-
-def _with_losses(spool: SpoolWriter) -> RecordingAttributes:
-    """The attributes of an interrupted take, whose ledger says what was cut off its log."""
-    attributes = spool.attributes.as_interrupted()
-    torn = spool.torn_bytes
-    marks = [
-        LedgerEntry(stream=stream.name, event="torn_bytes", count=torn)
-        for stream in attributes.streams
-        if torn
-    ]
-    marks += [
-        LedgerEntry(stream=name, event="lost_to_damage", count=count)
-        for name, count in spool.lost_samples.items()
-    ]
-    return attributes.model_copy(update={"ledger": (*attributes.ledger, *marks)})
 
 
 def _note_damage(path: Path, damage: StorageError) -> None:
@@ -430,11 +415,6 @@ def _condition(path: Path) -> tuple[bool, str | None]:
     except StorageError as error:
         return True, error.message
     return is_closed, None if is_closed else _text(path / DAMAGED_FILE)
-
-
-def _refusal(path: Path) -> str | None:
-    """Why the store refused a take for good; None where it did not."""
-    return _text(path / REFUSED_FILE)
 
 
 def _text(path: Path) -> str | None:

@@ -56,8 +56,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         await jobs.start()
         watch = None
         if settings.align_new:
-            look = NewRecordings(store, jobs).watch(settings.period_s)
-            watch = asyncio.create_task(look)
+            watch = asyncio.create_task(NewRecordings(store, jobs).watch(settings.period_s))
         try:
             yield
         finally:
@@ -83,7 +82,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
             ServedFolder(jobs.jobs_folder, "folder of alignment jobs"),
         ],
     )
-    app.state.registry.register(jobs.metrics)
+    app.state.registry.register(jobs.metrics.registry)
     return app
 
 
@@ -106,16 +105,16 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
         `wait=true` the answer comes when all have ended (200); the failure of a single one is then
         the error itself.
         """
-        asked = await jobs.submit(request)
+        submitted = await jobs.submit(request)
         if wait:
-            asked = tuple([await jobs.wait(job.alignment_id) for job in asked])
-        if all(job.state in ENDED for job in asked):
+            submitted = tuple([await jobs.wait(job.alignment_id) for job in submitted])
+        if all(job.state in ENDED for job in submitted):
             response.status_code = status.HTTP_200_OK
         if request.recording_id is None:
-            return AlignmentList(alignments=asked, num_matching=len(asked))
-        if wait and asked[0].problem is not None:
-            raise error_from_problem(asked[0].problem)
-        return asked[0]
+            return AlignmentList(alignments=submitted, num_matching=len(submitted))
+        if wait and submitted[0].problem is not None:
+            raise error_from_problem(submitted[0].problem)
+        return submitted[0]
 
     @router.get("", responses={404: {}})
     async def listing(

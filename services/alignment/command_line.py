@@ -26,7 +26,7 @@ from dextouch.schemas import json_ready, load_scene_objects
 from dextouch.serving import load_settings
 from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
-from services.alignment.retargeting.hand_profile import calibrated_profile
+from services.alignment.retargeting.hand_retargeter import calibrated_profile
 from services.alignment.schemas import AlignmentReport, report_of
 from services.alignment.settings import AlignmentOptions, AlignmentSettings, align_parser
 from services.alignment.synchronization import Progress
@@ -71,17 +71,12 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
+    batch = parsed.store, wanted, settings.wanted_options
     with _bars(console, len(wanted)) as on_progress:
         if parsed.ray is None:
-            outcomes = align_batch(
-                parsed.store,
-                wanted,
-                settings.wanted_options,
-                num_workers=parsed.workers,
-                on_progress=on_progress,
-            )
+            outcomes = align_batch(*batch, num_workers=parsed.workers, on_progress=on_progress)
         else:
-            outcomes = align_on_cluster(parsed.store, wanted, settings.wanted_options, parsed.ray)
+            outcomes = align_on_cluster(*batch, parsed.ray)
         for _, result in chain(refused, outcomes):
             if isinstance(result, DexTouchError):
                 print(f"dextouch align: {printable(result.message)}", file=sys.stderr)
@@ -237,14 +232,14 @@ def _align_one(store_url: str, options: AlignmentOptions, recording_id: str) -> 
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
     """Recordings without an episode under these options: ids to align, and what is refused."""
-    wanted, impossible = list[str](), list[Outcome]()
+    wanted, refused = list[str](), list[Outcome]()
     for recording_id in store.list(kind="recording"):
         try:
             if not store.exists(check_recording(store, recording_id, options)):
                 wanted.append(recording_id)
-        except InvalidInputError as error:
-            impossible.append((recording_id, error))
-    return wanted, impossible
+        except DexTouchError as error:
+            refused.append((recording_id, error))
+    return wanted, refused
 
 
 def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
@@ -258,16 +253,10 @@ def report_line(report: AlignmentReport) -> str:
     """A report as one line of text."""
     verb = "aligned" if report.created else "was aligned already"
     lost = sum(clock.num_dropped for clock in report.clocks)
-    absent = f"; absent: {', '.join(report.absent)}" if report.absent else ""
-    refused = "".join(
-        f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
-        for stream, reasons in report.refused_taxels.items()
-    )
-    doubts = "".join(f"; {doubt}" for doubt in (*_doubts(report), *_implausible(report)))
-    return (
-        f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
-        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}{doubts}"
-    )
+    absent = [f"absent: {', '.join(report.absent)}"] if report.absent else []
+    facts = f"{report.num_steps} steps, {len(report.streams)} streams, {lost} samples lost"
+    more = (*absent, *_refused_taxels(report), *_unreliable(report), *_implausible(report))
+    return "; ".join((f"{report.recording_id} {verb}: {report.episode_id}, {facts}", *more))
 
 
 def report_page(report: AlignmentReport) -> Group:
@@ -279,35 +268,32 @@ def report_page(report: AlignmentReport) -> Group:
             f"{', '.join(report.absent) or 'nothing'}"
         ),
         _clocks(report),
-        *map(Text, (*_doubts(report), *_implausible(report))),
+        *map(Text, (*_unreliable(report), *_implausible(report))),
         *([_retargeting(report.retargeting)] if report.retargeting else []),
         _refused(report.refused_parts),
-        *(
-            Text(f"{stream}: taxels not measured and zero: {_by_reason(reasons)}")
-            for stream, reasons in report.refused_taxels.items()
-        ),
+        *map(Text, _refused_taxels(report)),
     )
 
 
-def _doubts(report: AlignmentReport) -> list[str]:
+def _unreliable(report: AlignmentReport) -> list[str]:
     """Streams whose times may be wrong, with the reasons."""
     found = []
     for clock in report.clocks:
-        whys = {
+        texts = {
             "skew": f"its clock is skewed by {_number(clock.skew_ppm, 0)} ppm",
             "residual": "even the earliest samples of five seconds arrive later than fitted "
             f"({_number(clock.residual_rms_ms, 1)} ms RMS of all)",
             "stop": "the device clock stopped or was slewed, or the path delay increased",
         }
         if clock.warnings:
-            reasons = " and ".join(whys[warning] for warning in clock.warnings)
+            reasons = " and ".join(texts[warning] for warning in clock.warnings)
             found.append(f"{clock.stream}: unreliable times: {reasons}")
     return found
 
 
 def _implausible(report: AlignmentReport) -> list[str]:
     """What of the streams could not be true, and the steps that gaps left to interpolation."""
-    words = {
+    texts = {
         "jump_samples": "samples elsewhere",
         "lasting_jumps": "leaps of its world",
         "frozen_samples": "frozen samples",
@@ -318,13 +304,13 @@ def _implausible(report: AlignmentReport) -> list[str]:
         "repeated_images": "repeated images",
     }
     found = [
-        f"{name.removesuffix(f'_num_{what}')}: {count:.0f} {said}"
+        f"{name.removesuffix(f'_num_{what}')}: {count:.0f} {text}"
         for name, count in report.quality.items()
-        for what, said in words.items()
+        for what, text in texts.items()
         if name.endswith(f"_num_{what}") and count
     ]
-    if given := report.quality.get("num_steps_interpolated"):
-        found.append(f"{given:.0f} of {report.num_steps} steps interpolated across gaps")
+    if num_steps := report.quality.get("num_steps_interpolated"):
+        found.append(f"{num_steps:.0f} of {report.num_steps} steps interpolated across gaps")
     return found
 
 
@@ -361,9 +347,9 @@ def _retargeting(figures: Mapping[str, Mapping[str, float]]) -> Table:
     table = _table("retargeting", columns, left=("hand", "steps by status"))
     for side, mine in figures.items():
         shares = {k.removeprefix("share_"): v for k, v in mine.items() if k.startswith("share_")}
-        told = ", ".join(f"{name} {share:.2%}" for name, share in shares.items() if share)
+        statuses = ", ".join(f"{name} {share:.2%}" for name, share in shares.items() if share)
         errors_mm = (_number(mine.get(name), 2) for name in ("tip_error_mm", "tip_error_p95_mm"))
-        table.add_row(side, *errors_mm, told)
+        table.add_row(side, *errors_mm, statuses)
     return table
 
 
@@ -385,11 +371,15 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _by_reason(reasons: Mapping[str, Sequence[int]]) -> str:
-    return ", ".join(
-        f"{reason} {' '.join(map(str, taxels[:MAX_LISTED]))}{' …' * (len(taxels) > MAX_LISTED)}"
-        for reason, taxels in reasons.items()
-    )
+def _refused_taxels(report: AlignmentReport) -> list[str]:
+    found = []
+    for stream, reasons in report.refused_taxels.items():
+        texts = (
+            f"{reason} {' '.join(map(str, taxels[:MAX_LISTED]))}{' …' * (len(taxels) > MAX_LISTED)}"
+            for reason, taxels in reasons.items()
+        )
+        found.append(f"{stream}: taxels not measured and zero: {', '.join(texts)}")
+    return found
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {

@@ -7,7 +7,8 @@ import asyncio
 import sqlite3
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 import google_crc32c
@@ -124,16 +125,13 @@ class JobQueue:
         """
         self._require_open()
         jobs = [
-            job
-            for job in self._jobs.values()
+            (position, job)
+            for position, job in enumerate(self._jobs.values())
             if job.state == (state or job.state)
             and (not recording_ids or job.recording_id in recording_ids)
         ]
-        rest = jobs
-        if after is not None:
-            ids = list(self._jobs)
-            later = set(ids[ids.index(self.get(after).alignment_id) + 1 :])
-            rest = [job for job in jobs if job.alignment_id in later]
+        last = -1 if after is None else list(self._jobs).index(self.get(after).alignment_id)
+        rest = [job for position, job in jobs if position > last]
         shown = rest[:limit]
         return AlignmentList(
             alignments=tuple(job.with_eta() for job in shown),
@@ -141,9 +139,15 @@ class JobQueue:
             next_after=shown[-1].alignment_id if len(rest) > limit else None,
         )
 
-    def jobs(self) -> list[AlignmentJob]:
-        """All jobs, in the order in which they were submitted."""
-        return list(self._jobs.values())
+    def num_jobs(self, state: JobState) -> int:
+        """Number of jobs in a state."""
+        return sum(job.state == state for job in list(self._jobs.values()))
+
+    def oldest_waiting_s(self) -> float:
+        """For how long the oldest waiting job has waited; 0 without one."""
+        waits = [job.submitted_at for job in list(self._jobs.values()) if job.state == "waiting"]
+        times = [since for since in waits if since is not None]
+        return (datetime.now(UTC) - min(times)).total_seconds() if times else 0.0
 
     @property
     def recording_ids(self) -> set[str]:
@@ -169,9 +173,8 @@ class JobQueue:
         Raises:
             LimitExceededError: too many would be open; none is added.
         """
-        again = {None, "failed", "cancelled"}
-        states = {key: job.state for key, job in self._jobs.items()}
-        new = {j.alignment_id: j for j in jobs if states.get(j.alignment_id) in again}
+        known = {key for key, job in self._jobs.items() if job.state not in {"failed", "cancelled"}}
+        new = {job.alignment_id: job for job in jobs if job.alignment_id not in known}
         num_open = sum(job.state not in ENDED for job in self._jobs.values())
         if new and num_open + len(new) > self.max_open:
             raise LimitExceededError(
@@ -218,11 +221,11 @@ class JobQueue:
 
 def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
     database = JobDatabase(folder)
-    with ExitStack() as opened:
-        opened.callback(database.close)
-        jobs = database.load()
-        opened.pop_all()
-    return database, jobs
+    try:
+        return database, database.load()
+    except StorageError:
+        database.close()
+        raise
 
 
 class JobDatabase:
@@ -244,11 +247,13 @@ class JobDatabase:
         with disk_errors(f"open the jobs in {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             self._check_emptied()
-        with ExitStack() as opened, self._errors("open"):
+        with self._errors("open"):
             self._connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
-            opened.callback(self._connection.close)
-            self._prepare(self._connection.execute)
-            opened.pop_all()
+            try:
+                self._prepare(self._connection.execute)
+            except (sqlite3.Error, StorageError):
+                self._connection.close()
+                raise
 
     def _check_emptied(self) -> None:
         """Refuse a file that was cut to nothing beside its log, which SQLite would delete."""
@@ -337,8 +342,9 @@ class JobDatabase:
                     "stop it, or give this one a --jobs-folder of its own"
                 ) from error
             if code == sqlite3.SQLITE_FULL:
-                told = f"{what}: no space left; free space and try again"
-                raise StorageFullError(told) from error
+                raise StorageFullError(
+                    f"{what}: no space left; free space and try again"
+                ) from error
             if code in DAMAGED:
                 raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
             raise StorageError(f"{what}: {error}; {MOVE_AWAY}") from error

@@ -6,19 +6,15 @@ Jobs are resumed after a restart.
 import asyncio
 import re
 import time
-from collections import Counter as Counts
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final, get_args
 
 import structlog
-from prometheus_client import Counter, Histogram
-from prometheus_client.core import GaugeMetricFamily
-from prometheus_client.metrics_core import Metric
-from prometheus_client.registry import Collector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.errors import (
@@ -51,25 +47,29 @@ EPISODE_ID = re.compile(r"(.+)-[0-9a-f]{12}")
 RETRY_S = 60.0
 
 
-class AlignmentMetrics(Collector):
-    """Shows the queue, and counts the alignments that ended since the start.
-
-    Args:
-        queue: of the service's jobs.
-    """
+class AlignmentMetrics:
+    """Shows a queue in a `registry`, and counts the alignments that ended since the start."""
 
     def __init__(self, queue: JobQueue) -> None:
-        self._queue = queue
-        self._ended = Counter(
-            "dextouch_alignments_ended", "Alignments that ended.", ("state",), registry=None
-        )
-        self._seconds = Histogram(
+        registry = self.registry = CollectorRegistry()
+        text = "Alignments that the service remembers, by state."
+        jobs = Gauge("dextouch_alignment_jobs", text, ("state",), registry=registry)
+        for state in get_args(JobState):
+            jobs.labels(state).set_function(partial(queue.num_jobs, state))
+        text = "Alignments that may wait or run; more are refused."
+        limit = Gauge("dextouch_alignment_open_jobs_limit", text, registry=registry)
+        limit.set(queue.max_open)
+        text = "For how long the oldest waiting alignment has waited; 0 without one."
+        oldest = Gauge("dextouch_alignment_oldest_waiting_seconds", text, registry=registry)
+        oldest.set_function(queue.oldest_waiting_s)
+        name, text = "dextouch_alignments_ended", "Alignments that ended."
+        self._ended = Counter(name, text, ("state",), registry=registry)
+        name, text = (
             "dextouch_alignment_seconds",
-            "Duration of the last attempt of an alignment that is done.",
-            buckets=SECONDS,
-            registry=None,
+            "Duration of the last attempt of a done alignment.",
         )
-        for state in ("done", "failed", "cancelled"):
+        self._seconds = Histogram(name, text, buckets=SECONDS, registry=registry)
+        for state in ENDED:
             self._ended.labels(state)
 
     def count(self, job: AlignmentJob) -> None:
@@ -77,26 +77,6 @@ class AlignmentMetrics(Collector):
         self._ended.labels(job.state).inc()
         if job.state == "done" and job.started_at is not None and job.ended_at is not None:
             self._seconds.observe((job.ended_at - job.started_at).total_seconds())
-
-    def collect(self) -> Iterator[Metric]:
-        """All metrics of this moment."""
-        jobs = self._queue.jobs()
-        states = Counts(job.state for job in jobs)
-        text = "Alignments that the service remembers, by state."
-        shown = GaugeMetricFamily("dextouch_alignment_jobs", text, labels=("state",))
-        for state in get_args(JobState):
-            shown.add_metric((state,), states[state])
-        yield shown
-        text = "Alignments that may wait or run; more are refused."
-        yield GaugeMetricFamily("dextouch_alignment_open_jobs_limit", text, self._queue.max_open)
-        now = datetime.now(UTC)
-        waits = (job.submitted_at for job in jobs if job.state == "waiting")
-        ages_s = [(now - since).total_seconds() for since in waits if since is not None]
-        text = "For how long the oldest waiting alignment has waited; 0 without one."
-        oldest_s = max(ages_s, default=0.0)
-        yield GaugeMetricFamily("dextouch_alignment_oldest_waiting_seconds", text, oldest_s)
-        yield from self._ended.collect()
-        yield from self._seconds.collect()
 
 
 class JobRunner:
@@ -176,7 +156,7 @@ class JobRunner:
                     # An attempt that the service itself ends does not count.
                     again = job.waiting(attempts=job.attempts - 1)
                     await self.queue.save_if_possible(again)
-        ended = asyncio.ensure_future(asyncio.to_thread(self._threads.shutdown))
+        ended = asyncio.create_task(asyncio.to_thread(self._threads.shutdown))
         while not ended.done():
             # Repeated: a worker may have been about to start when it was stopped.
             await asyncio.to_thread(self._stop_workers)
@@ -214,8 +194,8 @@ class JobRunner:
             LimitExceededError: too many are waiting.
         """
         recording = await asyncio.to_thread(self._store.recording, recording_id)
-        options = self._options
-        job = AlignmentJob.new(episode_id_of(recording, options), recording_id, options)
+        alignment_id = episode_id_of(recording, self._options)
+        job = AlignmentJob.new(alignment_id, recording_id, self._options)
         failed = job.ended("failed", error=error)
         async with self.queue.lock:
             await self.queue.add([failed])

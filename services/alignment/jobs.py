@@ -116,12 +116,12 @@ def check_recordings(
                 raise
             refused[recording_id] = error
     if refused:
-        told = "; ".join([error.message for error in refused.values()][:MAX_LISTED])
+        reasons = "; ".join([error.message for error in refused.values()][:MAX_LISTED])
         more = f"; and {len(refused) - MAX_LISTED} more" if len(refused) > MAX_LISTED else ""
         unknown = all(isinstance(error, NotFoundError) for error in refused.values())
         raise (NotFoundError if unknown else InvalidInputError)(
             f"alignments: {len(refused)} of {len(recording_ids)} recordings cannot be aligned, so "
-            f"no job was started; omit them: {told}{more}",
+            f"no job was started; omit them: {reasons}{more}",
             refused={recording_id: error.message for recording_id, error in refused.items()},
         )
     return episodes
@@ -129,8 +129,8 @@ def check_recordings(
 
 def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
     """The id of the episode that a recording becomes under these options."""
-    mine = options.of_task(recording.attributes.task).model_dump_json()
-    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {mine}"
+    used = options.of_task(recording.attributes.task).model_dump_json()
+    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {used}"
     digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
     return f"{recording.attributes.recording_id[:MAX_STEM]}-{digest}"
 

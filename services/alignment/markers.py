@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import invert, transform, transform_from_pose
+from dextouch.geometry import apply, invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector, vector_from_rotation
 from dextouch.schemas import MarkerDictionary, ObjectMarker, SceneObject, SceneObjects
 
@@ -170,17 +170,18 @@ class MarkerTracker:
         markers = [marker for marker in one.markers if len(found.get(marker.id, [])) == 1]
         if not markers:
             return
-        points_m = np.concatenate([_corners_m(m.size_m, np.array(m.pose)) for m in markers])
+        Ts_object_marker = [transform_from_pose(np.array(marker.pose)) for marker in markers]
+        corners_m = [_corners_m(marker.size_m) for marker in markers]
+        points_m = np.concatenate([*map(apply, Ts_object_marker, corners_m)])
         pixels = np.concatenate([found[marker.id][0] for marker in markers])
         poses = []
-        for marker in markers:
-            T_marker_object = invert(transform_from_pose(np.array(marker.pose)))
-            flat = _flat_corners_m(marker.size_m)
+        for marker, flat, T_object_marker in zip(markers, corners_m, Ts_object_marker, strict=True):
             number, turns, shifts, _ = cv2.solvePnPGeneric(
                 flat, found[marker.id][0], *self._lens, flags=cv2.SOLVEPNP_IPPE_SQUARE
             )
             for turn, shift in zip(turns[:number], shifts[:number], strict=True):
-                T = transform(rotation_from_vector(turn.ravel()), shift.ravel()) @ T_marker_object
+                T_camera_marker = transform(rotation_from_vector(turn.ravel()), shift.ravel())
+                T = T_camera_marker @ invert(T_object_marker)
                 poses.append(self._refined(points_m, pixels, T))
         poses.sort(key=lambda candidate: candidate.error_px)
         if len(markers) > 1:
@@ -205,16 +206,10 @@ class MarkerTracker:
         return _Candidate(refined, error_px if in_front else np.inf)
 
 
-def _flat_corners_m(size_m: float) -> Float64[np.ndarray, "4 3"]:
+def _corners_m(size_m: float) -> Float64[np.ndarray, "4 3"]:
     """Corners of a marker in its own frame, in the order of OpenCV's IPPE_SQUARE and detector."""
     half = 0.5 * size_m
     return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
-
-
-def _corners_m(size_m: float, pose: np.ndarray) -> Float64[np.ndarray, "4 3"]:
-    """Corners of a marker in the frame of its object."""
-    T = transform_from_pose(pose)
-    return _flat_corners_m(size_m) @ T[:3, :3].T + T[:3, 3]
 
 
 def _decided(seen: Sequence[tuple[int, list[_Candidate]]]) -> TrackedObject:
@@ -274,19 +269,19 @@ def marker_sheet(objects: SceneObjects) -> str:
     Raises:
         InvalidInputError: there is no marker, or one is larger than the page.
     """
-    wanted = {
+    printed = {
         (one.name, marker.id, marker.size_m): marker
         for listed in objects.tasks.values()
         for one in listed
         for marker in one.markers
     }
-    if not wanted:
+    if not printed:
         raise InvalidInputError("markers: the objects have none to print")
     cells = cells_of_markers(objects)
-    places, height_mm = _places([marker.size_m for marker in wanted.values()])
+    places, height_mm = _places([marker.size_m for marker in printed.values()])
     drawn = [
         part
-        for ((name, *_), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
+        for ((name, *_), marker), (x_mm, y_mm) in zip(printed.items(), places, strict=True)
         for part in _marker(name, marker, x_mm, y_mm, cells[marker.id])
     ]
     width_mm = PAGE_MM[0]

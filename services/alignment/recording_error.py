@@ -15,7 +15,7 @@ from dextouch.hands.actions import poses_from_actions
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
 from dextouch.metrics import tactile
 from dextouch.tactile import in_contact
-from dextouch.tactile.layout import SIDES, Side
+from dextouch.tactile.layout import SIDES, Side, TactileLayout, common_layout
 from services.alignment.retargeting.hand_retargeter import HandRetargeter
 from services.alignment.synchronization.resampling import (
     GridPlacement,
@@ -81,10 +81,17 @@ def compare_with_truth(
         )
     left = {name: (m.mean_offset_ns + origin_ns) / NS_PER_MS for name, m in matches.items()}
     known = {report.stream: report.latency_ms or 0.0 for report in episode.attributes.clocks}
+    touch = [name for name in matches if episode.streams[name].kind == "tactile"]
+    layout = common_layout(
+        [one.streams[name].tactile_layout for name in touch for one in (episode, truth)],
+        what=f"episode {episode.attributes.episode_id!r} and its truth",
+    )
     gloves = (
-        (episode.read(name).values[m.index], truth.read(name).values[m.true_index])
-        for name, m in matches.items()
-        if episode.streams[name].kind == "tactile"
+        (
+            episode.read(name).values[matches[name].index],
+            truth.read(name).values[matches[name].true_index],
+        )
+        for name in touch
     )
     return {
         "clock_rms_ms": {
@@ -94,7 +101,7 @@ def compare_with_truth(
         "latency_ms": {name: known.get(name, 0.0) + error for name, error in left.items()},
         "latency_error_ms": left,
         "num_dropped": {name: m.num_dropped for name, m in matches.items()},
-        **_taxel_errors(gloves),
+        **_taxel_errors(gloves, layout),
         **_pose_errors(episode, truth, origin_ns),
     }
 
@@ -157,15 +164,18 @@ def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: in
     return float(np.abs(values[inside] - nearest).mean())
 
 
-def _taxel_errors(gloves: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict[str, float | None]:
+def _taxel_errors(
+    gloves: Iterable[tuple[np.ndarray, np.ndarray]], layout: TactileLayout
+) -> dict[str, float | None]:
     """Errors over pressures of all gloves, each beside the true ones."""
     pairs = list(gloves)
     if not pairs:
         return {"taxel_iou": None, "taxel_mae_kpa": None}
     mine, true = (np.concatenate(arrays).astype(np.float64) for arrays in zip(*pairs, strict=True))
     touched = bool((in_contact(mine) | in_contact(true)).any())
-    iou = tactile.contact_iou(predicted_kpa=mine, true_kpa=true) if touched else None
-    return {"taxel_iou": iou, "taxel_mae_kpa": tactile.mae(predicted_kpa=mine, true_kpa=true)}
+    both = {"predicted_kpa": mine, "true_kpa": true}
+    iou = tactile.contact_iou(**both, layout=layout) if touched else None
+    return {"taxel_iou": iou, "taxel_mae_kpa": tactile.mae(**both, layout=layout)}
 
 
 def _pose_errors(episode: EpisodeReader, truth: EpisodeReader, origin_ns: int) -> dict[str, float]:

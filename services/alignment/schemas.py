@@ -114,12 +114,12 @@ class AlignmentJob(FrozenModel):
             options=options,
             state="waiting",
             progress=0.0,
-            submitted_at=_now(),
+            submitted_at=datetime.now(UTC),
         )
 
     def started(self) -> "AlignmentJob":
         """A worker begins the next attempt."""
-        return self._with(state="running", attempts=self.attempts + 1, started_at=_now())
+        return self._with(state="running", attempts=self.attempts + 1, started_at=datetime.now(UTC))
 
     def with_progress(self, progress: Progress) -> "AlignmentJob":
         """Further along; progress never decreases."""
@@ -137,7 +137,7 @@ class AlignmentJob(FrozenModel):
         problem = error and problem_from_error(error, instance=self.alignment_id, request_id="")
         return self._with(
             state=state,
-            ended_at=_now(),
+            ended_at=datetime.now(UTC),
             progress=1.0 if state == "done" else self.progress,
             stage=None,
             stream=None,
@@ -169,14 +169,14 @@ class AlignmentJob(FrozenModel):
         """Whether it failed at least `for_s` ago because no space was left."""
         if self.state != "failed" or self.problem is None or self.ended_at is None:
             return False
-        is_old = (_now() - self.ended_at).total_seconds() >= for_s
+        is_old = (datetime.now(UTC) - self.ended_at).total_seconds() >= for_s
         return is_old and self.problem.status == HTTPStatus.INSUFFICIENT_STORAGE
 
     def with_eta(self) -> "AlignmentJob":
         """Estimates the remaining time from the time that the progress took so far."""
         if self.state != "running" or self.started_at is None or self.progress < MIN_ETA_SHARE:
             return self
-        elapsed_s = max((_now() - self.started_at).total_seconds(), 0.0)
+        elapsed_s = max((datetime.now(UTC) - self.started_at).total_seconds(), 0.0)
         return self._with(eta_s=elapsed_s * (1 - self.progress) / self.progress)
 
     def _with(self, **changes: object) -> "AlignmentJob":
@@ -197,6 +197,10 @@ class AlignmentList(FrozenModel):
 def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> AlignmentReport:
     """The report of an episode that alignment wrote."""
     attributes = episode.attributes
+    retargeting: dict[str, dict[str, float]] = {}
+    for name, value in attributes.quality.items():
+        if match := re.fullmatch(r"retargeting_(left|right)_(.+)", name):
+            retargeting.setdefault(match[1], {})[match[2]] = value
     return AlignmentReport(
         recording_id=recording_id,
         episode_id=attributes.episode_id,
@@ -205,26 +209,14 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
         num_steps=episode.num_steps,
         duration_s=episode.num_steps / attributes.model_rate_hz,
         streams={name: episode.num_samples(name) for name in episode.streams},
-        absent=(
-            *attributes.absent,
-            *(name for name in EXPECTED_STREAMS if name not in episode.streams),
-        ),
+        absent=(*attributes.absent, *(n for n in EXPECTED_STREAMS if n not in episode.streams)),
         clocks=attributes.clocks,
         quality=attributes.quality,
-        retargeting=_retargeting_figures(attributes.quality),
+        retargeting=retargeting,
         refused_parts=refused_parts(attributes.calibration),
         refused_taxels=_refused_taxels(attributes.calibration),
         content_sha256=episode.content_sha256,
     )
-
-
-def _retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """By side; empty where nothing was retargeted."""
-    found: dict[str, dict[str, float]] = {}
-    for name, value in quality.items():
-        if match := re.fullmatch(r"retargeting_(left|right)_(.+)", name):
-            found.setdefault(match[1], {})[match[2]] = value
-    return found
 
 
 def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tuple[int, ...]]]:
@@ -236,7 +228,3 @@ def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tu
             taxels = tuple(np.flatnonzero(states == code).tolist())
             found.setdefault(name, {})[REASONS[code]] = taxels
     return found
-
-
-def _now() -> datetime:
-    return datetime.now(UTC)

@@ -17,11 +17,7 @@ _CHOICES: Final = re.compile(r"\{([\w,.-]+)\}")
 
 
 def command_tree(targets: Mapping[str, tuple[str, str]]) -> argparse.ArgumentParser:
-    """Parser of the whole program, for shells; it parses nothing itself.
-
-    Args:
-        targets: summary and `module:function` of each command; groups have no target.
-    """
+    """Parser of the whole program, for shells; `targets` are summaries and `module:function`s."""
     root = CommandParser(prog="dextouch")
     root.add_argument("--version", action="store_true", help="print the version")
     root.add_subparsers(dest="command")

@@ -10,22 +10,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, SecretStr, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 from pydantic_settings import EnvSettingsSource, SettingsError
 
+from dextouch import serving
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import DATA_VARIABLE, data_folder
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.serving import (
-    DATA,
-    CommandSettings,
-    configuration_path,
-    explained,
-    file_source,
-    line_of,
-    read_configuration,
-)
 
 # Settings class of each section, imported when it is asked for.
 SECTIONS: Final = {
@@ -66,7 +57,7 @@ class Setting(NamedTuple):
     origin: str
 
 
-def settings_class(section: str) -> type[CommandSettings]:
+def settings_class(section: str) -> type[serving.CommandSettings]:
     """Settings class of a section.
 
     Raises:
@@ -75,7 +66,9 @@ def settings_class(section: str) -> type[CommandSettings]:
     if section not in SECTIONS:
         raise UnknownNameError("section", section, list(SECTIONS))
     module, _, name = SECTIONS[section].partition(":")
-    found: type[CommandSettings] = getattr(importlib.import_module(f"services.{module}"), name)
+    found: type[serving.CommandSettings] = getattr(
+        importlib.import_module(f"services.{module}"), name
+    )
     return found
 
 
@@ -87,16 +80,16 @@ def apply_configuration() -> None:
     Raises:
         InvalidInputError: an unknown section, or an unreadable file.
     """
-    path = configuration_path()
+    path = serving.configuration_path()
     if path is None:
         return
-    for name, value in read_configuration(path).items():
-        if name == DATA:
+    for name, value in serving.read_configuration(path).items():
+        if name == serving.DATA:
             os.environ.setdefault(DATA_VARIABLE, str(path.parent / Path(value).expanduser()))
         elif name not in SECTIONS:
             raise InvalidInputError(
-                f"{path}:{line_of(path, (name,))}: unknown section [{name}], expected one of "
-                f"{', '.join(SECTIONS)}"
+                f"{path}:{serving.line_of(path, (name,))}: unknown section [{name}], expected one "
+                f"of {', '.join(SECTIONS)}"
             )
 
 
@@ -111,12 +104,12 @@ def effective_settings(section: str) -> list[Setting]:
         kind()
     except ValidationError as error:
         if any(item["type"] != "missing" for item in error.errors()):
-            problems = explained(error, section)
+            problems = serving.explained(error, section)
             raise InvalidInputError(f"settings of [{section}]: {problems}") from error
     except SettingsError as error:
         raise InvalidInputError(f"settings of [{section}]: {error}; is it JSON?") from error
-    path = configuration_path()
-    in_file = dict(_leaves(file_source(kind)[0]())) if file_source(kind) else {}
+    path = serving.configuration_path()
+    in_file = dict(_leaves(serving.file_source(kind)[0]())) if serving.file_source(kind) else {}
     in_environment = dict(_leaves(EnvSettingsSource(kind)()))
     known = dict(_defaults(kind))
     prefix = str(kind.model_config.get("env_prefix"))
@@ -128,7 +121,7 @@ def effective_settings(section: str) -> list[Setting]:
             origin = origin if origin in os.environ else prefix + keys[0].upper()
             value = in_environment[keys]
         elif keys in in_file:
-            line = line_of(path, (section, *keys)) if path else None
+            line = serving.line_of(path, (section, *keys)) if path else None
             value, origin = in_file[keys], f"{path}:{line}"
         elif inner:
             continue
@@ -188,16 +181,15 @@ def _defaults(
     """Defaults of all settings, also of nested ones."""
     for name, field in kind.model_fields.items():
         keys = (*above, field.alias or name)
-        value = _default(field) if given is None else getattr(given, name)
+        value = field.get_default(call_default_factory=True, validated_data={})
+        if given is not None:
+            value = getattr(given, name)
+        elif value is PydanticUndefined:
+            value = REQUIRED
         if isinstance(value, BaseModel):
             yield from _defaults(type(value), value, keys)
         else:
             yield keys, to_jsonable_python(value, fallback=str)
-
-
-def _default(field: FieldInfo) -> object:
-    value = field.get_default(call_default_factory=True, validated_data={})
-    return REQUIRED if value is PydanticUndefined else value
 
 
 def _place(kind: type[BaseModel], keys: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
@@ -258,7 +250,7 @@ def show_main(argv: Sequence[str]) -> int:
     parser.add_argument("section", nargs="?", choices=list(SECTIONS), metavar="SECTION", help=names)
     add_json(parser)
     options = parser.parse_args(list(argv))
-    path = configuration_path()
+    path = serving.configuration_path()
     print(f"# {path.resolve() if path else 'no dextouch.toml here, and no DEXTOUCH_CONFIG'}")
     print(f"# data folder: {data_folder()}")
     result: dict[str, Any] = {}

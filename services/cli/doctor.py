@@ -63,8 +63,6 @@ DEVICE_KINDS: Final = {
 }
 MAX_LATENCY_TIMER_MS = 1
 MIN_MEMORY_BYTES = 2 * 10**9
-# Kernels from 5.18 on always show 256.
-MIN_ENTROPY_BITS = 128
 NVIDIA, DISPLAY_CLASS = "0x10de", "0x03"
 COMMAND_TIMEOUT_S = 5.0
 
@@ -119,16 +117,7 @@ def find_rules() -> Path:
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine that is checked, and how it is asked.
-
-    Attributes:
-        root: of the file system.
-        may_open: whether a device file may be opened.
-        is_free: whether a port is free.
-        output_of: what a program prints, None where it fails.
-        rules: the udev rules that give access to devices.
-        ports: that `dextouch up` listens on, by service.
-    """
+    """The machine that is checked, and how it is asked; `ports` are those of `dextouch up`."""
 
     root: Path = Path("/")
     may_open: Callable[[Path], bool] = may_open
@@ -145,8 +134,7 @@ class Machine:
             self._clock(),
             *self._ports(),
             *self._memory(),
-            *self._entropy(),
-            *self._gpus(),
+            self._gpu(),
         ]
 
     def _text(self, path: str | Path) -> str | None:
@@ -159,113 +147,93 @@ class Machine:
     def _devices(self) -> list[Finding]:
         """Which devices there are, and whether they may be opened."""
         findings, dev = [], self.root / "dev"
+        access = (
+            f"sudo install -m 644 {self.rules} /etc/udev/rules.d/ && "
+            "sudo udevadm control --reload && sudo udevadm trigger"
+        )
         for kind, patterns in DEVICE_KINDS.items():
             paths = sorted(path for pattern in patterns for path in dev.glob(pattern))
             names = [str(path.relative_to(dev)) for path in paths]
             closed = [name for name in names if not self.may_open(dev / name)]
-            # Access to USB devices by libusb is needed only for those without a driver.
-            is_usb = kind == "USB devices"
-            if closed and not is_usb:
-                found = f"no access: {', '.join(closed)}"
-                findings.append(Finding(kind, found, ok=False, do=self._access(), required=False))
-            elif is_usb:
+            if kind == "USB devices" and names:
+                # Access to USB devices by libusb is needed only for those without a driver.
                 num_open = len(names) - len(closed)
-                found = f"{len(names)}, of which {num_open} may be opened" if names else "none"
-                do = self._access() if closed and len(closed) == len(names) else ""
-                findings.append(Finding(kind, found, ok=not do, do=do, required=False))
+                found = f"{len(names)}, of which {num_open} may be opened"
+                findings.append(_advice(kind, found, "" if num_open else access))
+            elif closed:
+                findings.append(_advice(kind, f"no access: {', '.join(closed)}", access))
             else:
                 findings.append(Finding(kind, ", ".join(names) or "none"))
         return findings
 
-    def _access(self) -> str:
-        return (
-            f"sudo install -m 644 {self.rules} /etc/udev/rules.d/ && "
-            "sudo udevadm control --reload && sudo udevadm trigger"
-        )
-
     def _latency_timers(self) -> list[Finding]:
         """FTDI chips hold bytes back for 16 ms unless they are told to send at once."""
         findings = []
-        folder = self.root / "sys/bus/usb-serial/devices"
-        for path in sorted(folder.glob("*/latency_timer")):
+        for path in sorted((self.root / "sys/bus/usb-serial/devices").glob("*/latency_timer")):
             name, text = path.parent.name, self._text(path) or ""
             is_short = text.isdecimal() and int(text) <= MAX_LATENCY_TIMER_MS
             do = f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer"
-            what, found = f"latency timer of {name}", f"{text or 'unknown'} ms"
-            do = "" if is_short else do
-            findings.append(Finding(what, found, ok=is_short, do=do, required=False))
+            found = f"{text or 'unknown'} ms"
+            findings.append(_advice(f"latency timer of {name}", found, "" if is_short else do))
         return findings
 
     def _clock(self) -> Finding:
         """Whether something keeps the wall clock right, which names and dates the takes."""
         shown = self.output_of(["timedatectl", "show", "--property=NTPSynchronized", "--value"])
         tracking = self.output_of(["chronyc", "-n", "tracking"]) or ""
-        is_right = (shown or "").strip() == "yes" or ": Normal" in tracking
-        what = "wall clock"
-        if is_right:
-            return Finding(what, "synchronized")
+        if (shown or "").strip() == "yes" or ": Normal" in tracking:
+            return Finding("wall clock", "synchronized")
         known = shown is not None or tracking
         found = "not synchronized" if known else "unknown: neither timedatectl nor chronyc answers"
         do = "sudo apt-get install chrony && sudo systemctl enable --now chrony"
-        return Finding(what, found, ok=False, do=do, required=False)
+        return _advice("wall clock", found, do)
 
     def _ports(self) -> list[Finding]:
-        """Whether `dextouch up` can listen where its settings say."""
-        # 0 stands for any free one.
+        """Whether `dextouch up` can listen where its settings say; 0 stands for any free port."""
         ports = {name: port for name, port in self.ports.items() if port}
         taken = {name: port for name, port in ports.items() if not self.is_free(port)}
         what = "ports of dextouch up"
-        if not ports:
-            return []
-        if not taken:
-            return [Finding(what, f"{', '.join(map(str, ports.values()))} are free")]
-        found = "in use: " + ", ".join(f"{port} ({name})" for name, port in taken.items())
-        other = " ".join(f"--{name.replace('_', '-')}-port 0" for name in taken)
-        return [Finding(what, found, ok=False, do=f"dextouch up {other}", required=False)]
+        if taken:
+            found = "in use: " + ", ".join(f"{port} ({name})" for name, port in taken.items())
+            other = " ".join(f"--{name.replace('_', '-')}-port 0" for name in taken)
+            return [_advice(what, found, f"dextouch up {other}")]
+        return [Finding(what, f"{', '.join(map(str, ports.values()))} are free")] if ports else []
 
     def _memory(self) -> list[Finding]:
-        text = self._text("proc/meminfo")
-        if text is None:
+        sizes_kb = _colon_fields(self._text("proc/meminfo") or "")
+        if not sizes_kb:
             return []
-        sizes_kb = _colon_fields(text)
-        free_bytes = 1024 * int(sizes_kb.get("MemAvailable", "0 kB").split()[0])
-        all_bytes = 1024 * int(sizes_kb.get("MemTotal", "0 kB").split()[0])
+        free_bytes, all_bytes = (
+            1024 * int(sizes_kb.get(name, "0 kB").split()[0])
+            for name in ("MemAvailable", "MemTotal")
+        )
         found = f"{free_bytes / 1e9:.1f} of {all_bytes / 1e9:.1f} GB"
         is_enough = free_bytes >= MIN_MEMORY_BYTES
         do = "" if is_enough else "ps -eo pid,rss,comm --sort=-rss | head"
-        return [Finding("free memory", found, ok=is_enough, do=do, required=False)]
+        return [_advice("free memory", found, do)]
 
-    def _entropy(self) -> list[Finding]:
-        """Keys and ids are drawn from the kernel, which must have something to draw from."""
-        text = self._text("proc/sys/kernel/random/entropy_avail")
-        if text is None or not text.isdecimal():
-            return []
-        is_enough = int(text) >= MIN_ENTROPY_BITS
-        do = "" if is_enough else "sudo apt-get install rng-tools5"
-        found = f"{text} bits"
-        return [Finding("random numbers of the kernel", found, ok=is_enough, do=do, required=False)]
-
-    def _gpus(self) -> list[Finding]:
+    def _gpu(self) -> Finding:
         """NVIDIA graphics cards, and whether their driver runs."""
-        cards = [
-            path.parent
-            for path in sorted((self.root / "sys/bus/pci/devices").glob("*/vendor"))
-            if self._text(path) == NVIDIA
+        what = "GPU (optional)"
+        if self._text("proc/driver/nvidia/version") is not None:
+            files = sorted((self.root / "proc/driver/nvidia/gpus").glob("*/information"))
+            cards = [_colon_fields(self._text(path) or "") for path in files]
+            names = ", ".join(card.get("Model", "GPU") for card in cards if card)
+            return Finding(what, names or "NVIDIA driver is loaded")
+        num_cards = sum(
+            self._text(path) == NVIDIA
             and (self._text(path.parent / "class") or "").startswith(DISPLAY_CLASS)
-        ]
-        version = self._text("proc/driver/nvidia/version")
-        if version is not None:
-            names = [
-                fields.get("Model", "GPU")
-                for path in sorted((self.root / "proc/driver/nvidia/gpus").glob("*/information"))
-                if (fields := _colon_fields(self._text(path) or ""))
-            ]
-            return [Finding("GPU (optional)", ", ".join(names) or "NVIDIA driver is loaded")]
-        if cards:
-            found = f"{len(cards)} NVIDIA card without a driver"
+            for path in (self.root / "sys/bus/pci/devices").glob("*/vendor")
+        )
+        if num_cards:
             do = "sudo apt-get install nvidia-driver && sudo reboot"
-            return [Finding("GPU (optional)", found, ok=False, do=do, required=False)]
-        return [Finding("GPU (optional)", "none: models run on the processor")]
+            return _advice(what, f"{num_cards} NVIDIA card without a driver", do)
+        return Finding(what, "none: models run on the processor")
+
+
+def _advice(what: str, found: str, do: str = "") -> Finding:
+    """What is not required, and is in order if there is nothing to do."""
+    return Finding(what, found, ok=not do, do=do, required=False)
 
 
 def _colon_fields(text: str) -> Mapping[str, str]:
@@ -298,7 +266,6 @@ def examine() -> list[Finding]:
 
 def _ports_of_up() -> tuple[dict[str, int], list[Finding]]:
     """Ports of `dextouch up` as its settings have them, and what is wrong with the settings."""
-    what = "settings of dextouch up"
     try:
         # It needs the extra `serve`.
         from services.cli.up import ports_of_up
@@ -310,7 +277,7 @@ def _ports_of_up() -> tuple[dict[str, int], list[Finding]]:
             raise
         return {}, [Finding("ports of dextouch up", "unknown: it cannot run", required=False)]
     except InvalidInputError as error:
-        return {}, [Finding(what, error.message, ok=False, do="correct them", required=False)]
+        return {}, [_advice("settings of dextouch up", error.message, "correct them")]
 
 
 def _optional(name: str, purpose: str) -> Finding:
@@ -321,7 +288,6 @@ def _optional(name: str, purpose: str) -> Finding:
 
 
 def _package(name: str, purpose: str) -> Finding:
-    """Whether a package is installed, and its version."""
     what = f"{name} ({purpose})"
     if importlib.util.find_spec(name) is None:
         return Finding(what, "no", ok=False, do=install_hint(name))
@@ -350,7 +316,7 @@ def _outdated() -> list[Finding]:
             spec = f"{requirement.name}{requirement.specifier}"
             do = f"pip install '{spec}'"
             found = f"{version}, expected {requirement.specifier}"
-            wrong.append(Finding(requirement.name, found, ok=False, do=do, required=False))
+            wrong.append(_advice(requirement.name, found, do))
     return wrong
 
 

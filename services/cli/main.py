@@ -42,10 +42,15 @@ COMMANDS = {
         "twin.command_line:main",
         "twin.parser:twin_parser",
     ),
-    "twin serve": Command("serve rollouts in the twin", "twin.serving:serve", "twin"),
+    "twin serve": Command("serve rollouts in the twin", "twin.world:serve", "twin"),
     "station": Command("record and calibrate a station's devices"),
     "station serve": Command(
         "record gloves, trackers and cameras", "pipelines.station:main", "acquisition"
+    ),
+    "station bridge": Command(
+        "serve samples of other makers' trackers and programs to stations",
+        "acquisition.sdk_bridges.command_line:main",
+        "acquisition.sdk_bridges.parser:bridge_parser",
     ),
     "station enrol": Command(
         "exchange a one-time token for the station's key of the store",

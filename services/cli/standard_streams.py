@@ -21,7 +21,6 @@ class _Output(io.FileIO):
     """File of a standard stream that remembers why it could not be written."""
 
     def write(self, data: "ReadableBuffer", /) -> int:
-        """Write, or remember the failure."""
         try:
             return super().write(data)
         except OSError as error:

@@ -179,8 +179,8 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
 
 def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     from dextouch.worlds import create_world_app
-    from services.twin.serving import twin_worlds
     from services.twin.settings import TwinServiceSettings
+    from services.twin.world import twin_worlds
 
     settings = TwinServiceSettings()
     return create_world_app(twin_worlds(settings.scene), settings, name="twin")
@@ -265,7 +265,6 @@ def held_data_folder(folder: Path) -> Iterator[Callable[[str], None]]:
 
 
 def _tell(descriptor: int, dashboard_url: str) -> None:
-    """Write who holds the lock."""
     text = f"process {os.getpid()}, dashboard at {dashboard_url}"
     with disk_errors("write the lock of the data folder"):
         os.ftruncate(descriptor, 0)

@@ -10,19 +10,13 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
+from services.dashboard import routes
 from services.dashboard.audit import AuditLog, AuditTrail
 from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
 from services.dashboard.fleet import Fleet
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
-from services.dashboard.routes import (
-    api_router,
-    comparison_router,
-    forwarding_router,
-    live_router,
-    system_router,
-)
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.system import System
 from services.dashboard.upstream import Upstream, upstream_histogram
@@ -33,12 +27,7 @@ STATIC = Path(__file__).parent / "static"
 def create_app(
     settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None = None
 ) -> FastAPI:
-    """Create the dashboard's application.
-
-    Args:
-        settings: services to show, and access control.
-        upstreams: clients of the services; created from the settings' URLs by default.
-    """
+    """The dashboard's application; clients are made from the settings' URLs if none are given."""
     upstreams, stations = _clients(settings, upstreams)
     clients = (*upstreams.values(), *stations.values())
     feeds = {
@@ -68,11 +57,11 @@ def create_app(
         settings=settings,
         routers=[
             page_router(settings, sessions),
-            api_router(settings, fleet, sessions),
-            forwarding_router(fleet, sessions),
-            comparison_router(comparisons, sessions),
-            system_router(system, audit_log, sessions, upstreams.get("episode_store")),
-            live_router(
+            routes.api_router(settings, fleet, sessions),
+            routes.forwarding_router(fleet, sessions),
+            routes.comparison_router(comparisons, sessions),
+            routes.system_router(system, audit_log, sessions, upstreams.get("episode_store")),
+            routes.live_router(
                 fleet,
                 [
                     comparisons.topics.get,
@@ -88,7 +77,13 @@ def create_app(
     app.add_middleware(
         AuditTrail, log=audit_log, sessions=sessions, station=next(iter(fleet.names))
     )
-    _add_metrics(app.state.registry, clients, sessions)
+    seconds = upstream_histogram()
+    for client in clients:
+        client.seconds = seconds
+    registry: CollectorRegistry = app.state.registry
+    registry.register(seconds)
+    num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
+    num_sessions.set_function(lambda: sessions.num_open)
     app.state.sessions = sessions
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
@@ -98,7 +93,6 @@ def create_app(
 def _clients(
     settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None
 ) -> tuple[Mapping[str, Upstream], dict[str, Upstream]]:
-    """Clients of the services, and of the stations by name."""
     if upstreams is not None:
         station = upstreams.get("acquisition")
         return upstreams, {} if station is None else {settings.station: station}
@@ -109,17 +103,6 @@ def _clients(
         {name: connect(name, url) for name, url in settings.upstream_urls().items()},
         {name: connect("acquisition", url) for name, url in settings.station_urls().items()},
     )
-
-
-def _add_metrics(
-    registry: CollectorRegistry, clients: Sequence[Upstream], sessions: Sessions
-) -> None:
-    seconds = upstream_histogram()
-    for client in clients:
-        client.seconds = seconds
-    registry.register(seconds)
-    num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
-    num_sessions.set_function(lambda: sessions.num_open)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -63,8 +63,12 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/v1/alignment/alignments/{alignment_id}/cancel": "cancel alignment",
     "/v1/alignment/calibration/runs": "start calibration",
     "/v1/alignment/calibration/run/answer": "answer calibration",
+    "/v1/alignment/calibration/run/take": "keep calibration place",
+    "/v1/alignment/calibration/run/drop": "drop calibration place",
     "/v1/alignment/calibration/run/finish": "finish calibration",
     "/v1/alignment/calibration/run/cancel": "cancel calibration",
+    "/v1/alignment/calibration/practice/start": "start practice devices",
+    "/v1/alignment/calibration/practice/stop": "stop practice devices",
 }
 OF_STATION: Final = ("/v1/recorder/", "/v1/uploads/")
 # Fields of bodies that name what is changed, or how; all others may be private.
@@ -100,14 +104,9 @@ class AuditEntry(FrozenModel):
 class AuditPage(FrozenModel):
     """The newest entries, newest first.
 
-    Attributes:
-        has_more: whether older entries match, too.
-        actions: all that there are.
-        people: whose entries were read on the way.
-        folder: where the log is kept; None if only in memory, until the dashboard ends.
-        num_damaged: unreadable lines among those that were read.
-        num_lost: entries that could not be written since the dashboard started.
-        no_used_tokens: why the entries of enrolled stations are missing; empty if they are not.
+    `people` are those whose entries were read on the way, `folder` is None for a log in memory
+    alone, `num_damaged` counts unreadable lines among those read, `num_lost` entries that could not
+    be written since the start; `no_used_tokens` says why entries of enrolled stations are missing.
     """
 
     entries: tuple[AuditEntry, ...]
@@ -121,13 +120,9 @@ class AuditPage(FrozenModel):
 
 
 class RotatedLines:
-    """Lines in numbered files of a folder, of which old ones are deleted.
+    """Lines in numbered files of a folder, `max_bytes` together, of which old ones are deleted.
 
-    Args:
-        folder: of the files.
-        name: their beginning.
-        max_bytes: of all files together.
-        sync: whether a line survives a power loss, not only the end of the process.
+    With `sync` a line survives a power loss, not only the end of the process.
     """
 
     def __init__(self, folder: Path, name: str, *, max_bytes: int, sync: bool) -> None:
@@ -159,7 +154,11 @@ class RotatedLines:
         finally:
             os.close(descriptor)
         if is_new and self._sync:
-            _sync_folder(self._folder)
+            descriptor = os.open(self._folder, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{self._name}-{number:09}.jsonl"
@@ -175,12 +174,7 @@ class RotatedLines:
 
 
 class AuditLog:
-    """Entries of the requests that change something, in a folder or in memory; thread-safe.
-
-    Args:
-        folder: of the files; None keeps the newest entries in memory.
-        max_bytes: of all files together.
-    """
+    """Entries of the requests that change something, in a folder or in memory; thread-safe."""
 
     def __init__(self, folder: Path | None, *, max_bytes: int) -> None:
         self.folder = folder
@@ -268,23 +262,8 @@ def _prepare(folder: Path) -> None:
         )
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 class AuditTrail:
-    """Middleware that writes an entry before the response to a request begins.
-
-    Args:
-        app: the application.
-        log: where entries are kept.
-        sessions: who is signed in.
-        station: name of the station of requests that name none.
-    """
+    """Middleware that writes an entry before the response to a request begins."""
 
     def __init__(self, app: ASGIApp, *, log: AuditLog, sessions: Sessions, station: str) -> None:
         self._app, self._log, self._sessions, self._station = app, log, sessions, station
@@ -297,7 +276,9 @@ class AuditTrail:
             return
         body = bytearray()
         written = False
-        person = self._person(scope)
+        person = OPEN_ACCESS
+        if self._sessions.needs_key:
+            person = self._sessions.person(HTTPConnection(scope)) or NOT_SIGNED_IN
 
         async def receive_and_keep() -> Message:
             message = await receive()
@@ -333,16 +314,11 @@ class AuditTrail:
             if not written:
                 await write(500)
 
-    def _person(self, scope: Scope) -> str:
-        if not self._sessions.needs_key:
-            return OPEN_ACCESS
-        return self._sessions.person(HTTPConnection(scope)) or NOT_SIGNED_IN
-
     def _place(self, scope: Scope, path: str) -> list[str]:
         if not path.startswith(OF_STATION):
             return []
-        asked = parse_qs(scope["query_string"].decode("latin-1")).get("station", [self._station])
-        return [asked[0]]
+        named = parse_qs(scope["query_string"].decode("latin-1")).get("station", [self._station])
+        return [named[0]]
 
 
 def _known(scope: Scope) -> tuple[str, str, list[str]] | None:
@@ -352,8 +328,8 @@ def _known(scope: Scope) -> tuple[str, str, list[str]] | None:
     for pattern, path, action in _ROUTES:
         if match := pattern.match(scope["path"]):
             names = match.groupdict()
-            asked = names.pop("action", None)
-            named = action if asked is None else f"{action}: {_clean(asked)}"
+            verb = names.pop("action", None)
+            named = action if verb is None else f"{action}: {_clean(verb)}"
             return path, named, list(names.values())
     return None
 

@@ -12,23 +12,10 @@ import numpy as np
 import structlog
 from pydantic import Field
 
+from dextouch import schemas
 from dextouch.errors import DexTouchError, EndedError, InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.metrics import tactile
-from dextouch.schemas import (
-    CHUNK_STEPS,
-    ID_PATTERN,
-    EpisodeDetail,
-    Observation,
-    RolloutAnswer,
-    StartRequest,
-    Uncertainty,
-    WorldDescription,
-    WorldList,
-    decode_answer,
-    encode_start,
-    start_from,
-)
 from dextouch.serving import MSGPACK, OCTETS
 from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile import in_contact
@@ -48,7 +35,7 @@ SERVICES: Final = {"real": "twin", "imagined": "world_model"}
 class StartComparison(FrozenModel):
     """Body of POST /v1/comparisons: an episode of the store, recorded in the twin."""
 
-    episode_id: str = Field(pattern=ID_PATTERN)
+    episode_id: str = Field(pattern=schemas.ID_PATTERN)
 
 
 class ChunkUncertainty(FrozenModel):
@@ -56,18 +43,15 @@ class ChunkUncertainty(FrozenModel):
 
     first_step: int
     last_step: int
-    uncertainty: Uncertainty | None
+    uncertainty: schemas.Uncertainty | None
 
 
 class ComparisonView(FrozenModel):
     """State of a comparison; the errors are of steps 0, 1, 2, …, which are all computed so far.
 
-    Attributes:
-        pixel_error: mean absolute difference of the head images, 0 … 255.
-        pressure_error_kpa: mean absolute difference of the taxels of both hands.
-        contact_f1: of the taxels in contact; 1 where neither world has contact.
-        in_contact: whether either world has a taxel in contact.
-        real_success: of the twin at the newest step.
+    `pixel_error` is the mean absolute difference of the head images, 0 … 255, `pressure_error_kpa`
+    that of the taxels of both hands; `contact_f1` of the taxels in contact is 1 where neither world
+    has any.
     """
 
     id: str = ""
@@ -94,26 +78,19 @@ class _Side:
     """One world of a comparison: its service, and its rollout once begun."""
 
     service: str
-    world: WorldDescription
+    world: schemas.WorldDescription
     rollout_id: str = ""
 
 
 @dataclass
 class _Run:
-    """The running or newest comparison."""
-
     view: ComparisonView
     messages: list[bytes] = field(default_factory=list)
     task: "asyncio.Task[None] | None" = None
 
 
 class Comparisons:
-    """Runs one comparison at a time; a new one ends the one before.
-
-    Args:
-        feeds: clients of the services.
-        period_s: between two updates of its topic.
-    """
+    """Runs one comparison at a time; a new one ends the one before."""
 
     def __init__(self, feeds: Feeds, *, period_s: float) -> None:
         self._feeds = feeds
@@ -186,16 +163,16 @@ class Comparisons:
     async def _world(self, service: str) -> _Side:
         wanted = {"twin": "twin", "world_model": "model"}[service]
         upstream = self._feeds.upstream(service)
-        worlds = (await upstream.read(WorldList, "/v1/worlds")).worlds
+        worlds = (await upstream.read(schemas.WorldList, "/v1/worlds")).worlds
         found = [one for one in worlds if one.kind == wanted]
         if not found:
             names = ", ".join(f"{one.name} ({one.kind})" for one in worlds)
             raise InvalidInputError(f"{service}: got {names}, expected a world of kind {wanted}")
         return _Side(service, found[0])
 
-    async def _episode(self, episode_id: str) -> tuple[EpisodeDetail, np.ndarray]:
+    async def _episode(self, episode_id: str) -> tuple[schemas.EpisodeDetail, np.ndarray]:
         store, path = self._feeds.upstream("episode_store"), f"/v1/episodes/{quote(episode_id)}"
-        about = await store.read(EpisodeDetail, path)
+        about = await store.read(schemas.EpisodeDetail, path)
         attributes = about.attributes
         if attributes.seed is None or attributes.domain != "robot":
             raise InvalidInputError(
@@ -235,7 +212,7 @@ class Comparisons:
         first = await self._start(run, real, None)
         begun = await self._start(run, imagined, first)
         await self._add(run, first.observation, begun.observation)
-        size = min(CHUNK_STEPS, *(one.world.max_chunk_steps for one in sides.values()))
+        size = min(schemas.CHUNK_STEPS, *(one.world.max_chunk_steps for one in sides.values()))
         for number, start in enumerate(range(0, len(actions), size)):
             rows = actions[start : start + size]
             truth, guess = await asyncio.gather(
@@ -243,33 +220,37 @@ class Comparisons:
             )
             await self._add(run, truth.observation, guess.observation)
 
-    async def _start(self, run: _Run, side: _Side, first: RolloutAnswer | None) -> RolloutAnswer:
+    async def _start(
+        self, run: _Run, side: _Side, first: schemas.RolloutAnswer | None
+    ) -> schemas.RolloutAnswer:
         view = run.view
-        request = StartRequest(
+        request = schemas.StartRequest(
             world=side.world.name, task=view.task, seed=view.seed, instruction=view.instruction
         )
-        start = start_from(request)
+        start = schemas.start_from(request)
         if first is not None:
-            start = start_from(request, observation=first.observation, origin=first.origin)
-        body = encode_start(request, start)
+            start = schemas.start_from(request, observation=first.observation, origin=first.origin)
+        body = schemas.encode_start(request, start)
         answer = await self._post(side, "/v1/rollouts", MSGPACK, body)
         side.rollout_id = answer.rollout.id
         return answer
 
-    async def _step(self, side: _Side, number: int, rows: np.ndarray) -> RolloutAnswer:
+    async def _step(self, side: _Side, number: int, rows: np.ndarray) -> schemas.RolloutAnswer:
         path = f"/v1/rollouts/{side.rollout_id}/chunks/{number}"
         return await self._post(
             side, path, f"{OCTETS}; dtype=float64", rows.astype("<f8").tobytes()
         )
 
-    async def _post(self, side: _Side, path: str, kind: str, body: bytes) -> RolloutAnswer:
+    async def _post(self, side: _Side, path: str, kind: str, body: bytes) -> schemas.RolloutAnswer:
         headers = {"content-type": kind, "accept": MSGPACK, "dextouch-client": "replay"}
         path = f"{path}?{urlencode({'cameras': HEAD_CAMERA})}"
         upstream = self._feeds.upstream(side.service)
         answer = await upstream.forward("POST", path, headers, body, timeout_s=WORLD_TIMEOUT_S)
-        return decode_answer(answer.content, max_bytes=MAX_RESPONSE_BYTES)
+        return schemas.decode_answer(answer.content, max_bytes=MAX_RESPONSE_BYTES)
 
-    async def _add(self, run: _Run, real: Observation, imagined: Observation) -> None:
+    async def _add(
+        self, run: _Run, real: schemas.Observation, imagined: schemas.Observation
+    ) -> None:
         """Add the steps of a chunk: their errors to the view, their images for the page."""
         added, message = await asyncio.to_thread(compared, real, imagined)
         run.messages.append(message)
@@ -293,11 +274,13 @@ class Comparisons:
         )
 
 
-def compared(real: Observation, imagined: Observation) -> tuple[dict[str, tuple[Any, ...]], bytes]:
+def compared(
+    real: schemas.Observation, imagined: schemas.Observation
+) -> tuple[dict[str, tuple[Any, ...]], bytes]:
     """Errors of every step, and the message with both worlds' images and touch.
 
     The message is laid out as that of `steps_message`, with the real world first in every array:
-    touch [2, steps, 2, 320] and images [2, steps, height, width, 3].
+    touch [2, steps, 2, num_taxels] and images [2, steps, height, width, 3].
     """
     images = [seen.images[HEAD_CAMERA] for seen in (real, imagined)]
     touch = [seen.tactile_kpa for seen in (real, imagined)]
@@ -317,7 +300,7 @@ def compared(real: Observation, imagined: Observation) -> tuple[dict[str, tuple[
     }
     _, height, width, _ = images[0].shape
     header = {"first_step": real.first_step, "num_steps": len(real)}
-    header |= {"height": height, "width": width}
+    header |= {"height": height, "width": width, "num_taxels": touch[0].shape[-1]}
     parts = [np.ascontiguousarray(np.stack(touch), "<f4").tobytes(), np.stack(images).tobytes()]
     return errors, packed_message(COMPARISON_MESSAGE, header, parts)
 
@@ -339,4 +322,12 @@ def _check_worlds(sides: Mapping[str, _Side], task: str) -> None:
             f"worlds: got images of {real[0]} by {real[1]} px at {real[2]:g} Hz and of "
             f"{imagined[0]} by {imagined[1]} px at {imagined[2]:g} Hz, expected the same; start "
             "the twin with the world model's image size"
+        )
+    gloves = {name: one.world.tactile_layout for name, one in sides.items()}
+    others = {name: glove.name for name, glove in gloves.items() if glove is not None}
+    if others:
+        # The twin has no other glove to compare with.
+        raise InvalidInputError(
+            f"worlds: got the tactile layouts {others}, expected dextouch_v1 in both; only its "
+            "taxels can be compared"
         )

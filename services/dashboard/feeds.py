@@ -6,6 +6,7 @@ A new panel is a topic here with the function that fetches it, a section in
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -31,8 +32,8 @@ from dextouch.schemas import (
     UploadStatus,
 )
 from dextouch.streams import unpack
-from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, SIDES, Side, raw_indices
+from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, Side
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import (
     RecorderView,
@@ -61,18 +62,32 @@ def skeleton_bones() -> list[tuple[int, int]]:
 
 
 def heatmap_layout() -> dict[str, object]:
-    """Positions of the 320 taxels and the colour map, from `dextouch.tactile`."""
-    taxels = np.arange(NUM_TAXELS, dtype=np.float32)
-    canvases = {side: hand_canvas(taxels, side=side) for side in SIDES}
+    """Positions of the taxels of `dextouch_v1` and the colour map, from `dextouch.tactile`.
+
+    Those of other gloves the page finds from their layout (`static/layouts.js`).
+    """
+    layout = DEXTOUCH_V1
+    taxels = np.arange(layout.num_taxels, dtype=np.float32)
+    canvases = {side: layout.hand_canvas(taxels, side=side) for side in SIDES}
     rows, columns = canvases["right"].shape
     pressures_kpa = np.linspace(0.0, FULL_SCALE_KPA, RAMP_STEPS)
     return {
         "rows": rows,
         "columns": columns,
-        # NaN sorts last: the first 320 are the cells of the taxels in their order.
-        "cells": {s: np.argsort(c.ravel())[:NUM_TAXELS].tolist() for s, c in canvases.items()},
-        "num_raw_cells": NUM_RAW_TAXELS,
-        "raw_cells": {s: raw_indices(side=s).tolist() for s in SIDES},
+        # NaN sorts last: the first ones are the cells of the taxels in their order.
+        "cells": {s: np.argsort(c.ravel())[: len(taxels)].tolist() for s, c in canvases.items()},
+        "pads": [
+            {
+                "part": pad.part,
+                "start": start,
+                "rows": pad.rows,
+                "columns": pad.columns,
+                "taxel_area_mm2": 1e6 * pad.taxel_area_m2,
+            }
+            for pad, start in zip(layout.pads, layout.starts, strict=True)
+        ],
+        "num_raw_cells": layout.num_raw_cells,
+        "raw_cells": {s: layout.raw_indices(s).tolist() for s in SIDES},
         "ramp": colour(pressures_kpa, full_scale_kpa=FULL_SCALE_KPA).tolist(),
         "full_scale_kpa": FULL_SCALE_KPA,
         "contact_kpa": CONTACT_THRESHOLD_KPA,
@@ -104,7 +119,8 @@ def pose_message(ages_s: Mapping[str, float | None], arrays: Mapping[str, np.nda
 
 logger = structlog.get_logger(__name__)
 
-MAX_LIVE_BYTES = 64 * 1024
+# Pressures of two gloves of 4096 taxels, and their layouts as JSON.
+MAX_LIVE_BYTES = 256 * 1024
 MAX_HISTORY_BYTES = 1024 * 1024
 # Of the small plots: two minutes, two rows a point.
 TREND_ROWS = 120
@@ -151,24 +167,16 @@ class TakesView(FrozenModel):
     note: str = ""
 
 
+@dataclass(eq=False)
 class Topic:
-    """A topic: its newest messages, fetched at most once a period whatever the number of viewers.
+    """A topic: its newest messages, fetched at most once a period for all of its viewers."""
 
-    Args:
-        name: of the topic.
-        period_s: between two fetches.
-        fetch: asks the services.
-    """
-
-    def __init__(
-        self, name: str, period_s: float, fetch: Callable[[], Awaitable[list[Message]]]
-    ) -> None:
-        self.name = name
-        self.period_s = period_s
-        self._fetch = fetch
-        self._messages: list[Message] = []
-        self._due_s = float("-inf")
-        self._fetching = asyncio.Lock()
+    name: str
+    period_s: float
+    fetch: Callable[[], Awaitable[list[Message]]]
+    _messages: list[Message] = field(default_factory=list)
+    _due_s: float = float("-inf")
+    _fetching: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @classmethod
     def of_json(cls, name: str, period_s: float, read: Callable[[], Awaitable[object]]) -> "Topic":
@@ -185,7 +193,7 @@ class Topic:
         async with self._fetching:
             if (started_s := now_s()) >= self._due_s:
                 try:
-                    messages = await self._fetch()
+                    messages = await self.fetch()
                     if messages != self._messages:
                         self._messages = messages
                 except Exception:
@@ -343,7 +351,7 @@ class Feeds:
                 kind="recording",
                 name=item.recording_id,
                 size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
-                f"{_plural(len(item.num_samples), 'stream')}",
+                f"{len(item.num_samples)} stream{'s' * (len(item.num_samples) != 1)}",
                 consent=item.consent,
                 **_labels(item),
             )
@@ -410,10 +418,6 @@ class Feeds:
         return unpack(answer.content, max_bytes=MAX_LIVE_BYTES)
 
 
-def _plural(count: int, name: str) -> str:
-    return f"{count} {name}" if count == 1 else f"{count} {name}s"
-
-
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:
     labels = item.model_dump(include={"task", "domain", "operator"})
     return labels | {"outcome": OUTCOMES[item.success]}
@@ -433,10 +437,10 @@ async def _clock_words(store: Upstream, episode_id: str) -> str:
     if not residuals_ms or not skews_ppm:
         return ""
     lost = sum(clock.num_dropped for clock in clocks)
-    doubted = ", ".join(clock.stream for clock in clocks if clock.warnings)
+    unreliable = ", ".join(clock.stream for clock in clocks if clock.warnings)
     return (
         f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
-        f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
+        f"{lost} samples lost{f'; unreliable times: {unreliable}' if unreliable else ''}"
     )
 
 

@@ -4,17 +4,19 @@ import asyncio
 import time
 from collections.abc import Mapping
 from datetime import datetime
+from operator import not_
 from typing import Annotated
 
 import httpx
 import numpy as np
 from fastapi import Query
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import CameraLive, HealthLevel, HoursByField, StationOverview, first_problems
 from dextouch.streams import unpack
+from dextouch.tactile import LayoutDescription
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.dashboard.feeds import MAX_LIVE_BYTES, Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings
@@ -47,6 +49,7 @@ class Tile(FrozenModel):
     disk_free_bytes: float | None = None
     camera: CameraLive | None = None
     gloves: tuple[str, ...] = ()
+    layouts: dict[str, LayoutDescription] = Field(default={}, exclude_if=not_)
 
 
 class WatchedStation:
@@ -121,30 +124,27 @@ class WatchedStation:
             cause, advice = ("no answer", "") if overview else self._failure
             return Tile(name=self.name, cause=cause, advice=advice, hours_today=self._hours_today)
         fresh = [camera for camera in overview.cameras if camera.age_s <= self._timeout_s]
+        # Of what they share, the station's name alone is the dashboard's.
+        shown = overview.model_dump(include=Tile.model_fields.keys() - {"name"})
         return Tile(
+            **shown,
             name=self.name,
-            level=overview.level,
-            cause=overview.cause,
-            recorder=overview.recorder,
-            task=overview.task,
-            duration_s=overview.duration_s,
             hours_today=self._hours_today,
-            disk_left_s=overview.disk_left_s,
-            disk_free_bytes=overview.disk_free_bytes,
             camera=fresh[0] if fresh else None,
             gloves=tuple(side for side in SIDES if f"tactile_{side}" in self._pressures),
+            layouts=overview.layouts,
         )
 
     def taxel_message(self, index: int) -> bytes:
         """Encode the pressures of both hands, those of a glove that is not heard as zeros.
 
-        uint8 kind (3), uint8 place in the list, uint16 0, then float32 kPa of the left and of the
-        right hand, little endian.
+        uint8 kind (3), uint8 place in the list, uint16 number of taxels of the left hand, then
+        float32 kPa of the left and of the right hand, little endian.
         """
         none = np.zeros(NUM_TAXELS, dtype="<f4")
         known = self._pressures if self.is_known() else {}
         hands = [known.get(f"tactile_{side}", none) for side in SIDES]
-        header = bytes([FLEET_TAXELS_MESSAGE, index, 0, 0])
+        header = bytes([FLEET_TAXELS_MESSAGE, index]) + len(hands[0]).to_bytes(2, "little")
         return header + np.concatenate(hands).astype("<f4").tobytes()
 
 

@@ -9,7 +9,7 @@ import time
 import tomllib
 from asyncio import to_thread
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Final
@@ -92,7 +92,9 @@ class Documents:
         tokens = self._markdown.parse(self._paths[name].read_text(encoding="utf-8"))
         for token, following in zip(tokens, [*tokens[1:], None], strict=True):
             if token.type == "heading_open" and following is not None:
-                token.attrSet("id", _anchor(following.content))
+                # By the rules of common hosts of Markdown.
+                words = re.sub(r"[^\w\- ]", "", following.content.lower()).strip()
+                token.attrSet("id", words.replace(" ", "-"))
             for part in token.children or ():
                 self._link(part, posixpath.dirname(name))
         html = self._markdown.renderer.render(tokens, self._markdown.options, {})
@@ -119,11 +121,6 @@ class Documents:
 def _title(path: Path) -> str:
     found = re.search(r"^# (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
     return found[1] if found else path.stem
-
-
-def _anchor(heading: str) -> str:
-    """Anchor of a heading, by the rules of common hosts of Markdown."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
 class TaskChoice(FrozenModel):
@@ -200,28 +197,22 @@ SCREENS: Final = (
 )
 
 
+@dataclass(eq=False)
 class Sessions:
     """Access of browsers: open on loopback without keys, otherwise by signing in."""
 
-    def __init__(
-        self,
-        access: AccessControl,
-        *,
-        needs_key: bool,
-        lifetime_s: float,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.needs_key = needs_key
-        self.lifetime_s = lifetime_s
-        self._access = access
-        self._clock_s = clock_s
-        # What its key allows and the end of the session, by its token.
-        self._open: dict[str, tuple[Grant, float]] = {}
+    access: AccessControl
+    _: KW_ONLY
+    needs_key: bool
+    lifetime_s: float
+    clock_s: Callable[[], float] = time.monotonic
+    # What its key allows and the end of the session, by its token.
+    _open: dict[str, tuple[Grant, float]] = field(default_factory=dict)
 
     @property
     def num_open(self) -> int:
         """Sessions that have not ended."""
-        now_s = self._clock_s()
+        now_s = self.clock_s()
         return sum(end_s > now_s for _, end_s in tuple(self._open.values()))
 
     def sign_in(self, key: str) -> str:
@@ -230,8 +221,8 @@ class Sessions:
         Raises:
             AccessDeniedError: an unknown key or one without the scope.
         """
-        grant = self._access.granted(f"Bearer {key}", SCOPE)
-        now_s = self._clock_s()
+        grant = self.access.granted(f"Bearer {key}", SCOPE)
+        now_s = self.clock_s()
         self._open = {token: one for token, one in self._open.items() if one[1] > now_s}
         while len(self._open) >= MAX_SESSIONS:
             self._open.pop(next(iter(self._open)))
@@ -258,7 +249,7 @@ class Sessions:
 
     def _grant(self, token: str) -> Grant | None:
         grant, end_s = self._open.get(token, (None, 0.0))
-        return grant if end_s > self._clock_s() else None
+        return grant if end_s > self.clock_s() else None
 
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""

@@ -9,16 +9,9 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import to_json
 
+from dextouch import schemas
 from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    IMAGE_PREFIX,
-    WatchedRollout,
-    WatchedRollouts,
-    WorldKind,
-    WorldList,
-    decode_images,
-)
 from dextouch.streams import unpack
 from services.dashboard.feeds import Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings
@@ -38,17 +31,17 @@ class WorldView(FrozenModel):
 
     service: str
     name: str
-    kind: WorldKind
+    kind: schemas.WorldKind
     tasks: tuple[str, ...]
     model_rate_hz: float
     predicts_touch: bool
 
 
-class ListedRollout(WatchedRollout):
+class ListedRollout(schemas.WatchedRollout):
     """An open rollout and the service where it runs."""
 
     service: str
-    kind: WorldKind | None = None
+    kind: schemas.WorldKind | None = None
     model_rate_hz: float | None = None
 
 
@@ -62,12 +55,7 @@ class RolloutsView(FrozenModel):
 
 
 class RolloutFeeds:
-    """Reads open rollouts from the services of worlds, while somebody looks.
-
-    Args:
-        feeds: clients of the services.
-        settings: periods.
-    """
+    """Reads open rollouts from the services of worlds, while somebody looks."""
 
     def __init__(self, feeds: Feeds, settings: DashboardSettings) -> None:
         self._feeds = feeds
@@ -113,8 +101,8 @@ class RolloutFeeds:
         upstream = self._feeds.upstream(service)
         try:
             described, listed = await asyncio.gather(
-                upstream.read(WorldList, "/v1/worlds"),
-                upstream.read(WatchedRollouts, f"/v1/watch?limit={MAX_LISTED}"),
+                upstream.read(schemas.WorldList, "/v1/worlds"),
+                upstream.read(schemas.WatchedRollouts, f"/v1/watch?limit={MAX_LISTED}"),
             )
         except DexTouchError as error:
             # Failures of the connection name the service themselves.
@@ -171,18 +159,18 @@ def steps_message(topic: str, response: bytes) -> bytes:
     """Encode the steps of a response for the page.
 
     uint8 kind, three bytes of padding, uint32 size of the header, the header as JSON, then touch,
-    float32 [steps, 2, 320] in kPa, and per camera uint8 [steps, height, width, 3], RGB; little
-    endian, the header padded to a multiple of four bytes.
+    float32 [steps, 2, num_taxels] in kPa, and per camera uint8 [steps, height, width, 3], RGB;
+    little endian, the header padded to a multiple of four bytes.
 
     Raises:
         InvalidInputError: not a response of a rollout.
     """
     fields, arrays = unpack(response, max_bytes=MAX_RESPONSE_BYTES)
-    arrays = decode_images(arrays, max_bytes=MAX_RESPONSE_BYTES, where=topic)
+    arrays = schemas.decode_images(arrays, max_bytes=MAX_RESPONSE_BYTES, where=topic)
     images = {
-        name.removeprefix(IMAGE_PREFIX): array
+        name.removeprefix(schemas.IMAGE_PREFIX): array
         for name, array in arrays.items()
-        if name.startswith(IMAGE_PREFIX)
+        if name.startswith(schemas.IMAGE_PREFIX)
     }
     num_steps = len(arrays["action_reached"])
     stride = -(-sum(array.nbytes for array in images.values()) // MAX_IMAGE_BYTES) or 1
@@ -195,6 +183,7 @@ def steps_message(topic: str, response: bytes) -> bytes:
         "num_steps": num_steps,
         "steps": (fields["observation"]["first_step"] + kept).tolist(),
         "has_touch": touch is not None,
+        "num_taxels": 0 if touch is None else touch.shape[-1],
         "cameras": [
             {"name": name, "height": array.shape[1], "width": array.shape[2]}
             for name, array in images.items()

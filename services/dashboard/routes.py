@@ -120,9 +120,9 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
 
     @router.post("", status_code=202)
     @takes({JSON: KIB})
-    async def start(asked: StartComparison) -> ComparisonView:
+    async def start(body: StartComparison) -> ComparisonView:
         """Replay an episode in the twin and in the world model; ends the comparison before."""
-        return await comparisons.start(asked.episode_id)
+        return await comparisons.start(body.episode_id)
 
     @router.post("/stop", status_code=204)
     async def stop() -> None:
@@ -187,14 +187,15 @@ def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
             await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
             return
         await websocket.accept()
+        known: tuple[TopicFinder, ...] = (topics.get, *finders)
         session = asyncio.create_task(_close_with_session(websocket, sessions))
         senders: dict[str, asyncio.Task[None]] = {}
         try:
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
                     names = _view(await websocket.receive_text())
-                    found = {name: _topic(name, [topics.get, *finders]) for name in names}
-                    wanted = {name: topic for name, topic in found.items() if topic is not None}
+                    found = [(name, find(name)) for name in names for find in known]
+                    wanted = {name: topic for name, topic in found if topic is not None}
                     for name in senders.keys() - wanted.keys():
                         senders.pop(name).cancel()
                     for name in wanted.keys() - senders.keys():
@@ -207,10 +208,6 @@ def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
             await asyncio.gather(*tasks, return_exceptions=True)
 
     return router
-
-
-def _topic(name: str, finders: Sequence[TopicFinder]) -> Topic | None:
-    return next((topic for find in finders if (topic := find(name)) is not None), None)
 
 
 async def _send(websocket: WebSocket, topic: Topic, sessions: Sessions) -> None:
@@ -226,7 +223,6 @@ async def _send(websocket: WebSocket, topic: Topic, sessions: Sessions) -> None:
 
 
 async def _close_with_session(websocket: WebSocket, sessions: Sessions) -> None:
-    """Close the connection when its session ends."""
     try:
         while True:
             sessions.guard(websocket)
@@ -295,10 +291,14 @@ FORWARDED: Final = (
     Forwarded("alignment", "/alignments/{alignment_id}"),
     Forwarded("alignment", "/alignments/{alignment_id}/cancel", "POST"),
     Forwarded("alignment", "/calibration"),
+    Forwarded("alignment", "/calibration/practice/start", "POST"),
+    Forwarded("alignment", "/calibration/practice/stop", "POST"),
     Forwarded("alignment", "/calibration/run"),
     Forwarded("alignment", "/calibration/run/image"),
     Forwarded("alignment", "/calibration/runs", "POST"),
     Forwarded("alignment", "/calibration/run/answer", "POST"),
+    Forwarded("alignment", "/calibration/run/take", "POST"),
+    Forwarded("alignment", "/calibration/run/drop", "POST"),
     Forwarded("alignment", "/calibration/run/finish", "POST"),
     Forwarded("alignment", "/calibration/run/cancel", "POST"),
     Forwarded("studies", "/studies"),

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 from urllib.parse import quote
 
+from pydantic import Field
+
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
@@ -20,6 +22,7 @@ from dextouch.schemas import (
     TaxelState,
     UploadStatus,
 )
+from dextouch.tactile import LayoutDescription
 from services.dashboard.upstream import Upstream
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
@@ -90,10 +93,14 @@ class RecorderView(FrozenModel):
 
 
 class GloveView(FrozenModel):
-    """Taxels of a glove that are out of order, by their state, and the age of its tare."""
+    """Taxels of a glove that are out of order, by their state, and the age of its tare.
+
+    `layout` is that of its taxels, None of `dextouch_v1`.
+    """
 
     taxels: dict[TaxelState, tuple[int, ...]]
     tare_age_s: float | None
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
 class StationView(FrozenModel):
@@ -159,7 +166,7 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
         streams=streams,
         recorder=recorder_view(recorder),
         gloves={
-            item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s)
+            item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s, layout=item.layout)
             for item in station.streams
             if item.hand is not None and item.stream == f"tactile_{item.hand}"
         },
@@ -183,17 +190,13 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
     cause = check.cause if check else None
     level: HealthLevel = "WARN" if complete else "ERROR"
     return RecorderView(
-        state=recorder.state,
-        actions=recorder.actions,
-        recording_id=recorder.recording_id,
-        prompt=recorder.prompt,
+        **recorder.model_dump(include={"state", "actions", "recording_id", "prompt", "session"}),
         elapsed_s=recorder.duration_s,
         level=level if problems else "OK",
         complete=complete,
         cause=cause.message if cause else next(iter(problems), ""),
         advice=cause.advice if cause else "",
         problems=problems,
-        session=recorder.session,
     )
 
 
@@ -210,16 +213,11 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
             words.append(device.last_error)
     offered = item.received + item.lost
     return StreamView(
+        **item.model_dump(include=set(StreamView.model_fields)),
         name=item.stream,
-        device=item.device,
-        level=item.level,
         note=" · ".join(words),
-        rate_hz=item.rate_hz,
-        nominal_rate_hz=item.nominal_rate_hz,
         dropped=item.lost,
         drop_percent=100 * item.lost / offered if offered else None,
-        age_s=item.age_s,
-        skew_ppm=item.skew_ppm,
         clock_error_ms=item.clock_residual_ms,
     )
 
@@ -237,11 +235,8 @@ def _cause_view(cause: HealthCause, station: StationHealth) -> CauseView:
     # What the message of the cause says already needs no second line.
     says_all = len(found) == 1 and found[0][1] in cause.message
     return CauseView(
+        **cause.model_dump(include={"level", "message", "advice", "lasted_s"}),
         key=f"{cause.code} {cause.subject}",
-        level=cause.level,
-        message=cause.message,
-        advice=cause.advice,
-        lasted_s=cause.lasted_s,
         num_streams=len(cause.streams),
         findings=() if says_all else tuple(lines),
     )
@@ -373,8 +368,8 @@ def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
         for part in report.refused_parts
         if part.reason in {"jump", "frozen", "limits"}
     }
-    told = "".join(f"{cause}, " for cause in sorted(causes))
-    words += f"; stretches left out: {len(report.refused_parts)} ({told}dextouch align report)"
+    named = "".join(f"{cause}, " for cause in sorted(causes))
+    words += f"; stretches left out: {len(report.refused_parts)} ({named}dextouch align report)"
     return "WARN", words
 
 

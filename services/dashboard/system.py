@@ -49,11 +49,8 @@ Metrics = Mapping[str, Mapping[str, float]]
 class ServiceStatus(FrozenModel):
     """A service at its last probe; what it did not say is None.
 
-    Attributes:
-        state: `waiting` for what `waiting_for` names, `down` for the reason `problem`.
-        latency_s: time of the request for its liveness.
-        cpu_ratio: of one processor, since the probe before.
-        shares_process: whether other services run in the same process, with the same figures.
+    `latency_s` is the time of the request for its liveness, `cpu_ratio` of one processor since the
+    probe before. Services that share a process have its figures.
     """
 
     name: str
@@ -120,12 +117,7 @@ class SystemView(FrozenModel):
 
 
 class System:
-    """Asks every service for its health and metrics.
-
-    Args:
-        stations: clients of the stations by name.
-        upstreams: clients of the other services by name.
-    """
+    """Asks every service for its health and metrics."""
 
     def __init__(self, stations: Mapping[str, Upstream], upstreams: Mapping[str, Upstream]) -> None:
         probes = {

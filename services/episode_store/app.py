@@ -1,7 +1,7 @@
-"""Application of the episode store, which also completes uploads to a bucket while it runs."""
+"""Application of the episode store, with its threads in the background."""
 
 import threading
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Final
 
@@ -14,14 +14,14 @@ from dextouch.errors import DexTouchError
 from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
-from services.episode_store.clicking import clicks_router
-from services.episode_store.deletions import DeletionWatch, deletions_router
+from services.episode_store.deletions import deletions_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.keys import Enrolments, enrolment_router
 from services.episode_store.reading import content_router, playback_router
 from services.episode_store.routes import (
     catalog_router,
+    clicks_router,
     idle_uploads_router,
     reviews_router,
     trash_router,
@@ -34,32 +34,56 @@ logger = structlog.get_logger(__name__)
 ENROLMENTS_FILE = "enrolments.json"
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
 RETRY_PERIOD_S: Final = 30.0
+# How soon a deletion reaches an upload that nobody continues.
+WATCH_PERIOD_S: Final = 1.0
 
 
-class PendingUploads:
-    """Uploads what waits in the outbox of a store, and removes the stages of killed writers once.
+class PeriodicThread:
+    """Calls `work` again and again, between `start` and `stop`.
 
-    Failures, such as a bucket that cannot be reached or a read-only folder, are logged when they
-    begin or change; the service still serves everything else.
+    A failure, such as a bucket that cannot be reached or a read-only folder, is logged as `event`
+    when it begins or changes; the service still serves everything else.
     """
 
-    def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
-        self._store, self._period_s = store, period_s
-        self._is_swept = False
-        self._problem = ""
+    def __init__(self, event: str, period_s: float) -> None:
+        self._event, self._period_s = event, period_s
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="pending-uploads", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=event, daemon=True)
+
+    def work(self) -> None:
+        """What is done once a period."""
+        raise NotImplementedError
 
     def start(self) -> None:
         """Begin in the background."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, after an upload that is under way."""
+        """End the thread, after the work that is under way."""
         self._stopping.set()
         self._thread.join()
 
-    def try_all(self) -> None:
+    def _run(self) -> None:
+        problem = ""
+        while not self._stopping.is_set():
+            try:
+                self.work()
+                problem = ""
+            except DexTouchError as error:
+                if error.message != problem:
+                    logger.error(self._event, reason=error.message)  # noqa: TRY400
+                problem = error.message
+            self._stopping.wait(self._period_s)
+
+
+class PendingUploads(PeriodicThread):
+    """Uploads what waits in a store's outbox, and removes the stages of killed writers once."""
+
+    def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
+        super().__init__("uploads_not_completed", period_s)
+        self._store, self._is_swept = store, False
+
+    def work(self) -> None:
         """Try once.
 
         Raises:
@@ -73,16 +97,30 @@ class PendingUploads:
             if removed:
                 logger.info("unfinished_writes_removed", count=removed)
 
-    def _run(self) -> None:
-        while not self._stopping.is_set():
-            try:
-                self.try_all()
-                self._problem = ""
-            except DexTouchError as error:
-                if error.message != self._problem:
-                    logger.error("uploads_not_completed", reason=error.message)  # noqa: TRY400
-                self._problem = error.message
-            self._stopping.wait(self._period_s)
+
+class DeletionWatch(PeriodicThread):
+    """Drops uploads of deleted takes that nobody continues, soon after the deletion.
+
+    Args:
+        records: of the store.
+        drop: drops uploads of deleted takes, and returns their ids.
+        ended: called with the id of each dropped upload.
+    """
+
+    def __init__(
+        self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
+    ) -> None:
+        super().__init__("fail_deletions", WATCH_PERIOD_S)
+        self._records, self._drop, self._ended = records, drop, ended
+        self._revision = ""
+
+    def work(self) -> None:
+        """Drop uploads if there was a deletion since the last time."""
+        revision = self._records.revision
+        if revision != self._revision:
+            for recording_id in self._drop():
+                self._ended(recording_id)
+            self._revision = revision
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
@@ -95,7 +133,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     admission = Admission(
         max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
     )
-    metrics = UploadMetrics()
+    metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
     watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
     pending = PendingUploads(store)
@@ -133,7 +171,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         folders=[ServedFolder(store.root, "store folder")],
     )
     enrolments.connect(app.state.access)
-    metrics.register(app.state.registry, limits, catalog.num_items())
+    app.state.registry.register(metrics.registry)
     return app
 
 

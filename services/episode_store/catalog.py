@@ -90,8 +90,8 @@ class _Shelf(Generic[S]):
         self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
     ) -> None:
         self._store = store
-        self._kind: Kind = kind
         self._summarize: Callable[[str], Entry[S]] = summarize
+        self._kind: Kind = kind
         self._folder = store.root / f"{kind}s"
         self._listed_ns: int | None = None
         self._stamp_ns: int | None = None
@@ -202,20 +202,18 @@ class Catalog:
             "episode": partial(len, self._episodes),
         }
 
-    def episodes(
-        self, wanted: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE
-    ) -> EpisodeList:
+    def episodes(self, query: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE) -> EpisodeList:
         """One page of matching episodes in the order of the page."""
-        rows, facts = _page(self._episodes.entries(), wanted, limit, page)
+        rows, facts = _page(self._episodes.entries(), query, limit, page)
         summaries = tuple(row.summary for row in rows)
         return EpisodeList.model_construct(episodes=summaries, **facts)
 
     def recordings(
-        self, wanted: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
+        self, query: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
     ) -> RecordingList:
         """One page of matching finished recordings in the order of the page."""
-        wanted = wanted or CatalogFilter()
-        rows, facts = _page(self._recordings.entries(), wanted, limit, page)
+        query = query or CatalogFilter()
+        rows, facts = _page(self._recordings.entries(), query, limit, page)
         summaries = tuple(row.summary for row in rows)
         return RecordingList.model_construct(recordings=summaries, **facts)
 
@@ -233,15 +231,18 @@ class Catalog:
 
     def lineage(self, kind: Kind, item_id: str) -> Lineage:
         """Everything that an item was made from and that was made from it; as `lineage_of`."""
+        shelves: dict[Kind, _Shelf[Any]]
+        shelves = {"recording": self._recordings, "episode": self._episodes}
         entries: dict[tuple[str, str], Entry[Any]] = {
-            ("recording", name): entry for name, entry in self._recordings.entries().items()
+            (each, name): entry
+            for each in shelves
+            for name, entry in shelves[each].entries().items()
         }
-        entries |= {("episode", name): entry for name, entry in self._episodes.entries().items()}
         return lineage_of(entries, (kind, item_id))
 
-    def items(self, wanted: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
+    def items(self, query: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
         """One page of matching recordings, episodes or takes in the order of the page."""
-        rows, facts = _page(self._listed(wanted.kind), wanted, limit, page)
+        rows, facts = _page(self._listed(query.kind), query, limit, page)
         return CatalogItems.model_construct(items=tuple(row.item for row in rows), **facts)
 
     def groups(self) -> ComparedGroups:
@@ -271,15 +272,14 @@ class Catalog:
         self._store.set_clicks(episode_id, clicks)
         self._episodes.forget(episode_id)
 
-    def hours(self, wanted: EpisodeFilter) -> CatalogHours:
+    def hours(self, query: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
-        return hours_of(_matching(self._episodes.entries(), wanted).values())
+        return hours_of(_matching(self._episodes.entries(), query).values())
 
-    def hours_by(self, field: HoursField, wanted: HoursFilter) -> HoursByField:
+    def hours_by(self, field: HoursField, query: HoursFilter) -> HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
-        entries = _matching(self._listed("episode"), wanted)
-        items = [entry.item for entry in entries.values()]
-        return hours_by(field, items, utc_offset_min=wanted.utc_offset_min)
+        items = [one.item for one in _matching(self._listed("episode"), query).values()]
+        return hours_by(field, items, utc_offset_min=query.utc_offset_min)
 
     def _listed(self, kind: ItemsKind) -> Mapping[str, Entry[Any]]:
         return self._items.entries(kind, self._recordings.entries(), self._episodes.entries())
@@ -335,12 +335,12 @@ class Catalog:
             item_id,
             about.task,
             about.instruction,
-            about.operator or "",
-            about.station or "",
-            about.trace_id or "",
+            about.operator,
+            about.station,
+            about.trace_id,
         )
-        text = "\n".join(parts).casefold()
-        return Entry(summary, item, dict(about.quality), at, about.lineage, text)
+        text = "\n".join(part or "" for part in parts)
+        return Entry(summary, item, dict(about.quality), at, about.lineage, text.casefold())
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -350,16 +350,16 @@ def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
     return fields | {"content_sha256": reader.content_sha256}
 
 
-def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, Entry[S]]:
-    matches = wanted.matcher()
+def _matching(entries: Mapping[str, Entry[S]], query: CatalogFilter) -> dict[str, Entry[S]]:
+    matches = query.matcher()
     return {name: entry for name, entry in entries.items() if matches(entry)}
 
 
 def _page(
-    entries: Mapping[str, Entry[S]], wanted: CatalogFilter, limit: int, page: Page
+    entries: Mapping[str, Entry[S]], query: CatalogFilter, limit: int, page: Page
 ) -> tuple[list[Entry[S]], dict[str, Any]]:
     """The rows of a page, and the number of all that match with the cursor to go on after."""
-    found = _matching(entries, wanted)
+    found = _matching(entries, query)
     places = sorted((sort_key(row.item, page.sort), name) for name, row in found.items())
     first = page.offset
     if page.after is not None:
@@ -376,10 +376,5 @@ def _page(
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:
     # Counts come from the commit record, so no array is opened.
-    return max(
-        (
-            reader.num_samples(name) / descriptor.nominal_rate_hz
-            for name, descriptor in reader.streams.items()
-        ),
-        default=0.0,
-    )
+    rates_hz = {name: stream.nominal_rate_hz for name, stream in reader.streams.items()}
+    return max((reader.num_samples(name) / rates_hz[name] for name in rates_hz), default=0.0)

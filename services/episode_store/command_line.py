@@ -1,14 +1,78 @@
 """Command line `dextouch store`: inspect, repair and delete items of a store."""
 
-from collections.abc import Callable, Sequence
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
-from dextouch.command_line import write_result
-from dextouch.episodes import EpisodeStore
+import numpy as np
+
+from dextouch.command_line import progress, write_result
+from dextouch.data_folder import is_system_file
+from dextouch.episodes import (
+    KINDS,
+    ClickedPoses,
+    EpisodeGrid,
+    EpisodeReader,
+    EpisodeStore,
+    GroupFiles,
+    Kind,
+    LocalGroup,
+    TrashKind,
+    check_id,
+    clicked_poses,
+    has_object_poses,
+    local_folder,
+    shard_path,
+    stream_arrays,
+    touched_objects,
+)
+from dextouch.episodes.care import (
+    LEFT,
+    DeletionRecords,
+    DeletionRequest,
+    Finding,
+    ItemReport,
+    delete_for_good,
+    inspect_group,
+    inspect_stage,
+    inspect_upload,
+    open_contents,
+    plan_deletion,
+    repair_group,
+    repair_uploads,
+    reviews_by,
+    unfinished_folders,
+)
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.free_text import printable
+from dextouch.geometry import transform_from_pose
+from dextouch.schemas import (
+    EpisodeAttributes,
+    EpisodeClicks,
+    EpisodeSummary,
+    RecordingAttributes,
+    RecordingSummary,
+    SceneObject,
+    SceneObjects,
+    json_ready,
+    load_object_clicks,
+)
 from dextouch.serving import configure_logging, load_settings
-from services.episode_store.commands import Context, Outcome, change, inspect
+from services.episode_store.catalog import Catalog
+from services.episode_store.deletions import deletion_statuses
+from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 from services.episode_store.settings import EpisodeStoreSettings
+
+EXIT_DAMAGED = 1
+_SIZES = ("bytes", "kB", "MB", "GB", "TB")
+_OUTCOMES = {True: "success", False: "failure", None: "not judged"}
+
+Outcome = tuple[dict[str, Any], int]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -21,23 +85,480 @@ def main(argv: Sequence[str]) -> int:
     # Items that the catalog leaves out are reported on stderr.
     configure_logging(service="episode_store", log_format="auto", level="warning")
     url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options, _say))
+    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options))
     write_result(options.json, result)
     return status
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Print a line that may hold text of others."""
     print(printable(line))
 
 
+@dataclass(frozen=True)
+class Context:
+    """The store, its URL, and parsed arguments."""
+
+    store: EpisodeStore
+    url: str
+    options: argparse.Namespace
+
+    def kind_of(self, item_id: str) -> Kind:
+        """Kind of an id: given by --kind, otherwise the one under which it exists.
+
+        Raises:
+            NotFoundError: no such id.
+            InvalidInputError: both kinds exist.
+        """
+        check_id(item_id)
+        if self.options.kind:
+            return self.options.kind
+        found = [kind for kind in KINDS if self._is_there(kind, item_id)]
+        if not found:
+            raise NotFoundError(
+                f"{item_id!r}: not in the store {self.url}, neither episode nor recording"
+            )
+        if len(found) > 1:
+            raise InvalidInputError(
+                f"{item_id!r} is an episode and a recording; name one with --kind"
+            )
+        return found[0]
+
+    def _is_there(self, kind: Kind, item_id: str) -> bool:
+        if self.store.exists(item_id, kind=kind):
+            return True
+        return self.root is not None and (self.root / f"{kind}s" / item_id).is_dir()
+
+    def items(self) -> list[tuple[Kind, str]]:
+        """Selected items: the given ids, otherwise all of the given kinds.
+
+        A folder counts even without a commit record.
+        """
+        if self.options.ids:
+            return [(self.kind_of(item_id), item_id) for item_id in self.options.ids]
+        found: list[tuple[Kind, str]] = []
+        for kind in KINDS if self.options.kind is None else (self.options.kind,):
+            names = set(self.store.list(kind=kind))
+            folder = None if self.root is None else self.root / f"{kind}s"
+            if folder is not None and folder.is_dir():
+                names |= {p.name for p in folder.iterdir() if not is_system_file(p.name)}
+            found += [(kind, name) for name in sorted(names)]
+        return found
+
+    @property
+    def root(self) -> Path | None:
+        """The store's folder; None for one in a bucket."""
+        return None if self.url.startswith("s3://") else local_folder(self.url)
+
+    def need_local_root(self) -> Path:
+        """The store's folder.
+
+        Raises:
+            InvalidInputError: a store in a bucket.
+        """
+        if self.root is None:
+            raise InvalidInputError(
+                f"{self.options.command}: got the store {self.url}, expected one in a folder; copy "
+                "it to a folder first, or use the versions of the bucket"
+            )
+        return self.root
+
+
+def readable_size(num_bytes: int) -> str:
+    """Format a size with three digits and a unit."""
+    size, unit = float(num_bytes), 0
+    while size >= 999.5 and unit < len(_SIZES) - 1:
+        size, unit = size / 1000, unit + 1
+    return f"{num_bytes} bytes" if unit == 0 else f"{size:.3g} {_SIZES[unit]}"
+
+
+def table(rows: list[tuple[str, ...]]) -> list[str]:
+    """Format rows of text as lines with aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    return [
+        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def list_items(context: Context) -> Outcome:
+    """List matching items of the store, or its trash."""
+    options = context.options
+    if options.trash:
+        return _list_trash(context)
+    root = context.root
+    if root is not None and not root.is_dir():
+        raise NotFoundError(f"store {root}: no such folder; name another with --store")
+    if options.kind == "recording" and options.origin is not None:
+        raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
+    catalog = Catalog(context.store)
+    # Recordings have no origin to match.
+    kind: Kind | None = "episode" if options.origin is not None else options.kind
+    result: dict[str, Any] = {"num_matching": 0, "next_after": None}
+    totals = []
+    for each in KINDS if kind is None else (kind,):
+        found, num_in_all = _list_kind(context, catalog, each)
+        result |= found | {"num_matching": result["num_matching"] + found["num_matching"]}
+        totals.append(f"{num_in_all} {each}" + "s" * (num_in_all != 1))
+    if not result["num_matching"]:
+        say(f"nothing matches, of {' and '.join(totals)}")
+    return result, 0
+
+
+def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str, Any], int]:
+    """List matching items of a kind; returns them and the number of all."""
+    options = context.options
+    query = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
+    if kind == "episode":
+        episodes = catalog.episodes(query, limit=sys.maxsize)
+        for row in episodes.episodes:
+            facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
+            say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
+        return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+    recordings = catalog.recordings(query, limit=sys.maxsize)
+    for each in recordings.recordings:
+        facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
+        say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
+    return json_ready(recordings), catalog.recordings(limit=1).num_matching
+
+
+def _outcome(
+    row: EpisodeSummary | RecordingSummary | EpisodeAttributes | RecordingAttributes,
+) -> str:
+    return _OUTCOMES[row.success] + "  recovered" * row.recovered
+
+
+def _list_trash(context: Context) -> Outcome:
+    rows = []
+    for entry in context.store.trash_list():
+        deleted_at = datetime.fromtimestamp(entry.deleted_at_ns / 1e9, UTC)
+        date, size = deleted_at.isoformat(timespec="seconds"), readable_size(entry.num_bytes)
+        say(f"{entry.item_id}  {entry.kind}  deleted {date}  {size}")
+        known = {"kind": entry.kind, "id": entry.item_id}
+        rows.append(known | {"deleted_at": date, "num_bytes": entry.num_bytes})
+    return {"trash": rows}, 0
+
+
+def show(context: Context) -> Outcome:
+    """Attributes of one group and a table of its streams."""
+    item_id = context.options.id
+    kind = context.kind_of(item_id)
+    store = context.store
+    reader = store.recording(item_id) if kind == "recording" else store.open(item_id)
+    files = store.files(item_id, kind=kind)
+    contents = open_contents(files, kind)
+    streams = {}
+    rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
+    for name, descriptor in reader.streams.items():
+        entry = contents.entries[name]
+        # Steps between samples above one and a half nominal periods.
+        num_gaps = int((np.diff(reader.stamps_ns(name)) > 1.5 * descriptor.period_ns()).sum())
+        arrays = stream_arrays(descriptor, kind)
+        shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
+        num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
+        num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
+        streams[name] = {
+            "rate_hz": rate_hz,
+            "num_samples": num_samples,
+            "num_gaps": num_gaps,
+            "num_bytes": num_bytes,
+            "codec": entry.codec,
+            "encoder": entry.encoder,
+        }
+        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
+        rows.append((name, *numbers, entry.codec, entry.encoder or ""))
+    result = {
+        "attributes": json_ready(reader.attributes),
+        "num_samples": {name: reader.num_samples(name) for name in reader.streams},
+        "streams": streams,
+        "content_sha256": reader.content_sha256,
+    }
+    attributes = reader.attributes
+    say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
+    say(_outcome(attributes))
+    for source in attributes.lineage:
+        say(f"made from {source.kind} {source.id}")
+    for line in table(rows):
+        say(line)
+    say(f"content {reader.content_sha256}")
+    return result, 0
+
+
+def verify(context: Context) -> Outcome:
+    """Verify items completely and list all damage."""
+    items, root = context.items(), context.root
+    reports: list[ItemReport] = []
+    for kind, item_id in progress(items, "verify", len(items)):
+        try:
+            # Not through the store, which ignores groups without a commit record.
+            files = (
+                context.store.files(item_id, kind=kind)
+                if root is None
+                else LocalGroup(root / f"{kind}s" / item_id)
+            )
+            reports.append(inspect_group(files, kind))
+        except NotFoundError:
+            say(f"{item_id}  deleted meanwhile  {kind}")
+    if not context.options.ids and root is not None:
+        for what, folder in unfinished_folders(root):
+            reports.append(_inspect_unfinished(what, folder))
+    for report in reports:
+        _say_report(report)
+    damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
+    result = {
+        "verified": sum(report.kind in KINDS for report in reports),
+        "damaged": damaged,
+        "reports": [asdict(report) for report in reports],
+    }
+    return result, EXIT_DAMAGED if damaged else 0
+
+
+def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
+    if not folder.is_dir() or folder.is_symlink():
+        finding = Finding(f"{kind} {folder.name}: is not a folder; move it away", foreign=True)
+        return ItemReport(kind, folder.name, findings=(finding,))
+    return inspect_stage(folder) if kind == "stage" else inspect_upload(folder)
+
+
+def _say_report(report: ItemReport) -> None:
+    size = f"{report.num_arrays} arrays, {report.num_bytes} bytes"
+    if report.damaged:
+        for finding in report.findings:
+            say(f"{report.item_id}  DAMAGED  {finding.message}")
+    elif report.kind in KINDS:
+        say(f"{report.item_id}  whole  {report.kind}, {size}")
+    else:
+        state = "being written" if report.busy else "unfinished"
+        say(f"{report.item_id}  {state}  {report.kind}, {size}")
+
+
+def clicks(context: Context) -> Outcome:
+    """Check the clicks of a file and of the store, and list the places that they and touch give.
+
+    The result is a file of all clicks.
+    """
+    given = load_object_clicks(context.options.clicks)
+    names = sorted({*given.episodes, *context.store.list()})
+    found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
+    rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
+    for name, one in found.items():
+        reader = context.store.open(name)
+        clicked = None
+        if one is not None:
+            is_lenient = name not in given.episodes
+            clicked = clicked_poses(reader.attributes, given, one, may_lack_headings=is_lenient)
+            rows += _clicked_rows(name, one, clicked)
+        rows += _touched_rows(reader, given, clicked)
+    for line in table(rows):
+        say(line)
+    episodes = {name: one for name, one in found.items() if one is not None}
+    return json_ready(given.model_copy(update={"episodes": episodes})), 0
+
+
+def _clicked_rows(
+    name: str, clicked: EpisodeClicks, found: ClickedPoses
+) -> Iterator[tuple[str, ...]]:
+    for index, one in enumerate(found.objects):
+        click = clicked.objects.get(one.name)
+        if click is None:
+            if one.touch is None:
+                yield name, one.name, "", "not clicked", *[""] * 3
+        elif click.state != "seen":
+            yield name, one.name, "clicks", click.state, *[""] * 3
+        elif not found.known[index]:
+            yield name, one.name, "clicks", "no heading", *[""] * 3
+        else:
+            place = _place(one, found.poses[index], found.sd_m[index])
+            yield name, one.name, "clicks", *place
+
+
+def _touched_rows(
+    reader: EpisodeReader, objects: SceneObjects, clicked: ClickedPoses | None
+) -> Iterator[tuple[str, ...]]:
+    """Places that touch alone gives, of objects that neither clicks nor streams place."""
+    about = reader.attributes
+    listed = objects.tasks.get(about.task, ())
+    names = tuple(one.name for one in listed)
+    is_touched = about.success and any(one.touch is not None for one in listed)
+    if not is_touched or has_object_poses(reader) or about.object_names not in {(), names}:
+        return
+    done = np.zeros(len(listed), dtype=np.bool_) if clicked is None else clicked.known
+    track = touched_objects(EpisodeGrid(reader), objects)
+    for index, one in enumerate(listed):
+        if one.touch is not None and not done[index]:
+            place = ("no clear hold", *[""] * 3)
+            if track.known[0, index]:
+                place = _place(one, track.poses[0, index], track.sd_m[index])
+            yield about.episode_id, one.name, "touch", *place
+
+
+def _place(one: SceneObject, pose: np.ndarray, sd_m: float) -> tuple[str, str, str, str]:
+    """Place (x, y mm), heading and error (mm) of an object at the first step, as text."""
+    axis = one.click.heading
+    x, y = transform_from_pose(pose)[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
+    heading = "symmetric" if one.click.symmetric else f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
+    return f"{1e3 * pose[0]:.0f}", f"{1e3 * pose[1]:.0f}", heading, f"{1e3 * sd_m:.1f}"
+
+
+def delete(context: Context) -> Outcome:
+    """Move ids to the trash, delete them permanently, or all data of an operator or recording."""
+    options = context.options
+    if options.operator is not None or options.recording is not None:
+        return _delete_all_of(context)
+    if not options.ids:
+        raise InvalidInputError(
+            "delete: got nothing to delete, expected ids, --operator or --recording"
+        )
+    if options.derived or options.receipt or options.checkpoints or options.unsent:
+        raise InvalidInputError(
+            "delete: --derived, --receipt, --checkpoints and --unsent go with --operator or "
+            "--recording"
+        )
+    for item_id, kind in [(item_id, context.kind_of(item_id)) for item_id in options.ids]:
+        context.store.delete(item_id, kind=kind, for_good=options.for_good)
+        say(f"{item_id}  {'deleted permanently' if options.for_good else 'in the trash'}")
+    return {"deleted": options.ids, "for_good": options.for_good}, 0
+
+
+def _delete_all_of(context: Context) -> Outcome:
+    options, root = context.options, context.need_local_root()
+    if not options.for_good or options.ids:
+        raise InvalidInputError(
+            "delete: --operator and --recording remove all that stems from them; got "
+            f"{'ids as well' if options.ids else 'no --for-good'}, expected --for-good alone"
+        )
+    # Derived data of an operator is always deleted; that of a recording on request.
+    derived = options.derived or options.operator is not None
+    request = DeletionRequest(
+        operator=options.operator, recording=options.recording, derived=derived
+    )
+    name = options.operator or options.recording
+    victims = plan_deletion(root, request)
+    for victim in victims:
+        say(f"{victim.place}/{victim.folder}  {victim.reason}")
+    gone = {(victim.place, victim.folder) for victim in victims}
+    for facts in reviews_by(root, request):
+        if (facts.place, facts.folder.name) not in gone:
+            say(f"{facts.place}/{facts.folder.name}  review: loses its reviewer's name")
+    if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
+        raise InvalidInputError("delete: not confirmed; nothing was removed")
+    path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
+    unsent = options.unsent and options.operator is not None
+    receipt = delete_for_good(root, request, path, checkpoints=options.checkpoints, unsent=unsent)
+    for reference in receipt.remaining:
+        say(f"{reference.where}  still names {', '.join(reference.names)}")
+    for place in receipt.unreadable:
+        say(f"{place}  cannot be read; repair or delete it, then repeat")
+    for one in receipt.outstanding:
+        say(_outstanding_line(one.station, one.recordings, has_answered=one.has_answered))
+    say(
+        f"{len(receipt.deleted)} removed, {len(receipt.unnamed_reviews)} reviews without a name, "
+        f"{len(receipt.remaining)} references left, "
+        f"{len(receipt.unreadable)} unreadable of {receipt.num_files_searched} files searched; "
+        f"receipt {path}"
+    )
+    return receipt.model_dump(mode="json"), 0 if receipt.complete else EXIT_DAMAGED
+
+
+def _outstanding_line(station: str, recordings: Sequence[str], *, has_answered: bool) -> str:
+    held = ", ".join(recordings) or "takes not uploaded yet, if there are any"
+    why = "still in its spool" if has_answered else "it removes them when it next asks the store"
+    return f"station {station}  outstanding: {held} ({why})"
+
+
+def deletions(context: Context) -> Outcome:
+    """List permanent deletions and what stations have yet to remove."""
+    options, records = context.options, DeletionRecords(context.need_local_root())
+    if options.readmit is not None:
+        if not records.readmit(options.readmit):
+            raise NotFoundError(f"deletions: no deleted operator {options.readmit!r}")
+        say("readmitted: takes of this operator may be uploaded again")
+    if options.settle is not None:
+        records.confirm(options.settle, revision=records.revision, held={})
+        say(f"station {options.settle}  nothing outstanding: its spool is gone")
+    found = deletion_statuses(records)
+    if options.operator is not None or options.recording is not None:
+        key = records.key_of(operator=options.operator, recording=options.recording)
+        found = [one for one in found if one.key == key]
+    for one in found:
+        what = "an operator" if one.is_of_operator else "a recording"
+        count = sum(len(left.recordings) for left in one.outstanding)
+        say(
+            f"{one.deleted_at:%Y-%m-%d %H:%M:%S} UTC  {what}, {one.num_recordings} recordings, "
+            f"{count} outstanding at {len(one.outstanding)} stations"
+        )
+        for left in one.outstanding:
+            line = _outstanding_line(left.station, left.recordings, has_answered=left.has_answered)
+            say(f"  {line}")
+    return {"deletions": [one.model_dump(mode="json") for one in found]}, 0
+
+
+def _answer(question: str) -> str:
+    sys.stderr.write(question)
+    sys.stderr.flush()
+    return sys.stdin.readline().strip()
+
+
+def restore(context: Context) -> Outcome:
+    """Restore the last deleted item of each id."""
+    options = context.options
+    for item_id in options.ids:
+        kinds = {entry.kind for entry in context.store.trash_list() if entry.item_id == item_id}
+        if options.kind is None and len(kinds) > 1:
+            raise InvalidInputError(
+                f"{item_id!r} is in the trash as {', '.join(sorted(kinds))}; name one with --kind"
+            )
+        found: TrashKind = next(iter(kinds), "episode")
+        kind: TrashKind = options.kind or found
+        context.store.restore(item_id, kind=kind)
+        say(f"{item_id}  restored")
+    return {"restored": options.ids}, 0
+
+
+def purge(context: Context) -> Outcome:
+    """Permanently delete old items of the trash."""
+    gone = context.store.purge(older_than_s=context.options.older_than)
+    for entry in gone:
+        say(f"{entry.item_id}  {entry.kind}  {readable_size(entry.num_bytes)} freed")
+    num_bytes = sum(entry.num_bytes for entry in gone)
+    say(f"{len(gone)} purged, {readable_size(num_bytes)} freed")
+    return {"purged": [entry.item_id for entry in gone], "num_bytes": num_bytes}, 0
+
+
+def repair(context: Context) -> Outcome:
+    """Repair damaged items from a copy, and salvage the rest."""
+    root, options = context.need_local_root(), context.options
+    copies = EpisodeStore(options.source) if options.source else None
+    reports = [] if options.ids else repair_uploads(root)
+    for kind, item_id in context.items():
+        reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
+    for report in reports:
+        say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
+        for name, count in report.lost.items():
+            say(f"  {name}: {count} samples lost")
+        for note in report.notes:
+            say(f"  {note}")
+    left = any(report.action == LEFT for report in reports)
+    return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
+
+
+def _copy(copies: EpisodeStore | None, kind: Kind, item_id: str) -> GroupFiles | None:
+    if copies is None:
+        return None
+    try:
+        return copies.files(item_id, kind=kind)
+    except NotFoundError:
+        return None
+
+
 _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
-    "list": inspect.list_items,
-    "show": inspect.show,
-    "verify": inspect.verify,
-    "clicks": inspect.clicks,
-    "delete": change.delete,
-    "deletions": change.deletions,
-    "restore": change.restore,
-    "purge": change.purge,
-    "repair": change.repair,
+    "list": list_items,
+    "show": show,
+    "verify": verify,
+    "clicks": clicks,
+    "delete": delete,
+    "deletions": deletions,
+    "restore": restore,
+    "purge": purge,
+    "repair": repair,
 }

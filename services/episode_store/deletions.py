@@ -3,16 +3,14 @@
 Deletions are made by `dextouch store delete` on the same folder, also while the service runs.
 """
 
-import threading
 from collections import defaultdict
-from collections.abc import Callable
 from typing import Annotated, Final
 
 import structlog
 from fastapi import APIRouter, Depends
 
 from dextouch.episodes.care import DeletionRecords, TakeFacts, take_start
-from dextouch.errors import ConflictError, DexTouchError
+from dextouch.errors import ConflictError
 from dextouch.schemas import (
     OPERATOR_DELETED,
     TAKE_DELETED,
@@ -31,8 +29,6 @@ from services.episode_store.keys import MAY_DELETE, MAY_WRITE, Writer
 
 logger = structlog.get_logger(__name__)
 
-# How soon a deletion reaches an upload that nobody continues.
-WATCH_PERIOD_S: Final = 1.0
 MAX_CHECK_BYTES: Final = 512 * KIB
 Checked = Annotated[CheckTakes, Depends(JsonBody(CheckTakes))]
 
@@ -78,12 +74,12 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
 
     @router.post("/check", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
-    def check(wanted: Checked, sender: Writer) -> CheckedTakes:
+    def check(body: Checked, sender: Writer) -> CheckedTakes:
         """Which of these takes were deleted, and which operators."""
-        sender.check_station(wanted.station)
+        sender.check_station(body.station)
         # Before the takes, so that a deletion in between is found by the next check.
         revision = records.revision
-        found = ((take, _deletion_of(records, wanted.station, take)) for take in wanted.takes)
+        found = ((take, _deletion_of(records, body.station, take)) for take in body.takes)
         return CheckedTakes(
             revision=revision,
             takes=tuple(
@@ -91,7 +87,7 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
                 for take, key in found
                 if key is not None
             ),
-            operators=tuple(name for name in wanted.operators if records.has_operator(name)),
+            operators=tuple(name for name in body.operators if records.has_operator(name)),
         )
 
     @router.post("/confirm", dependencies=[MAY_WRITE])
@@ -141,51 +137,3 @@ def deletion_statuses(records: DeletionRecords) -> list[DeletionStatus]:
         )
         for key, record in records.read().items()
     ]
-
-
-class DeletionWatch:
-    """Drops uploads of deleted takes that nobody continues, soon after the deletion.
-
-    Args:
-        records: of the store.
-        drop: drops uploads of deleted takes, and returns their ids.
-        ended: called with the id of each dropped upload.
-    """
-
-    def __init__(
-        self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
-    ) -> None:
-        self._records, self._drop, self._ended = records, drop, ended
-        self._revision = ""
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="deletions", daemon=True)
-
-    def start(self) -> None:
-        """Start watching."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread."""
-        self._stopping.set()
-        self._thread.join()
-
-    def look(self) -> None:
-        """Drop uploads if there was a deletion since the last look."""
-        revision = self._records.revision
-        if revision != self._revision:
-            for recording_id in self._drop():
-                self._ended(recording_id)
-            self._revision = revision
-
-    def _run(self) -> None:
-        problem = ""
-        while not self._stopping.is_set():
-            try:
-                self.look()
-            except DexTouchError as error:
-                if error.message != problem:
-                    logger.warning("fail_deletions", reason=error.message)
-                problem = error.message
-            else:
-                problem = ""
-            self._stopping.wait(WATCH_PERIOD_S)

@@ -37,6 +37,7 @@ _WEIGHTS = {
     "recovered": 5.0,
     "not_judged": 1.0,
 }
+EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
 
@@ -72,10 +73,6 @@ def quality_bound(text: str) -> tuple[str, float]:
     if not (name and colon) or math.isnan(least):
         raise ValueError(f"got {text!r}, expected NAME:NUMBER such as coverage:0.95")
     return name, least
-
-
-def _is_between(at: datetime | None, after: datetime | None, before: datetime | None) -> bool:
-    return at is not None and (after is None or after <= at) and (before is None or at < before)
 
 
 class CatalogFilter(FrozenModel):
@@ -120,7 +117,6 @@ class CatalogFilter(FrozenModel):
 
     def _further(self) -> list[Callable[[Entry[S]], bool]]:
         """Checks of the filters that do not compare one field of the summary."""
-        after, before = self.created_after, self.created_before
         checks: list[Callable[[Entry[S]], bool]] = []
         if self.outcome is not None:
             success = _SUCCESS[self.outcome]
@@ -128,8 +124,9 @@ class CatalogFilter(FrozenModel):
         if self.text:
             text = self.text.casefold()
             checks.append(lambda entry: text in entry.text)
-        if after is not None or before is not None:
-            checks.append(lambda entry: _is_between(entry.created_at, after, before))
+        if self.created_after is not None or self.created_before is not None:
+            after, before = self.created_after or EARLIEST, self.created_before or LATEST
+            checks.append(lambda entry: after <= (entry.created_at or LATEST) < before)
         return checks
 
 
@@ -170,8 +167,8 @@ class ItemFilter(CatalogFilter):
             flagged = self.flagged
             checks.append(lambda entry: bool(entry.item.findings) == flagged)
         if self.id:
-            wanted = frozenset(self.id)
-            checks.append(lambda entry: entry.item.id in wanted)
+            ids = frozenset(self.id)
+            checks.append(lambda entry: entry.item.id in ids)
         return checks
 
 
@@ -184,7 +181,6 @@ class Page(FrozenModel):
 
     sort: SortKey = "id"
     descending: bool = False
-
     limit: int | None = Field(default=None, ge=1)
     offset: int = Field(default=0, ge=0)
     after: str | None = Field(

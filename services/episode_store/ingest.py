@@ -114,7 +114,7 @@ class Ingest:
         sender.check_station(attributes.station)
         with self._working_on(recording_id):
             refuse_deleted(self._deletions, attributes)
-            if self._store.exists(recording_id, kind="recording"):
+            if self.is_finished(recording_id):
                 _check_same(attributes, self._store.recording(recording_id).attributes)
                 return RecordingStatus(recording_id=recording_id, state="finished")
             path = self._path(recording_id)
@@ -142,7 +142,7 @@ class Ingest:
             AccessDeniedError: it is none of the sender.
         """
         with self._working_on(recording_id):
-            if self._store.exists(recording_id, kind="recording"):
+            if self.is_finished(recording_id):
                 sender.check_station(self._store.recording(recording_id).attributes.station)
                 return RecordingStatus(recording_id=recording_id, state="finished")
             return _status(self._upload(recording_id, sender))
@@ -160,7 +160,7 @@ class Ingest:
         return self._path(recording_id).exists() or self.is_finished(recording_id)
 
     def is_finished(self, recording_id: str) -> bool:
-        """Whether a recording is finished, which it can be told again without any space."""
+        """Whether a recording is finished; finishing it again needs no space."""
         return self._store.exists(recording_id, kind="recording")
 
     def put_batch(
@@ -197,13 +197,18 @@ class Ingest:
             StorageFullError: no space; the upload is unchanged.
         """
         with self._working_on(recording_id):
-            is_finished = self._store.exists(recording_id, kind="recording")
+            is_finished = self.is_finished(recording_id)
             if not is_finished:
                 spool = self._upload(recording_id, sender)
                 refuse_deleted(self._deletions, spool.attributes)
                 _check_announced(recording_id, _status(spool).next_batch, body)
                 is_finished = not self._move(spool, body)
-                self._undo_deleted(spool.attributes)
+                try:
+                    refuse_deleted(self._deletions, spool.attributes)
+                except ConflictError:
+                    # Deleted while it was committed, when nothing listed it.
+                    self._store.delete(recording_id, kind="recording", for_good=True)
+                    raise
             content = {}
             if is_finished or body.content:
                 content = self._check_committed(recording_id, body, sender)
@@ -227,9 +232,7 @@ class Ingest:
     def drop_deleted(self) -> list[str]:
         """Drop unfinished uploads of takes that were deleted permanently, and return their ids."""
         gone = []
-        with disk_errors("list uploads"):
-            paths = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
-        for path in (path for path in paths if "." not in path.name):
+        for path in upload_folders(self.folder):
             with self._working_on(path.name):
                 try:
                     refuse_deleted(self._deletions, read_attributes(path))
@@ -258,14 +261,6 @@ class Ingest:
             spool.abandon()
         shutil.rmtree(self._path(recording_id), ignore_errors=True)
 
-    def _undo_deleted(self, attributes: RecordingAttributes) -> None:
-        """Remove a recording that was deleted while it was committed, when nothing lists it."""
-        try:
-            refuse_deleted(self._deletions, attributes)
-        except ConflictError:
-            self._store.delete(attributes.recording_id, kind="recording", for_good=True)
-            raise
-
     def _move(self, spool: SpoolWriter, body: FinishRecording) -> bool:
         """Commit an upload; whether we did, and not the process of a previous service."""
         known = spool.attributes
@@ -286,7 +281,7 @@ class Ingest:
         try:
             counts = self._commit(self._path(recording_id), attributes, body.content)
         except ConflictError:
-            if not self._store.exists(recording_id, kind="recording"):
+            if not self.is_finished(recording_id):
                 raise
             return False
         logger.info("recording_finished", recording_id=recording_id, num_samples=counts)
@@ -328,7 +323,7 @@ class Ingest:
                     return self._open[recording_id]
                 # Removed by someone else: what is appended to it now would be lost.
                 self._open.pop(recording_id).abandon()
-        if self._store.exists(recording_id, kind="recording"):
+        if self.is_finished(recording_id):
             raise ConflictError(f"recording {recording_id!r} is finished and cannot be changed")
         path = self._path(recording_id)
         if not path.exists():
@@ -346,6 +341,14 @@ class Ingest:
 
     def _path(self, recording_id: str) -> Path:
         return self.folder / recording_id
+
+
+def upload_folders(folder: Path) -> list[Path]:
+    """Folders of the unfinished uploads in a folder, by name; they may end at any moment."""
+    with disk_errors("list uploads"):
+        paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    # A name with a dot is an upload that is still being created.
+    return [path for path in paths if "." not in path.name]
 
 
 def idle_seconds(path: Path) -> float:

@@ -16,15 +16,15 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
-from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary
-from services.episode_store.ingest import idle_seconds
+from dextouch.schemas import BatchReceipt, RecordingAttributes, UploadList, UploadSummary
+from services.episode_store.ingest import idle_seconds, upload_folders
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
 
+# Bounds of the histograms.
 SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
-
-
+REFUSAL_REASONS: Final = ("busy", "disk", "quota", "other")
 BUSY_RETRY_S = 1
 FULL_RETRY_S = 30
 # Maximum age of the sum of finished recordings; our own commits are counted at once.
@@ -167,11 +167,12 @@ class StorageLimits:
                 station=attributes.station,
                 task=attributes.task,
                 num_bytes=folder_bytes(path),
-                idle_s=idle_seconds(path),
+                idle_s=since_s,
             )
             for path, attributes in self._spools()
+            if (since_s := idle_seconds(path)) >= idle_s
         ]
-        return UploadList(uploads=tuple(upload for upload in found if upload.idle_s >= idle_s))
+        return UploadList(uploads=tuple(found))
 
     def _check_disk(self, num_bytes: int, reserve: int, what: str) -> None:
         free = self.free_bytes()
@@ -188,7 +189,12 @@ class StorageLimits:
     def _check_quota(self, station: str, num_bytes: int) -> None:
         if self._quota is None:
             return
-        used = self._used(station)
+        now = time.monotonic()
+        with self._guard:
+            if self._finished is None or now - self._finished[0] > REFRESH_S:
+                self._finished = (now, self._recordings())
+            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
+            used = self._finished[1].get(station, 0) + sum(uploads)
         if used + num_bytes > self._quota:
             raise StorageFullError(
                 f"station {station!r}: {used} bytes are in use and {num_bytes} more were sent, "
@@ -199,20 +205,9 @@ class StorageLimits:
                 retry_after_s=FULL_RETRY_S,
             )
 
-    def _used(self, station: str) -> int:
-        now = time.monotonic()
-        with self._guard:
-            if self._finished is None or now - self._finished[0] > REFRESH_S:
-                self._finished = (now, self._recordings())
-            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
-            return self._finished[1].get(station, 0) + sum(uploads)
-
     def _spools(self) -> list[tuple[Path, RecordingAttributes]]:
         found = []
-        with disk_errors("list uploads"):
-            paths = sorted(self._folder.iterdir()) if self._folder.is_dir() else []
-        # A name with a dot is an upload that is still being created.
-        for path in (path for path in paths if "." not in path.name):
+        for path in upload_folders(self._folder):
             try:
                 found.append((path, read_attributes(path)))
             except NotFoundError:
@@ -222,62 +217,34 @@ class StorageLimits:
         return found
 
 
-REFUSAL_REASONS: Final = ("busy", "disk", "quota", "other")
-
-
 class UploadMetrics:
-    """Prometheus metrics of uploads."""
+    """Prometheus metrics of a store, in a `registry`: uploads, and what the limits measure.
 
-    def __init__(self) -> None:
-        self.batches = Counter(
-            "dextouch_store_batches",
-            "Acknowledged batches; replayed ones were stored before.",
-            ("replayed",),
-            registry=None,
-        )
-        self.bytes = Counter(
-            "dextouch_store_batch_bytes", "Bytes of acknowledged new batches.", registry=None
-        )
-        self.ack_seconds = Histogram(
-            "dextouch_store_ack_seconds",
-            "Time from admission of a batch to its acknowledgement.",
-            buckets=SECONDS,
-            registry=None,
-        )
-        self.finish_seconds = Histogram(
-            "dextouch_store_finish_seconds",
-            "Time from the request to finish an upload to the committed recording.",
-            buckets=SECONDS,
-            registry=None,
-        )
-        self.refused = Counter(
-            "dextouch_store_refused",
-            "Refused upload requests by the exhausted resource.",
-            ("reason",),
-            registry=None,
-        )
+    Args:
+        limits: of the store's disk.
+        num_items: how many recordings and episodes are stored, by kind.
+    """
 
-    def register(
-        self,
-        registry: CollectorRegistry,
-        limits: StorageLimits,
-        num_items: Mapping[str, Callable[[], int]],
-    ) -> None:
-        """Add the metrics to a registry, with what the limits measure.
-
-        Args:
-            registry: of the service.
-            limits: of the store's disk.
-            num_items: how many recordings and episodes are stored, by kind.
-        """
+    def __init__(self, limits: StorageLimits, num_items: Mapping[str, Callable[[], int]]) -> None:
+        registry = self.registry = CollectorRegistry()
+        text = "Acknowledged batches; replayed ones were stored before."
+        self.batches = Counter("dextouch_store_batches", text, ("replayed",), registry=registry)
+        text = "Bytes of acknowledged new batches."
+        self.bytes = Counter("dextouch_store_batch_bytes", text, registry=registry)
+        text = "Refused upload requests by the exhausted resource."
+        self.refused = Counter("dextouch_store_refused", text, ("reason",), registry=registry)
+        self.ack_seconds, self.finish_seconds = (
+            Histogram(f"dextouch_store_{name}_seconds", text, buckets=SECONDS, registry=registry)
+            for name, text in (
+                ("ack", "Time from admission of a batch to its acknowledgement."),
+                ("finish", "Time from the request to finish an upload to the committed recording."),
+            )
+        )
         # A rate needs a first value to grow from.
         for reason in REFUSAL_REASONS:
             self.refused.labels(reason)
         for replayed in ("true", "false"):
             self.batches.labels(replayed)
-        counts = (self.batches, self.bytes, self.refused)
-        for metric in (*counts, self.ack_seconds, self.finish_seconds):
-            registry.register(metric)
         for name, text, measure in (
             ("open_uploads", "Unfinished uploads.", lambda: limits.num_open),
             ("free_bytes", "Free bytes on the store's disk.", limits.free_bytes),
@@ -287,6 +254,13 @@ class UploadMetrics:
         items = Gauge("dextouch_store_items", text, ("kind",), registry=registry)
         for kind, count in num_items.items():
             items.labels(kind).set_function(count)
+
+    def count(self, receipt: BatchReceipt, *, num_bytes: int, took_s: float) -> None:
+        """Count a batch of so many bytes that was acknowledged in `took_s` after its admission."""
+        self.ack_seconds.observe(took_s)
+        self.batches.labels(str(receipt.replayed).lower()).inc()
+        if not receipt.replayed:
+            self.bytes.inc(num_bytes)
 
     @contextmanager
     def counting_refusals(self) -> Iterator[None]:

@@ -1,16 +1,24 @@
-"""What a catalog makes of its entries: items in one list, hours of episodes, and lineage.
+"""What a catalog makes of its entries: items in one list, their findings, hours, and lineage.
 
-Items are recordings, episodes, or takes, with the findings of comparisons. A take is a recording
-together with the episodes that were made from it, or an episode without a stored recording.
+Items are recordings, episodes, or takes. A take is a recording together with the episodes that were
+made from it, or an episode without a stored recording.
+
+Findings are figures beyond limits, and outliers among items of the same task. The limits are those
+of live health for the same faults: they need no other items to compare with, so they hold from the
+first take of a task on. Outliers have robust z-scores of figures, 0.6745 (x − median) / MAD, above
+3.5 (Iglewicz and Hoaglin, How to Detect and Handle Outliers, 1993).
 """
 
+import re
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import timedelta, timezone
 from typing import Any, Final, Literal
 
+import numpy as np
+from jaxtyping import Float64
 from pydantic import Field
 
 from dextouch.episodes import EpisodeReader, RecordingReader
@@ -18,6 +26,7 @@ from dextouch.errors import NotFoundError
 from dextouch.schemas import (
     CatalogHours,
     CatalogItem,
+    ClockReport,
     ComparedGroup,
     EpisodeAttributes,
     EpisodeSummary,
@@ -27,11 +36,12 @@ from dextouch.schemas import (
     HoursRow,
     Lineage,
     LineageNode,
+    RecordingAttributes,
     RecordingSummary,
     Review,
 )
+from dextouch.streams import LEAST_SHARE_KEPT, residual_limits_s
 from services.episode_store.filters import Entry, EpisodeFilter, ItemsKind
-from services.episode_store.findings import MIN_ITEMS, beyond_limits, figures_of, find_outliers
 
 AnyEntry = Entry[Any]
 Entries = Mapping[str, AnyEntry]
@@ -41,9 +51,15 @@ _SHARED: Final = (
     "complete", "incomplete_cause",
 )  # fmt: skip
 MAX_NODES = 200
+# Kind and id of an item.
 Name = tuple[str, str]
 SECONDS_AN_HOUR = 3600.0
 HoursField = Literal["task", "operator", "station", "day"]
+# MAD of a normal distribution with standard deviation 1 (Iglewicz and Hoaglin, section 3.3).
+MAD_OF_SIGMA: Final = 0.6745
+MAX_SCORE: Final = 3.5
+# Median and MAD of fewer values say little about what is usual.
+MIN_ITEMS: Final = 8
 
 
 def item_of(
@@ -191,7 +207,7 @@ def _compare(
     for (task, *_), items in sorted(groups.items()):
         outliers = find_outliers([item.figures for item in items])
         for item, own in zip(items, outliers, strict=True):
-            found[item.id, item.kind] = (*_incomplete(item), *item.findings, *own, *_other(item))
+            found[item.id, item.kind] = _all_findings(item, own)
         row = ComparedGroup(
             kind=items[0].kind,
             task=task,
@@ -205,15 +221,11 @@ def _compare(
     return found, tuple(rows)
 
 
-def _incomplete(item: CatalogItem) -> list[Finding]:
-    if item.complete:
-        return []
-    text = f"incomplete: {item.incomplete_cause or 'no cause noted'}"
-    return [Finding(code="incomplete", message=text)]
-
-
-def _other(item: CatalogItem) -> list[Finding]:
-    found = []
+def _all_findings(item: CatalogItem, outliers: list[Finding]) -> tuple[Finding, ...]:
+    found = [*item.findings, *outliers]
+    if not item.complete:
+        text = f"incomplete: {item.incomplete_cause or 'no cause noted'}"
+        found.insert(0, Finding(code="incomplete", message=text))
     if item.time_doubts:
         text = f"times in doubt: {', '.join(item.time_doubts)}"
         found.append(Finding(code="doubtful_clock", message=text))
@@ -222,7 +234,7 @@ def _other(item: CatalogItem) -> list[Finding]:
         found.append(Finding(code="recovered", message=text))
     if item.success is None and item.origin == "recorded":
         found.append(Finding(code="not_judged", message="outcome not judged"))
-    return found
+    return tuple(found)
 
 
 class HoursFilter(EpisodeFilter):
@@ -262,7 +274,14 @@ def hours_by(
     for item in episodes:
         groups[_value(field, item, utc_offset_min)].append(item)
     ordered = sorted(groups, key=lambda value: (value is None, value or ""))
-    return HoursByField(rows=tuple(_hours(value, groups[value]) for value in ordered))
+    rows = []
+    for value in ordered:
+        seconds = {"accepted": 0.0, "rejected": 0.0, "not_reviewed": 0.0}
+        for item in groups[value]:
+            seconds[item.review.verdict if item.review else "not_reviewed"] += item.duration_s
+        hours = {f"{name}_h": total_s / SECONDS_AN_HOUR for name, total_s in seconds.items()}
+        rows.append(HoursOf(value=value, num_episodes=len(groups[value]), **hours))
+    return HoursByField(rows=tuple(rows))
 
 
 def _value(field: HoursField, item: CatalogItem, utc_offset_min: int) -> str | None:
@@ -273,17 +292,6 @@ def _value(field: HoursField, item: CatalogItem, utc_offset_min: int) -> str | N
         return None
     zone = timezone(timedelta(minutes=utc_offset_min))
     return item.at.astimezone(zone).date().isoformat()
-
-
-def _hours(value: str | None, items: list[CatalogItem]) -> HoursOf:
-    seconds = {"accepted": 0.0, "rejected": 0.0, "not_reviewed": 0.0}
-    for item in items:
-        seconds[item.review.verdict if item.review else "not_reviewed"] += item.duration_s
-    return HoursOf(
-        value=value,
-        num_episodes=len(items),
-        **{f"{name}_h": total_s / SECONDS_AN_HOUR for name, total_s in seconds.items()},
-    )
 
 
 def lineage_of(entries: Mapping[Name, AnyEntry], start: Name) -> Lineage:
@@ -313,7 +321,7 @@ def lineage_of(entries: Mapping[Name, AnyEntry], start: Name) -> Lineage:
                 "relation": relation,
                 "is_stored": name in entries,
                 "made_from": [one for _, one in sources.get(name, ())],
-                "summary": _brief(entries[name].item) if name in entries else "",
+                "summary": _summary(entries[name].item) if name in entries else "",
             }
         )
         for name, relation in nodes.items()
@@ -333,5 +341,149 @@ def _walk(
                 waiting.append(name)
 
 
-def _brief(item: CatalogItem) -> str:
+def _summary(item: CatalogItem) -> str:
     return f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure that all items may have.
+
+    `resolution` is the smallest spread that matters: a task whose items hardly differ must not make
+    outliers of differences that nobody would look at. `unit` "%" is shown of a share.
+    """
+
+    name: str
+    label: str
+    unit: str
+    bad: Literal["high", "low", "both"]
+    resolution: float
+
+    def text(self, value: float) -> str:
+        """The value as an operator reads it."""
+        return f"{100 * value:.1f} %" if self.unit == "%" else f"{value:.3g} {self.unit}".rstrip()
+
+
+FIGURES: Final = (
+    Figure("duration_s", "duration", "s", "both", 0.25),
+    Figure("coverage", "share of steps kept", "%", "low", 0.01),
+    Figure("clock_residual_ms", "clock residual", "ms", "high", 0.1),
+    Figure("num_gaps", "gaps", "", "high", 1.0),
+    Figure("largest_gap_s", "largest gap", "s", "high", 0.02),
+    Figure("lost_share", "samples lost", "%", "high", 0.002),
+    Figure("tip_error_mm", "fingertip error of retargeting", "mm", "high", 0.5),
+    Figure("peak_speed_m_s", "peak speed of a wrist", "m/s", "both", 0.1),
+    Figure("jerk_p95_m_s3", "jerk of a wrist", "m/s³", "high", 5.0),
+    Figure("static_share", "share of time at rest", "%", "both", 0.02),
+)
+# Figures that are made of those of single streams or hands: their names, and how.
+_COLLECTED: Final[Mapping[str, tuple[str, Callable[[Iterable[float]], float]]]] = {
+    "num_gaps": (r".+_num_gaps", sum),
+    "largest_gap_s": (r".+_largest_gap_s", max),
+    "tip_error_mm": (r"retargeting_.+_tip_error_p95_mm", max),
+    "peak_speed_m_s": (r"(.+_)?peak_speed_m_s", max),
+    "jerk_p95_m_s3": (r"(.+_)?jerk_p95_m_s3", max),
+    "static_share": (r"static_share", min),
+}
+
+
+def figures_of(
+    attributes: EpisodeAttributes | RecordingAttributes, *, num_steps: int, duration_s: float
+) -> dict[str, float]:
+    """The figures that an item has; `num_steps` are those of an episode."""
+    quality = attributes.quality
+    found = {"duration_s": duration_s}
+    for name, (pattern, collect) in _COLLECTED.items():
+        values = [value for key, value in quality.items() if re.fullmatch(pattern, key)]
+        if values:
+            found[name] = float(collect(values))
+    if "coverage" in quality:
+        found["coverage"] = quality["coverage"]
+    elif num_steps and "num_steps_refused" in quality:
+        num_measured = num_steps - quality.get("num_steps_interpolated", 0.0)
+        found["coverage"] = num_measured / (num_steps + quality["num_steps_refused"])
+    if isinstance(attributes, EpisodeAttributes):
+        found |= _clock_figures(attributes.clocks)
+    return found
+
+
+def _clock_figures(clocks: Iterable[ClockReport]) -> dict[str, float]:
+    found = {}
+    residuals_ms = [one.residual_rms_ms for one in clocks if one.residual_rms_ms is not None]
+    if residuals_ms:
+        found["clock_residual_ms"] = max(residuals_ms)
+    dropped = sum(clock.num_dropped for clock in clocks)
+    offered = dropped + sum(clock.num_samples for clock in clocks)
+    if offered:
+        found["lost_share"] = dropped / offered
+    return found
+
+
+def robust_scores(
+    values: Float64[np.ndarray, " n"], *, resolution: float
+) -> Float64[np.ndarray, " n"]:
+    """Deviations from the median in robust standard deviations, at least `resolution` each."""
+    deviations = values - np.median(values)
+    sigma = float(np.median(np.abs(deviations))) / MAD_OF_SIGMA
+    return deviations / max(sigma, resolution)
+
+
+def find_outliers(items: Sequence[Mapping[str, float]]) -> list[list[Finding]]:
+    """Findings of each item of one task; none where fewer than MIN_ITEMS have a figure."""
+    found: list[list[Finding]] = [[] for _ in items]
+    for figure in FIGURES:
+        owners = [place for place, figures in enumerate(items) if figure.name in figures]
+        if len(owners) < MIN_ITEMS:
+            continue
+        values = np.array([items[place][figure.name] for place in owners])
+        median = float(np.median(values))
+        scores = robust_scores(values, resolution=figure.resolution)
+        for place, value, score in zip(owners, values.tolist(), scores.tolist(), strict=True):
+            if {"both": abs(score), "high": score, "low": -score}[figure.bad] <= MAX_SCORE:
+                continue
+            one = Finding(
+                code="outlier",
+                message=f"{figure.label} {figure.text(value)}, usually {figure.text(median)}",
+                figure=figure.name,
+                value=value,
+                median=median,
+                score=score,
+            )
+            found[place].append(one)
+    return found
+
+
+def beyond_limits(
+    attributes: EpisodeAttributes | RecordingAttributes, figures: Mapping[str, float]
+) -> tuple[Finding, ...]:
+    """Findings of an item with these figures."""
+    found = []
+    kept = figures.get("coverage", 1.0)
+    if kept < LEAST_SHARE_KEPT:
+        text = f"share of steps kept {kept:.1%}, expected at least {LEAST_SHARE_KEPT:.0%}"
+        found.append(_beyond("coverage", kept, text))
+    if isinstance(attributes, EpisodeAttributes):
+        found += _scattered(attributes)
+    return tuple(found)
+
+
+def _scattered(attributes: EpisodeAttributes) -> list[Finding]:
+    rates_hz = {stream.name: stream.nominal_rate_hz for stream in attributes.streams}
+    found = []
+    for clock in attributes.clocks:
+        if clock.residual_rms_ms is None:
+            continue
+        rate_hz = rates_hz.get(clock.stream) if clock.method == "counting" else None
+        _, limit_s = residual_limits_s(None if rate_hz is None else 1.0 / rate_hz)
+        limit_ms = 1e3 * limit_s
+        if clock.residual_rms_ms >= limit_ms:
+            text = (
+                f"{clock.stream}: arrivals scatter by {clock.residual_rms_ms:.1f} ms about its "
+                f"clock, expected less than {limit_ms:.3g} ms"
+            )
+            found.append(_beyond("clock_residual_ms", clock.residual_rms_ms, text))
+    return found
+
+
+def _beyond(figure: str, value: float, text: str) -> Finding:
+    return Finding(code="beyond_limit", message=text, figure=figure, value=value)

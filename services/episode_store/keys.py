@@ -199,10 +199,8 @@ class Enrolments:
     def listing(self) -> StationEnrolments:
         """All enrolments, newest first."""
         with self._lock:
-            shown = [
-                StationEnrolment.model_validate(one.model_dump(exclude={"key_sha256"}))
-                for one in self._kept
-            ]
+            fields = [one.model_dump(exclude={"key_sha256"}) for one in self._kept]
+            shown = [StationEnrolment.model_validate(one) for one in fields]
             for token in self._tokens:
                 if not token.is_used:
                     state = "waiting" if token.end_s > self._clock_s() else "expired"
@@ -373,11 +371,11 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
 
     @router.post("", status_code=201)
     def issue(
-        wanted: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
+        body: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
     ) -> EnrolmentToken:
         """Issue a one-time token for a station, valid for 15 minutes."""
         response.headers["cache-control"] = "no-store"
-        return enrolments.issue(wanted.station, by=by)
+        return enrolments.issue(body.station, by=by)
 
     @router.post("/exchange", status_code=201)
     @takes({JSON: KIB}, needs_key=False)

@@ -13,8 +13,9 @@ def seconds_of(text: str) -> float:
     """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds, for argparse."""
     factor = _UNITS.get(text[-1:])
     if factor is None or not text[:-1].isdecimal():
-        told = f"got {text!r}, expected a number and one of s m h d, such as 30d"
-        raise argparse.ArgumentTypeError(told)
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a number and one of s m h d, such as 30d"
+        )
     return int(text[:-1]) * factor
 
 
@@ -126,7 +127,9 @@ def _add_delete(command: argparse.ArgumentParser) -> None:
         help="with --operator: also if the store has nothing of him and only stations may",
     )
     command.add_argument("--yes", action="store_true", help="skip the confirmation")
-    command.add_argument("--receipt", metavar="PATH", help="file for the deletion receipt")
     command.add_argument(
-        "--checkpoints", metavar="FOLDER", help="also search the models in this folder"
+        "--receipt", type=Path, metavar="PATH", help="file for the deletion receipt"
+    )
+    command.add_argument(
+        "--checkpoints", type=Path, metavar="FOLDER", help="also search the models in this folder"
     )

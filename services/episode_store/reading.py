@@ -57,6 +57,7 @@ GAP_PERIODS = 1.5
 MAX_GAPS = 50
 MAX_IMAGES = 240
 QUALITY = 85
+TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 Reader = EpisodeReader | RecordingReader
 # Limits of one request: signals, and bytes of samples that are read for it.
 MAX_SIGNALS = 16
@@ -131,12 +132,8 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         episode_id: str, query: Annotated[WindowQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
-        if query.num_steps > max_steps:
-            raise LimitExceededError(
-                f"window: got {query.num_steps} steps, expected at most {max_steps}",
-                got=query.num_steps,
-                expected=max_steps,
-            )
+        text = f"window: got {query.num_steps} steps, expected at most {max_steps}"
+        _check_limit(query.num_steps, max_steps, text)
         reader = store.open(episode_id)
         read = partial(_window, reader, query, max_bytes)
         return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
@@ -172,39 +169,37 @@ def _window(reader: EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
     step_bytes = sum(
         prod(form.shape(stream.shape)) for stream in known_cameras if len(stream.shape) == 3
     )
-    if query.num_steps * step_bytes > max_bytes:
-        allowed = max_bytes // step_bytes
-        raise LimitExceededError(
-            f"window: {query.num_steps} steps hold {query.num_steps * step_bytes} bytes of "
-            f"images, expected at most {max_bytes}, which are {allowed} steps; "
-            "ask for fewer steps or cameras",
-            got=query.num_steps,
-            expected=allowed,
-        )
+    allowed = max_bytes // max(step_bytes, 1)
+    text = (
+        f"window: {query.num_steps} steps hold {query.num_steps * step_bytes} bytes of images, "
+        f"expected at most {max_bytes}, which are {allowed} steps; ask for fewer steps or cameras"
+    )
+    _check_limit(query.num_steps, allowed, text)
     window = reader.window(
         query.start, query.num_steps, cameras=cameras, action_kind=query.action_kind, form=form
     )
     return encode_window(window)
 
 
-def _samples(
-    reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery, max_bytes: int
-) -> bytes:
+def _samples(reader: Reader, stream: str, span: SpanQuery, max_bytes: int) -> bytes:
     count = reader.count(stream, span.start_ns, span.stop_ns)
     sample_bytes = reader.streams[stream].sample_bytes() + 24
-    if count * sample_bytes > max_bytes:
-        allowed = max_bytes // sample_bytes
-        raise LimitExceededError(
-            f"{stream}: {count} samples are {count * sample_bytes} bytes, expected at most "
-            f"{max_bytes}, which are {allowed} samples; ask for a shorter time",
-            got=count,
-            expected=allowed,
-        )
+    allowed = max_bytes // sample_bytes
+    text = (
+        f"{stream}: {count} samples are {count * sample_bytes} bytes, expected at most "
+        f"{max_bytes}, which are {allowed} samples; ask for a shorter time"
+    )
+    _check_limit(count, allowed, text)
     # The fields of both kinds of answers are arrays: stamps, then values.
     return pack({"stream": stream}, vars(reader.read(stream, span.start_ns, span.stop_ns)))
 
 
-def etag_of(reader: EpisodeReader | RecordingReader, what: str, query: BaseModel) -> str:
+def _check_limit(got: int, expected: int, text: str) -> None:
+    if got > expected:
+        raise LimitExceededError(text, got=got, expected=expected)
+
+
+def etag_of(reader: Reader, what: str, query: BaseModel) -> str:
     """ETag of content and query; valid forever since committed groups are immutable."""
     text = f"{ANSWER_VERSION} {reader.content_sha256} {what} {query.model_dump_json()}"
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:40]}"'
@@ -240,13 +235,8 @@ def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
     """
     stream = STREAMS[query.action_kind]
     count = reader.count(stream, query.start_ns, query.stop_ns)
-    if count > MAX_STEPS:
-        raise LimitExceededError(
-            f"{stream}: the span holds {count} steps, expected at most {MAX_STEPS}; "
-            "ask for a shorter time",
-            got=count,
-            expected=MAX_STEPS,
-        )
+    text = f"the span holds {count} steps, expected at most {MAX_STEPS}; ask for a shorter time"
+    _check_limit(count, MAX_STEPS, f"{stream}: {text}")
     about = reader.attributes
     if reader.streams[stream].shape != (ACTION_DIM,):
         raise InvalidInputError(
@@ -271,11 +261,9 @@ def _points(
     anchor = reader.attributes.anchor.to_poses()
     where = f"actions of episode {reader.item_id!r}"
     hands = poses_from_actions(actions, anchor, where=where)
-    for side, Ts_world_wrist, joints_rad in (
-        ("left", hands.Ts_world_wrist_left, hands.joints_left_rad),
-        ("right", hands.Ts_world_wrist_right, hands.joints_right_rad),
-    ):
-        points_wrist = RobotHand(side).chain_points_m(joints_rad)
+    for side in SIDES:
+        Ts_world_wrist = getattr(hands, f"Ts_world_wrist_{side}")
+        points_wrist = RobotHand(side).chain_points_m(getattr(hands, f"joints_{side}_rad"))
         R, t = Ts_world_wrist[:, None, None, :3, :3], Ts_world_wrist[:, None, None, :3, 3]
         arrays[f"{side}_points_world_m"] = (R @ points_wrist[..., None])[..., 0] + t
         arrays[f"T_world_wrist_{side}"] = Ts_world_wrist
@@ -360,23 +348,18 @@ def playback_of(reader: Reader) -> Playback:
     shared = {name: getattr(about, name) for name in (*names, "lineage")}
     span = {"start_ns": min(firsts, default=0), "stop_ns": max(lasts, default=0)}
     if isinstance(reader, EpisodeReader):
-        origin_ns = reader.attributes.quality.get("origin_after_start_ns")
+        of_episode = reader.attributes
+        origin_ns = of_episode.quality.get("origin_after_start_ns")
         own = {
             "kind": "episode",
-            "origin": reader.attributes.origin,
-            "absent": reader.attributes.absent,
-            "at": reader.attributes.created_at,
-            "model_rate_hz": reader.attributes.model_rate_hz,
+            **{name: getattr(of_episode, name) for name in ("origin", "absent", "model_rate_hz")},
+            "at": of_episode.created_at,
             "num_steps": reader.num_steps,
             "origin_after_start_ns": None if origin_ns is None else round(origin_ns),
         }
     else:
-        own = {
-            "kind": "recording",
-            "origin": "recorded",
-            "at": reader.attributes.started_at,
-            "started_t_host_ns": reader.attributes.started_t_host_ns,
-        }
+        own = {"kind": "recording", "origin": "recorded", "at": reader.attributes.started_at}
+        own["started_t_host_ns"] = reader.attributes.started_t_host_ns
     return Playback.model_validate(shared | span | own | {"id": reader.item_id, "streams": streams})
 
 
@@ -385,12 +368,12 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     steps_ns = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
     longest = np.sort(gaps[np.argsort(steps_ns[gaps], kind="stable")[-MAX_GAPS:]])
-    calibration = reader.attributes.calibration
+    calibration, num_taxels = reader.attributes.calibration, stream.tactile_layout.num_taxels
     spans = interpolated_spans(calibration) if stream.name.startswith("action") else []
     taxels = np.zeros(0, dtype=np.int64)
-    for side, measured in zip(SIDES, measured_taxels(calibration), strict=True):
-        if stream.name == f"tactile_{side}":
-            taxels = np.flatnonzero(~measured)
+    if stream.name in TOUCH_STREAMS:
+        measured = measured_taxels(calibration, num_taxels)
+        taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
     return PlayedStream(
         name=stream.name,
         kind=stream.kind,
@@ -409,6 +392,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
+        layout=stream.layout,
     )
 
 
@@ -420,13 +404,8 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
     form = ImageForm(half_size=query.half_size)
     image_bytes = int(np.prod(form.shape(descriptor.shape)))
     allowed = max(1, min(MAX_IMAGES, max_bytes // image_bytes))
-    if count > allowed:
-        raise LimitExceededError(
-            f"{camera}: the span holds {count} images, expected at most {allowed}; "
-            "ask for a shorter time",
-            got=count,
-            expected=allowed,
-        )
+    text = f"the span holds {count} images, expected at most {allowed}; ask for a shorter time"
+    _check_limit(count, allowed, f"{camera}: {text}")
     stamps_ns = reader.stamps_ns(camera)
     first = 0 if query.start_ns is None else int(stamps_ns.searchsorted(query.start_ns))
     # A browser would fill in what is missing of a damaged image.
@@ -457,12 +436,8 @@ def reduce_signals(reader: Reader, query: SignalsQuery) -> bytes:
         LimitExceededError: too many signals or samples.
     """
     names = list(dict.fromkeys(query.names.split(",")))
-    if len(names) > MAX_SIGNALS:
-        raise LimitExceededError(
-            f"signals: got {len(names)}, expected at most {MAX_SIGNALS}",
-            got=len(names),
-            expected=MAX_SIGNALS,
-        )
+    text = f"signals: got {len(names)}, expected at most {MAX_SIGNALS}"
+    _check_limit(len(names), MAX_SIGNALS, text)
     if query.stop_ns <= query.start_ns:
         raise InvalidInputError(
             f"signals: got the span {query.start_ns} … {query.stop_ns}, expected start < stop"

@@ -1,6 +1,7 @@
-"""HTTP routes of the store: uploads by stations, lists, and changes of many items at once."""
+"""HTTP routes of the store: uploads by stations, lists, changes of items, and clicks on objects."""
 
 import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
@@ -9,17 +10,21 @@ from typing import Annotated
 
 import anyio
 import anyio.to_thread
+import numpy as np
 import structlog
 from fastapi import APIRouter, Depends, Path, Query, Request
 
-from dextouch.episodes import KINDS, EpisodeStore
-from dextouch.errors import DexTouchError, StorageFullError
+from dextouch.episodes import KINDS, EpisodeStore, clicked_poses, first_camera
+from dextouch.errors import DexTouchError, NotFoundError, StorageFullError
+from dextouch.frozen_model import FrozenModel
+from dextouch.geometry import box_pixels, transform_from_pose
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
     CatalogItems,
     CatalogValues,
     ComparedGroups,
+    EpisodeClicks,
     EpisodeList,
     ExpireUploads,
     FinishRecording,
@@ -29,19 +34,21 @@ from dextouch.schemas import (
     MovedItems,
     MoveItems,
     NewRecording,
+    ObjectClicks,
     RecordingList,
     RecordingStatus,
     RefusedItem,
     Review,
     ReviewedItems,
     ReviewItems,
+    SceneObject,
     StoredItem,
     TrashContents,
     TrashedItem,
     UploadList,
 )
 from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, takes
-from dextouch.streams import MAX_BATCH_BYTES
+from dextouch.streams import HEAD_CAMERA, MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import EpisodeFilter, EpisodeQuery, ItemQuery, RecordingQuery
 from services.episode_store.ingest import Ingest
@@ -69,8 +76,10 @@ def uploads_router(
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
-        is_begun = partial(ingest.is_begun, attributes.recording_id)
-        with metrics.counting_refusals(), _unless(is_begun):
+        with (
+            metrics.counting_refusals(),
+            _unless(partial(ingest.is_begun, attributes.recording_id)),
+        ):
             limits.check_new(attributes.station)
         status = ingest.create(attributes, sender)
         if status.state == "open":
@@ -91,26 +100,29 @@ def uploads_router(
         sender: Writer,
     ) -> BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
-        num_bytes = _announced_bytes(request)
+        announced = request.headers.get("content-length", "")
+        # A body of unknown length may be as large as the largest batch.
+        num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
         with ExitStack() as admitted:
             # A refused body is not read.
             with metrics.counting_refusals():
                 admitted.enter_context(admission.admitted(num_bytes))
-                await _check_new(
-                    partial(limits.check_batch, recording_id, num_bytes),
-                    partial(ingest.is_stored, recording_id, stream, number),
-                    admission.threads,
-                )
+                try:
+                    limits.check_batch(recording_id, num_bytes)
+                except StorageFullError:
+                    # As `_unless`; whether it is stored is looked up on the disk.
+                    if not await anyio.to_thread.run_sync(
+                        ingest.is_stored, recording_id, stream, number, limiter=admission.threads
+                    ):
+                        raise
             started = time.perf_counter()
             data = await request.body()
             receipt = await anyio.to_thread.run_sync(
                 partial(ingest.put_batch, recording_id, stream, number, data, sender),
                 limiter=admission.threads,
             )
-        metrics.ack_seconds.observe(time.perf_counter() - started)
-        metrics.batches.labels(str(receipt.replayed).lower()).inc()
+        metrics.count(receipt, num_bytes=len(data), took_s=time.perf_counter() - started)
         if not receipt.replayed:
-            metrics.bytes.inc(len(data))
             limits.add(recording_id, len(data))
         return receipt
 
@@ -144,11 +156,11 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
         return limits.idle(idle_s=idle_s)
 
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
-    def expire(wanted: ExpireUploads) -> UploadList:
+    def expire(body: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
         gone = []
-        for upload in limits.idle(idle_s=wanted.idle_s).uploads:
-            if ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
+        for upload in limits.idle(idle_s=body.idle_s).uploads:
+            if ingest.expire(upload.recording_id, idle_s=body.idle_s):
                 limits.end(upload.recording_id)
                 gone.append(upload)
         return UploadList(uploads=tuple(gone))
@@ -156,37 +168,17 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
     return router
 
 
-def _raise_unless(is_known: Callable[[], bool], error: StorageFullError) -> None:
+@contextmanager
+def _unless(is_known: Callable[[], bool]) -> Iterator[None]:
     """Refuse for lack of space, unless the request repeats what was acknowledged before.
 
     A station that missed the acknowledgement must get it on a full disk too.
     """
-    if not is_known():
-        raise error
-
-
-@contextmanager
-def _unless(is_known: Callable[[], bool]) -> Iterator[None]:
     try:
         yield
-    except StorageFullError as error:
-        _raise_unless(is_known, error)
-
-
-async def _check_new(
-    check: Callable[[], None], is_known: Callable[[], bool], limiter: anyio.CapacityLimiter
-) -> None:
-    """As `_unless`, with the search for what is known in a thread."""
-    try:
-        check()
-    except StorageFullError as error:
-        await anyio.to_thread.run_sync(_raise_unless, is_known, error, limiter=limiter)
-
-
-def _announced_bytes(request: Request) -> int:
-    announced = request.headers.get("content-length", "")
-    # A body of unknown length may be as large as the largest batch.
-    return int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
+    except StorageFullError:
+        if not is_known():
+            raise
 
 
 def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
@@ -194,29 +186,29 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings", tags=["recordings"])
-    def recordings(wanted: Annotated[RecordingQuery, Query()]) -> RecordingList:
+    def recordings(query: Annotated[RecordingQuery, Query()]) -> RecordingList:
         """List finished recordings that match all filters."""
-        return catalog.recordings(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.recordings(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/episodes", tags=["episodes"])
-    def episodes(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
+    def episodes(query: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
         """List episodes that match all filters."""
-        return catalog.episodes(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.episodes(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/hours", tags=["catalog"])
-    def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
+    def hours(query: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
-        return catalog.hours(wanted)
+        return catalog.hours(query)
 
     @router.get("/catalog/hours/{field}", tags=["catalog"])
-    def hours_by(field: HoursField, wanted: Annotated[HoursFilter, Query()]) -> HoursByField:
+    def hours_by(field: HoursField, query: Annotated[HoursFilter, Query()]) -> HoursByField:
         """Hours of the matching episodes by the values of one field, and by their reviews."""
-        return catalog.hours_by(field, wanted)
+        return catalog.hours_by(field, query)
 
     @router.get("/catalog/items", tags=["catalog"])
-    def items(wanted: Annotated[ItemQuery, Query()]) -> CatalogItems:
+    def items(query: Annotated[ItemQuery, Query()]) -> CatalogItems:
         """List recordings and episodes in one list; both as takes by default."""
-        return catalog.items(wanted, limit=wanted.num_rows(max_page), page=wanted)
+        return catalog.items(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/groups", tags=["catalog"])
     def groups() -> ComparedGroups:
@@ -242,18 +234,18 @@ def reviews_router(catalog: Catalog) -> APIRouter:
 
     @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+    def review(body: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
         """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
         review = None
-        if wanted.verdict is not None:
+        if body.verdict is not None:
             review = Review(
-                verdict=wanted.verdict,
-                reason=wanted.reason,
-                reviewer=wanted.reviewer,
+                verdict=body.verdict,
+                reason=body.reason,
+                reviewer=body.reviewer,
                 reviewed_at=datetime.now(UTC),
             )
-        reviewed, refused = _each(wanted.items, lambda item: catalog.review(item, review))
-        logger.info("items_reviewed", verdict=wanted.verdict, ids=[item.id for item in reviewed])
+        reviewed, refused = _each(body.items, lambda item: catalog.review(item, review))
+        logger.info("items_reviewed", verdict=body.verdict, ids=[item.id for item in reviewed])
         return ReviewedItems(reviewed=reviewed, refused=refused)
 
     return router
@@ -282,22 +274,22 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
         return TrashContents(items=tuple(items), num_items=len(entries))
 
     @router.post("", dependencies=[MAY_DELETE])
-    def delete(wanted: MoveItems) -> MovedItems:
+    def delete(body: MoveItems) -> MovedItems:
         """Move items to the trash; refused for a store in a bucket, which has none."""
         store.require_trash()
-        return _move(wanted, lambda item: store.delete(item.id, kind=item.kind))
+        return _move(body, lambda item: store.delete(item.id, kind=item.kind))
 
     @router.post("/restore", dependencies=[MAY_DELETE])
-    def restore(wanted: MoveItems) -> MovedItems:
+    def restore(body: MoveItems) -> MovedItems:
         """Restore items from the trash, each the one that was deleted last."""
         store.require_trash()
-        return _move(wanted, lambda item: store.restore(item.id, kind=item.kind))
+        return _move(body, lambda item: store.restore(item.id, kind=item.kind))
 
     return router
 
 
-def _move(wanted: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
-    moved, refused = _each(wanted.items, move)
+def _move(body: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
+    moved, refused = _each(body.items, move)
     logger.info("items_moved", moved=[item.id for item in moved], num_refused=len(refused))
     return MovedItems(moved=moved, refused=refused)
 
@@ -315,3 +307,133 @@ def _each(
         else:
             changed.append(item)
     return tuple(changed), tuple(refused)
+
+
+class ClickableEpisode(FrozenModel):
+    """An episode whose objects can be clicked, and clicks that there are."""
+
+    episode_id: str
+    clicks: EpisodeClicks | None
+
+
+class ClickQueue(FrozenModel):
+    """Episodes of a task to mark: those that were marked, and others in an order without meaning.
+
+    `num_matching` is the number of all episodes of the task that could be marked.
+    """
+
+    tasks: tuple[str, ...]
+    task: str
+    objects: tuple[SceneObject, ...]
+    episodes: tuple[ClickableEpisode, ...]
+    num_matching: int
+
+
+class ClickedEpisode(FrozenModel):
+    """The first image of an episode, clicks in it, and the boxes of the poses that they give.
+
+    `boxes_px` are the eight corners of each box (bit 0, 1, 2 of a corner's number: x, y, z);
+    `problem` is why the clicks give no poses, with the objects as they are described now.
+    """
+
+    episode_id: str
+    image_t_ns: int
+    clicks: EpisodeClicks
+    boxes_px: dict[str, tuple[tuple[float, float], ...]]
+    problem: str = ""
+
+
+def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks | None) -> APIRouter:
+    """Create the routes of clicks; without a description of the objects they are refused."""
+    router = APIRouter(prefix="/v1", tags=["clicks"], responses={404: {}})
+
+    def described() -> ObjectClicks:
+        if objects is None:
+            raise NotFoundError(
+                "clicks: no objects are described; start the store with --objects FILE, or "
+                "DEXTOUCH_EPISODE_STORE_OBJECTS (docs/objects.md)"
+            )
+        return objects
+
+    @router.get("/catalog/clicks", dependencies=[MAY_READ])
+    def queue(
+        task: Annotated[str | None, Query(max_length=128)] = None,
+        limit: Annotated[int, Query(ge=1, le=1000)] = 20,
+    ) -> ClickQueue:
+        """Episodes of a task (by default the first) whose objects no stream and no person knows."""
+        return _queue(catalog, described(), task, limit)
+
+    @router.get("/catalog/clicks/file", dependencies=[MAY_READ])
+    def file() -> ObjectClicks:
+        """The described objects and all clicks in the store, for `train world-model --clicks`."""
+        known = described()
+        stored = {name: one.clicks for name, one in catalog.clickable().items() if one.clicks}
+        return known.model_copy(update={"episodes": known.episodes | stored})
+
+    @router.get("/episodes/{episode_id}/clicks", dependencies=[MAY_READ])
+    def clicked(episode_id: str) -> ClickedEpisode:
+        """Clicks on the objects of an episode, and what its first image is."""
+        clicks = store.clicks(episode_id) or EpisodeClicks(objects={})
+        try:
+            return _clicked(store, described(), episode_id, clicks)
+        except DexTouchError as error:
+            about = _clicked(store, described(), episode_id, EpisodeClicks(objects={}))
+            return about.model_copy(update={"clicks": clicks, "problem": error.message})
+
+    @router.post("/episodes/{episode_id}/clicks", dependencies=[MAY_DELETE])
+    @takes({JSON: 16 * KIB})
+    def click(
+        episode_id: str, clicks: Annotated[EpisodeClicks, Depends(JsonBody(EpisodeClicks))]
+    ) -> ClickedEpisode:
+        """Keep clicks in place of earlier ones, none to remove them; wrong ones are refused."""
+        found = _clicked(store, described(), episode_id, clicks)
+        catalog.set_clicks(episode_id, clicks if clicks.objects else None)
+        return found
+
+    return router
+
+
+def _queue(catalog: Catalog, objects: ObjectClicks, task: str | None, limit: int) -> ClickQueue:
+    tasks = tuple(objects.tasks)
+    chosen = tasks[0] if task is None and tasks else task or ""
+    if chosen not in objects.tasks:
+        raise NotFoundError(f"clicks: task {chosen!r} has no objects; {', '.join(tasks)} have")
+    found = {name: one for name, one in catalog.clickable().items() if one.item.task == chosen}
+    # In the order of recording, the first takes would be those of one person and one day.
+    names = sorted(found, key=lambda name: (zlib.crc32(name.encode()), name))
+    marked = [name for name in names if found[name].clicks]
+    others = [name for name in names if not found[name].clicks][: max(limit - len(marked), 0)]
+    listed = sorted({*marked, *others}, key=names.index)
+    return ClickQueue(
+        tasks=tasks,
+        task=chosen,
+        objects=objects.tasks[chosen],
+        episodes=tuple(
+            ClickableEpisode(episode_id=name, clicks=found[name].clicks) for name in listed
+        ),
+        num_matching=len(found),
+    )
+
+
+def _clicked(
+    store: EpisodeStore, objects: ObjectClicks, episode_id: str, clicks: EpisodeClicks
+) -> ClickedEpisode:
+    """An episode with clicks; raises as `clicked_poses`."""
+    reader = store.open(episode_id)
+    about = reader.attributes
+    found = clicked_poses(about, objects, clicks, may_lack_headings=True)
+    camera, T_world_camera = first_camera(about)
+    boxes_px = {}
+    for one, pose, is_known in zip(found.objects, found.poses, found.known.tolist(), strict=True):
+        if is_known and clicks.objects[one.name].state == "seen":
+            T = transform_from_pose(pose)
+            corners_px = box_pixels(np.array(one.box_m), T, camera, T_world_camera)
+            if np.isfinite(corners_px).all():
+                boxes_px[one.name] = tuple((u, v) for u, v in corners_px.tolist())
+    nearest = reader.nearest_images(HEAD_CAMERA, reader.stamps_ns("action")[:1])
+    return ClickedEpisode(
+        episode_id=episode_id,
+        image_t_ns=int(reader.stamps_ns(HEAD_CAMERA)[nearest[0]]),
+        clicks=clicks,
+        boxes_px=boxes_px,
+    )

@@ -49,9 +49,9 @@ class Figure:
     """An agreement figure with its 95 % interval.
 
     `value` is NaN and `interval` None where it is undefined, as a correlation of two policies, or
-    where all scores of a world are equal; `undefined_share` is the share of hierarchical bootstrap
-    draws in which it is. The interval is that of the true scores: noise biases an observed
-    correlation towards zero, so the interval may lie above it.
+    where all scores of a world are equal; `undefined_share` is the share of bootstrap draws in
+    which it is. The interval is that of the true scores: noise biases an observed correlation
+    towards zero, so the interval may lie above it.
     """
 
     value: float
@@ -102,7 +102,7 @@ def task_agreement(
 
     Scores are those of the named policies, at least two, from at least two starts.
     """
-    real, imagined = (known_mean(rollouts, axis=1) for rollouts in scores.by_rollout())
+    real, imagined = (known_mean(side, axis=1) for side in (scores.real, scores.imagined))
     draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
     without = {
         name: policy.pearson(real=np.delete(real, row), imagined=np.delete(imagined, row))
@@ -125,8 +125,8 @@ def pooled_agreement(
     decide it. Permutations assign policies within each task only, and `without` omits a policy in
     every task. `policies` are the same in every task, and `draws` those of `task_agreement`.
     """
-    means = [[known_mean(rollouts, axis=1) for rollouts in scores.by_rollout()] for scores in tasks]
-    real, imagined = (np.array([pair[side] for pair in means]) for side in (0, 1))
+    real = np.array([known_mean(scores.real, axis=1) for scores in tasks])
+    imagined = np.array([known_mean(scores.imagined, axis=1) for scores in tasks])
     joined = Draws(
         _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
     )

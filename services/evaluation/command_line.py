@@ -18,7 +18,7 @@ from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
-from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.outside import load_policies
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
@@ -131,8 +131,8 @@ def run_evaluation(arguments: list[str]) -> int:
     log = ResultLog(settings.results_path())
     with ExitStack() as connections:
         report = evaluate(
-            real=_address(settings.real, connections),
-            imagined={n: _address(world, connections) for n, world in settings.imagined.items()},
+            real=opened(settings.real, connections),
+            imagined={n: opened(world, connections) for n, world in settings.imagined.items()},
             policies=policies,
             plan=plan,
             probe=probe,
@@ -154,16 +154,9 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         InvalidInputError: two policies of one name, or a user policy that does not load.
         UnknownNameError: arguments for a policy that was not requested.
     """
-    sources = [PolicySource.parse(text) for text in settings.policy]
-    names = [source.name for source in sources]
-    if unknown := sorted(set(settings.policy_arguments) - set(names)):
-        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
-    names += [*settings.scripts, *settings.builtin]
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise InvalidInputError(
-            f"policies: {repeated[0]!r} is given twice; rename one, --policy NAME=MODULE:FACTORY"
-        )
-    policies = {s.name: s.load(settings.policy_arguments.get(s.name, {})) for s in sources}
+    policies = load_policies(
+        settings.policy, settings.policy_arguments, [*settings.scripts, *settings.builtin]
+    )
     for name, url in settings.scripts.items():
         found = select_episodes(
             [EpisodeStore(url)], domain="robot", tasks=settings.tasks, origins=()
@@ -190,7 +183,8 @@ def instructions_for(tasks: Sequence[str], known: Mapping[str, str]) -> dict[str
     return {task: known[task] for task in tasks or known}
 
 
-def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
+def opened(world: ServedWorld, connections: ExitStack) -> WorldAddress:
+    """A connection to a served world, which ends with `connections`."""
     client = connections.enter_context(RolloutClient(world.url, world.api_key))
     return WorldAddress(client, world.world)
 

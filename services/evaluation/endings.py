@@ -30,7 +30,7 @@ from dextouch.schemas import (
     rollout_uncertainty,
 )
 from dextouch.streams import HEAD_CAMERA
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import DEXTOUCH_V1
 from services.evaluation.matched_starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
 
@@ -84,7 +84,7 @@ class Ending:
     """
 
     images: UInt8[np.ndarray, "3 h w 3"] | None
-    tactile_kpa: Float32[np.ndarray, "3 2 320"]
+    tactile_kpa: Float32[np.ndarray, "3 2 taxels"]
     task: str
     object_poses: Float32[np.ndarray, "3 objects 7"] | None = None
     imagined: bool = False
@@ -222,7 +222,7 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
 
 
 def _read_ending(
-    grid: EpisodeGrid, touch_kpa: Float32[np.ndarray, "steps 2 320"], end: int
+    grid: EpisodeGrid, touch_kpa: Float32[np.ndarray, "steps 2 taxels"], end: int
 ) -> Ending:
     steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
     return Ending(
@@ -288,21 +288,23 @@ def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
     """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
 
     Args:
-        tactile_kpa: [..., 2, 320]; small negative readings count as zero.
+        tactile_kpa: [..., 2, 320] of `dextouch_v1`; small negative readings count as zero.
 
     Raises:
-        ShapeError: not [..., 2, 320].
+        ShapeError: not [..., 2, 320], such as touch of another glove.
         NonFiniteError: NaN or infinity.
     """
     taxels = np.asarray(tactile_kpa, dtype=np.float32)
-    if taxels.shape[-2:] != (2, NUM_TAXELS):
-        raise ShapeError(f"tactile: got shape {taxels.shape}, expected [..., 2, {NUM_TAXELS}]")
+    layout = DEXTOUCH_V1
+    if taxels.shape[-2:] != (2, layout.num_taxels):
+        raise ShapeError(
+            f"tactile: got shape {taxels.shape}, expected [..., 2, {layout.num_taxels}] of layout "
+            f"{layout.name!r}, the only one that success classifiers and cloned policies support"
+        )
     if not np.isfinite(taxels).all():
         raise NonFiniteError("tactile: NaN or infinite pressure; expected finite kPa")
-    tips, palm = split_pads(np.sqrt(np.maximum(taxels, 0.0)) / 4)
-    parts = [tips.mean((-2, -1)), palm.mean((-2, -1))[..., None]]
-    parts += [tips.max((-2, -1)), palm.max((-2, -1))[..., None]]
-    features = np.concatenate(parts, axis=-1)
+    roots = np.sqrt(np.maximum(taxels, 0.0)) / 4
+    features = np.concatenate([layout.by_part(roots, of) for of in (np.mean, np.max)], axis=-1)
     return features.reshape(*features.shape[:-2], NUM_PAD_FEATURES)
 
 

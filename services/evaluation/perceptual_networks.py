@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.tactile import colour, hand_canvas
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile import colour
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout
 from services.evaluation.prediction_scenes import Future, Scene
 from services.networks.weight_files import load_strictly, read_tensors
 
@@ -236,12 +236,15 @@ def _resized(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 224 224
     return large[..., top : top + _INPUT_PX, left : left + _INPUT_PX]
 
 
-def heat_maps(tactile_kpa: np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-    """Both hands' taxels [n, 2, 320] as pictures, side by side, four pixels a cell."""
+def heat_maps(
+    tactile_kpa: np.ndarray, layout: TactileLayout = DEXTOUCH_V1
+) -> UInt8[np.ndarray, "n h w 3"]:
+    """Both hands' taxels [n, 2, taxels] as pictures, side by side, four pixels a cell."""
     rows = []
     for hands in tactile_kpa:
+        pairs = zip(hands, SIDES, strict=True)
         canvas = np.concatenate(
-            [hand_canvas(hand, side=side) for hand, side in zip(hands, SIDES, strict=True)], axis=1
+            [layout.hand_canvas(hand, side=side) for hand, side in pairs], axis=1
         )
         rows.append(np.kron(colour(canvas), np.ones((_CELL_PX, _CELL_PX, 1), dtype=np.uint8)))
     return np.stack(rows)
@@ -258,7 +261,7 @@ def _tactile_lpips(networks: PerceptualNetworks, pairs: Pairs) -> float:
     parts = []
     for scene, future in pairs:
         steps = np.array(future.image_steps) - 1
-        maps = [heat_maps(one.tactile_kpa[steps]) for one in (future, scene.truth)]
+        maps = [heat_maps(one.tactile_kpa[steps], scene.layout) for one in (future, scene.truth)]
         parts.append(networks.perceptual_distance(*maps))
     return float(np.concatenate(parts).mean())
 

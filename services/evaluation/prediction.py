@@ -17,6 +17,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
+from dextouch.tactile.layout import common_layout
 from dextouch.worlds import World
 from services.evaluation.perceptual_networks import Metric, Pairs, weighted_metrics
 from services.evaluation.prediction_names import DEFAULT_BASELINES
@@ -60,6 +61,7 @@ def _of_touch(function: Callable[..., float], pairs: Pairs) -> float:
         predicted_kpa=np.concatenate([future.tactile_kpa for _, future in pairs]),
         true_kpa=np.concatenate([scene.truth.tactile_kpa for scene, _ in pairs]),
         measured=measured,
+        layout=common_layout([scene.layout for scene, _ in pairs], what="prediction: episodes"),
     )
 
 
@@ -279,5 +281,6 @@ def _pictures(rollouts: Pairs) -> tuple[PredictionPicture, ...]:
             predicted_images=imagined.images[at],
             true_tactile_kpa=scene.truth.tactile_kpa[ends - 1],
             predicted_tactile_kpa=imagined.tactile_kpa[ends - 1],
+            layout=scene.layout,
         )
     return tuple(firsts.values())

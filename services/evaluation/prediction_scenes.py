@@ -11,12 +11,14 @@ from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert
 from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
-from dextouch.metrics import geometry as depth_metrics
+from dextouch.metrics import image as depth_metrics
 from dextouch.metrics import trajectory as trajectory_metrics
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from dextouch.worlds import ReconstructingWorld, World
 
+# Labels of what a pixel shows; hands and objects follow the table.
 BACKGROUND, TABLE, FIRST_BODY = 0, 1, 2
 # Depth of a pixel that shows nothing (m): the farthest that the twin renders.
 FAR_M: Final = 4.0
@@ -145,12 +147,12 @@ class Future:
     """
 
     images: UInt8[np.ndarray, "shown h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     image_steps: tuple[int, ...]
     objects_m: Float64[np.ndarray, "objects 3"] | None = None
-    measured_taxels: Bool[np.ndarray, "steps 2 320"] | None = None
+    measured_taxels: Bool[np.ndarray, "steps 2 taxels"] | None = None
 
-    def is_measured(self) -> Bool[np.ndarray, "steps 2 320"]:
+    def is_measured(self) -> Bool[np.ndarray, "steps 2 taxels"]:
         """Taxels at steps whose pressure is known."""
         if self.measured_taxels is None:
             return np.ones(self.tactile_kpa.shape, dtype=np.bool_)
@@ -162,7 +164,7 @@ class Scene:
     """Start at a step of an episode, its actions from there, and the true future.
 
     `geometry` is that of the true images, if it is known, and `first_objects_m` are the positions
-    of the objects at the start, as in `Future`.
+    of the objects at the start, as in `Future`. `layout` is that of the taxels.
     """
 
     episode_id: str
@@ -173,6 +175,7 @@ class Scene:
     first_step: int = 0
     geometry: SceneGeometry | None = None
     first_objects_m: Float64[np.ndarray, "objects 3"] | None = None
+    layout: TactileLayout = DEXTOUCH_V1
 
     @property
     def first(self) -> Observation:
@@ -253,6 +256,7 @@ def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: in
         about.model_rate_hz,
         first_step,
         first_objects_m=_objects_m(grid, first_step),
+        layout=grid.tactile_layout,
     )
 
 

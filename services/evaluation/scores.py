@@ -261,7 +261,7 @@ class ClosedLoopReport:
         joined = None
         if min(real.shape) >= 2:
             generator = np.random.default_rng(_SEED)
-            scores = MatchedScores(real[:, :, None], imagined[:, :, None])
+            scores = MatchedScores(real, imagined)
             agreement, draws = task_agreement(compared, scores, generator)
             joined = tuple(compared), scores, draws
             found |= _entries(agreement, len(real))

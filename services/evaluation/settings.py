@@ -15,16 +15,14 @@ from services.evaluation.bundled_policies import DEFAULT_POLICY, PRETRAINED, Bun
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     Batch,
-    Brightness,
     CpuBudget,
-    ImageNoise,
     ImagePx,
     LearningRate,
     NumSteps,
-    Seed,
     Splits,
     Stores,
     Tasks,
+    TrainingSettings,
     WeightDecay,
 )
 
@@ -43,61 +41,26 @@ _STUDY = "name of the study whose rollouts are rated; default: all rollouts of t
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
-class CloningSettings(FrozenModel):
+class CloningSettings(TrainingSettings):
     """Training settings of behaviour cloning."""
 
-    seed: Seed = 0
     num_training_steps: NumSteps = 3000
     max_cpu_s: CpuBudget = 240.0
     batch_size: Batch = 72
     learning_rate: LearningRate = 1.5e-3
     weight_decay: WeightDecay = 1e-3
-    image_noise: ImageNoise = 0.02
-    brightness: Brightness = 0.06
-    pose_noise: float = Field(default=0.2, ge=0, description="pose noise, relative to the spread")
     held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
-class ClassifierSettings(FrozenModel):
+class ClassifierSettings(TrainingSettings):
     """Training settings of a success classifier."""
 
-    seed: Seed = 0
     # For each task.
     num_training_steps: NumSteps = 2000
     max_cpu_s: CpuBudget = 200.0
     batch_size: Batch = Field(default=48, ge=2)
     learning_rate: LearningRate = 1.5e-3
     weight_decay: WeightDecay = 5e-2
-    image_noise: ImageNoise = 0.02
-    brightness: Brightness = 0.05
-    # At 64 pixels, one pixel is about 10 mm on the table, the scale that decides success.
-    shift_px: int = Field(default=1, ge=0, description="largest shift of training images")
-    # Shares of true endings with both inputs that lose their poses, or their image: real endings
-    # come without poses, and with poses the network would ignore the image.
-    true_without_poses: float = Field(
-        default=0.85, ge=0, le=1, description="share of true endings with object poses dropped"
-    )
-    true_without_images: float = Field(
-        default=0.1, ge=0, le=1, description="share of true endings with images dropped"
-    )
-    # The same for imagined endings: worlds always predict poses, but render images on request.
-    imagined_without_poses: float = Field(
-        default=0.3, ge=0, le=1, description="share of imagined endings with object poses dropped"
-    )
-    imagined_without_images: float = Field(
-        default=0.3, ge=0, le=1, description="share of imagined endings with images dropped"
-    )
-    pose_noise: float = Field(
-        default=0.03,
-        ge=0,
-        description="noise on object poses, in standard deviations of each feature",
-    )
-    imagined_share: float = Field(
-        default=0.4, gt=0, lt=1, description="weight of imagined endings relative to true ones"
-    )
-    milestone_weight: float = Field(
-        default=0.3, ge=0, description="weight of the milestones in the loss"
-    )
     development_share: float = Field(
         default=0.15, gt=0, lt=1, description="share of seeds to calibrate on"
     )

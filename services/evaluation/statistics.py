@@ -161,19 +161,12 @@ def known_mean(scores: np.ndarray, *, axis: int) -> np.ndarray:
 class MatchedScores:
     """Scores in 0 … 1 of one task's policies from the same starts in two worlds.
 
-    `real` and `imagined` are [policies, starts, raters]; an absent rater is NaN. Every real rollout
-    has at least one; an imagined one without any is undecided and counts in no mean, and every
-    policy has one that is not. Success is a score of one rater, 0 or 1.
+    Success is 0 or 1. An imagined rollout that is NaN is undecided and counts in no mean; every
+    policy has one that is not.
     """
 
-    real: Float64[np.ndarray, "_ _ _"]
-    imagined: Float64[np.ndarray, "_ _ _"]
-
-    def by_rollout(
-        self,
-    ) -> tuple[Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]]:
-        """Scores of rollouts in both worlds: means over raters; NaN for undecided rollouts."""
-        return known_mean(self.real, axis=2), known_mean(self.imagined, axis=2)
+    real: Float64[np.ndarray, "policies starts"]
+    imagined: Float64[np.ndarray, "policies starts"]
 
 
 @dataclass(frozen=True)
@@ -187,44 +180,17 @@ class ScoreDraws:
 def bootstrap_scores(
     scores: MatchedScores, generator: np.random.Generator, *, num_draws: int = 10_000
 ) -> ScoreDraws:
-    """Hierarchical bootstrap: starts with replacement, then raters within each drawn rollout.
-
-    A drawn start is drawn for all policies and both worlds, since they share its objects.
-    """
+    """Bootstrap over starts, each drawn for all policies and worlds, which share its objects."""
     num_starts = scores.real.shape[1]
     starts = generator.integers(0, num_starts, (num_draws, num_starts))
-    return ScoreDraws(
-        _resampled(scores.real, starts, generator), _resampled(scores.imagined, starts, generator)
-    )
+    return ScoreDraws(_resampled(scores.real, starts), _resampled(scores.imagined, starts))
 
 
-def _resampled(
-    scores: np.ndarray, starts: np.ndarray, generator: np.random.Generator
-) -> Float64[np.ndarray, "draws policies"]:
-    num_policies, num_starts, num_raters = scores.shape
-    known = np.isfinite(scores)
-    # Present raters first, so that a random index below their number names one of them.
-    order = np.argsort(~known, axis=2, kind="stable")
-    packed = np.nan_to_num(np.take_along_axis(scores, order, axis=2)).reshape(-1)
-    present = known.sum(axis=2)
-    rows = np.arange(num_policies)[:, None]
-    means = []
-    for drawn in np.array_split(starts, -(-len(starts) // _BATCH)):
-        if num_raters == 1:
-            means.append(known_mean(scores[rows, drawn[:, None, :], 0], axis=2))
-            continue
-        here = present[rows, drawn[:, None, :]]
-        uniform = generator.random((*here.shape, num_raters), dtype=np.float32)
-        rater = (uniform * here[..., None]).astype(np.intp)
-        cell = (rows * num_starts + drawn[:, None, :]) * num_raters
-        values = packed[cell[..., None] + rater]
-        if (present == num_raters).all():
-            rollouts = values.mean(axis=3)
-        else:
-            counted = np.arange(num_raters) < here[..., None]
-            total = (values * counted).sum(axis=3)
-            rollouts = np.where(here > 0, total / np.maximum(here, 1), np.nan)
-        means.append(known_mean(rollouts, axis=2))
+def _resampled(scores: np.ndarray, starts: np.ndarray) -> Float64[np.ndarray, "draws policies"]:
+    means = [
+        known_mean(scores[:, drawn], axis=2).T
+        for drawn in np.array_split(starts, -(-len(starts) // _BATCH))
+    ]
     return np.concatenate(means)
 
 
@@ -242,7 +208,7 @@ def posterior_scores(
     There are at least two policies and two starts.
     """
     num_policies = len(scores.real)
-    rollouts = np.concatenate(scores.by_rollout())
+    rollouts = np.concatenate([scores.real, scores.imagined])
     observed, noise = known_mean(rollouts, axis=1), noise_covariance(rollouts)
     grid = _Grid.of(num_policies, observed, noise)
     counts = generator.multinomial(num_draws, grid.weight)

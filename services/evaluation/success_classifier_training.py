@@ -57,6 +57,19 @@ from services.evaluation.trained_networks import (
 EARLY_SHARE: Final = 0.1
 # Share of middle endings, which train milestones only, in a task's total weight.
 MIDDLE_SHARE: Final = 0.15
+# Weight of a task's imagined endings relative to its true ones, and that of milestones in the loss;
+# chosen.
+_IMAGINED_SHARE: Final = 0.4
+_MILESTONE_WEIGHT: Final = 0.3
+# Augmentation, chosen: noise and brightness of images (standard deviations, of 0 … 1), and noise of
+# poses in standard deviations of each feature. At 64 pixels, one pixel is about 10 mm on the table,
+# the scale that decides success, so images are shifted by one at most.
+_IMAGE_NOISE, _BRIGHTNESS, _POSE_NOISE, _SHIFT_PX = 0.02, 0.05, 0.03, 1
+# Shares of true and of imagined endings with both inputs that lose their poses, or their image:
+# real endings come without poses, and with poses the network would ignore the image; worlds always
+# predict poses, but render images on request.
+WITHOUT_POSES: Final = (0.85, 0.3)
+WITHOUT_IMAGES: Final = (0.1, 0.3)
 # Lower bound of the deviation of features that hardly vary in a task, so that noise stays small.
 _LEAST_STD: Final = 0.05
 
@@ -274,7 +287,7 @@ def train_success_classifier(
         milestones=milestones_of(sets.training),
     )
     network = ClassifierNetwork(shape)
-    learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
+    learned = labelled_endings(sets.training, shape, imagined_share=_IMAGINED_SHARE)
     sets.check_measurable()
     orders = [
         (network.of(task), learned.of_task(index), settings, f"probe {task}")
@@ -408,50 +421,47 @@ def _optimized(
         index = torch.multinomial(
             learned.weight, settings.batch_size, replacement=True, generator=generator
         )
-        batch = some_parts(learned.batch[index], network.object_std, settings, generator)
-        images = _disturb(unit_images(batch.images), settings, generator)
+        batch = some_parts(learned.batch[index], network.object_std, generator)
+        images = _disturb(unit_images(batch.images), generator)
         odds = network(images, batch)
-        return _loss(odds, learned.outcome[index], learned.known[index], settings)
+        return _loss(odds, learned.outcome[index], learned.known[index])
 
-    limits = (settings.num_training_steps, settings.max_cpu_s)
-    steps = optimized(network, loss, settings, limits=limits, title=name, max_gradient_norm=None)
     cpu_s = 0.0
-    for used in steps:
+    for used in optimized(network, loss, settings, title=name, max_gradient_norm=None):
         cpu_s = used.cpu_s
     return network.state_dict(), cpu_s
 
 
-def _loss(
-    odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor, settings: ClassifierSettings
-) -> torch.Tensor:
+def _loss(odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     """Cross entropy of success and, with less weight, milestones, where they are known."""
     each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
     success = each[:, 0].sum() / known[:, 0].sum().clamp_min(1)
     milestones = each[:, 1:].sum() / known[:, 1:].sum().clamp_min(1)
-    return success + settings.milestone_weight * milestones
+    return success + _MILESTONE_WEIGHT * milestones
 
 
 def some_parts(
     batch: ClassifierBatch,
     object_std: torch.Tensor,
-    settings: ClassifierSettings,
     generator: torch.Generator,
+    *,
+    without_poses: tuple[float, float] = WITHOUT_POSES,
+    without_images: tuple[float, float] = WITHOUT_IMAGES,
 ) -> ClassifierBatch:
     """Add noise to the poses of examples of one task, and drop poses or images at random.
 
-    `object_std` [features] is the deviation of the task's pose features, the unit of the noise.
+    `object_std` [features] is the deviation of the task's pose features, the unit of the noise;
+    the shares are those of true and of imagined endings.
     """
     drawn = torch.rand(len(batch.task), generator=generator)
     both = batch.has_image & batch.has_objects
-    without_poses = torch.where(
-        batch.imagined, settings.imagined_without_poses, settings.true_without_poses
+    poses, images = (
+        torch.where(batch.imagined, imagined, true)
+        for true, imagined in (without_poses, without_images)
     )
-    without_images = torch.where(
-        batch.imagined, settings.imagined_without_images, settings.true_without_images
-    )
-    no_poses = both & (drawn < without_poses)
-    no_image = both & ~no_poses & (drawn < without_poses + without_images)
-    noise = torch.randn(batch.objects.shape, generator=generator) * settings.pose_noise
+    no_poses = both & (drawn < poses)
+    no_image = both & ~no_poses & (drawn < poses + images)
+    noise = torch.randn(batch.objects.shape, generator=generator) * _POSE_NOISE
     return replace(
         batch,
         objects=batch.objects + noise * object_std,
@@ -460,18 +470,16 @@ def some_parts(
     )
 
 
-def _disturb(
-    images: torch.Tensor, settings: ClassifierSettings, generator: torch.Generator
-) -> torch.Tensor:
+def _disturb(images: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Noise, brightness and a small shift, and a blur of half the examples, as in predictions."""
     num = len(images)
-    noise = torch.randn(images.shape, generator=generator) * settings.image_noise
-    brightness = torch.randn((num, 1, 1, 1), generator=generator) * settings.brightness
+    noise = torch.randn(images.shape, generator=generator) * _IMAGE_NOISE
+    brightness = torch.randn((num, 1, 1, 1), generator=generator) * _BRIGHTNESS
     blurred = functional.avg_pool2d(
         functional.pad(images, (1, 1, 1, 1), mode="replicate"), 3, stride=1
     )
     choose = torch.rand((num, 1, 1, 1), generator=generator) < 0.5
     images = torch.where(choose, blurred, images) + noise + brightness
-    reach = settings.shift_px
-    rows, columns = torch.randint(-reach, reach + 1, (2,), generator=generator).tolist()
+    shifts = torch.randint(-_SHIFT_PX, _SHIFT_PX + 1, (2,), generator=generator)
+    rows, columns = shifts.tolist()
     return torch.roll(images, (rows, columns), dims=(2, 3))

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,7 @@ from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.progress import Progress
 from services.networks.optimizer import Budget, OptimizerLoop, OptimizerOptions
+from services.networks.training_settings import TrainingSettings
 from services.networks.weight_files import (
     load_strictly,
     read_weights,
@@ -103,45 +104,26 @@ def load_network(network: nn.Module, checkpoint: Checkpoint) -> None:
     load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)
 
 
-@runtime_checkable
-class RateSettings(Protocol):
-    """Settings that every training of this service has."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of weights and sampling."""
-
-    @property
-    def learning_rate(self) -> float:
-        """Peak of the cosine schedule."""
-
-    @property
-    def weight_decay(self) -> float:
-        """AdamW weight decay."""
-
-
 def optimized(
     network: nn.Module,
     loss: Callable[[torch.Generator], Tensor],
-    settings: RateSettings,
+    settings: TrainingSettings,
     *,
-    limits: tuple[int, float],
     title: str,
     max_gradient_norm: float | None = 1.0,
 ) -> Iterator[Budget]:
     """Train a network; yields the used budget after each step.
 
-    `loss` is that of a batch drawn with the generator; `limits` are the largest number of steps,
-    and CPU seconds. Gradients are clipped to `max_gradient_norm`, unless it is None.
+    `loss` is that of a batch drawn with the generator. Gradients are clipped to
+    `max_gradient_norm`, unless it is None.
     """
-    num_steps, max_cpu_s = limits
     generator = torch.Generator().manual_seed(settings.seed)
-    budget = Budget(max_cpu_s, num_steps)
+    budget = Budget(settings.max_cpu_s, settings.num_training_steps)
     options = OptimizerOptions(
         settings.learning_rate, settings.weight_decay, max_gradient_norm, fused=False
     )
     network.train()
-    with Progress(title, num_steps) as progress:
+    with Progress(title, settings.num_training_steps) as progress:
         for value in OptimizerLoop(network, options, budget).run(lambda: loss(generator)):
             progress.advance(loss=value)
             yield budget

@@ -43,13 +43,9 @@ def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
 
 
 def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel, key: str) -> str:
-    """Write a file atomically and return the SHA-256 of its bytes.
+    """Write weights with their history, as JSON, atomically; returns the SHA-256 of the file.
 
-    Args:
-        path: file to write.
-        tensors: from `half_weights`, of one or several models.
-        history: provenance of the weights; stored as JSON.
-        key: metadata key of the history, which identifies the kind of model.
+    `key` is the metadata key of the history, which identifies the kind of model.
     """
     return write_tensors(path, tensors, {key: history.model_dump_json()})
 
@@ -79,13 +75,9 @@ def digest_of(path: Path) -> str:
 def read_weights(
     path: Path, history: type[History], key: str, *, max_bytes: int = MAX_FILE_BYTES
 ) -> tuple[dict[str, Tensor], History, str]:
-    """Read tensors, history and SHA-256 of a file.
+    """Read tensors, history and SHA-256 of a file of at most `max_bytes`.
 
-    Args:
-        path: file to read.
-        history: class of the history; it has a `format_version`.
-        key: metadata key of the history.
-        max_bytes: largest size of the file.
+    The history, under the metadata key `key`, is of a class with a `format_version`.
 
     Raises:
         NotFoundError: no such file.
@@ -148,11 +140,6 @@ def _history(text: str | None, history: type[History], key: str, where: str) -> 
         raise CorruptDataError(f"{where}: metadata unreadable ({error})") from error
 
 
-def holds(path: Path, key: str) -> bool:
-    """Whether a file declares this kind of model; False if it is not a safetensors file."""
-    return key in notes_of(path)
-
-
 def notes_of(path: Path) -> dict[str, str]:
     """Metadata of a file, without reading its tensors; empty if it is not a safetensors file."""
     try:
@@ -171,11 +158,8 @@ def load_strictly(
 ) -> None:
     """Load tensors into models in their precision, for inference; the names must match exactly.
 
-    Args:
-        models: keyed by the prefix of their tensor names.
-        tensors: tensors of all models.
-        where: context for error messages.
-        later: names that older files do not have; the model keeps its own values.
+    Models are keyed by the prefix of their tensor names. Of tensors that are named by `later` and
+    that older files do not have, a model keeps its own values.
 
     Raises:
         InvalidInputError: missing or unexpected tensors, wrong shapes or kinds of numbers.
@@ -246,12 +230,7 @@ def memory_of(tensors: Mapping[str, Tensor]) -> int:
 
 
 def check_memory(num_bytes: int, *, where: str, max_bytes: int | None = None) -> None:
-    """Refuse weights that do not fit.
-
-    Args:
-        num_bytes: memory that the weights need.
-        where: context for the error message.
-        max_bytes: limit; None for the memory that is available.
+    """Refuse weights that need more than `max_bytes`; None: than the memory that is available.
 
     Raises:
         LimitExceededError: more than the limit.

@@ -5,10 +5,10 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from fastapi import FastAPI
 from rich.console import Console
@@ -29,10 +29,10 @@ from services.evaluation.command_line import print_scores
 from services.evaluation.prediction import ALL_TASKS, all_metrics, described, measure_prediction
 from services.evaluation.prediction_scenes import read_rollout
 from services.evaluation.reporting import (
-    ActionPicture,
-    EpisodePicture,
     PredictionPicture,
     ReportPictures,
+    action_picture,
+    episode_picture,
     write_report,
 )
 from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
@@ -223,30 +223,18 @@ def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _pictures(
     takes: Mapping[str, recording.Take], predictions: tuple[PredictionPicture, ...]
 ) -> ReportPictures:
-    robot = takes["robot"].episode
-    measured = robot.window(0, robot.num_steps, cameras=())
-    commanded = None
-    if "action_commanded" in robot.streams:
-        window = robot.window(0, robot.num_steps, cameras=(), action_kind="commanded")
-        commanded = window.actions
-    times_s = (measured.t_ref_ns - measured.t_ref_ns[0]) * 1e-9
     return ReportPictures(
-        episodes=tuple(_strip(take.episode, name.capitalize()) for name, take in takes.items()),
+        episodes=tuple(
+            replace(
+                episode_picture(take.episode, num_moments=NUM_MOMENTS),
+                title=f"{name.capitalize()} take, as recorded and aligned: "
+                f"{take.episode.attributes.instruction}",
+            )
+            for name, take in takes.items()
+        ),
         clock_residuals_ms=takes["human"].clock_residuals_ms,
-        actions=ActionPicture(times_s, measured.actions, commanded),
+        actions=action_picture(takes["robot"].episode),
         predictions=predictions,
-    )
-
-
-def _strip(episode: EpisodeReader, name: str) -> EpisodePicture:
-    """Images and touch of a take at a few moments."""
-    steps = np.linspace(0, episode.num_steps - 1, NUM_MOMENTS).astype(int)
-    window = episode.window(0, episode.num_steps, cameras=(HEAD_CAMERA,))
-    return EpisodePicture(
-        title=f"{name} take, as recorded and aligned: {episode.attributes.instruction}",
-        times_s=(window.t_ref_ns[steps] - window.t_ref_ns[0]) * 1e-9,
-        images=window.images[HEAD_CAMERA][steps],
-        tactile_kpa=window.tactile_kpa[steps],
     )
 
 

@@ -13,12 +13,12 @@ import torch
 from dextouch.clients import Policy
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import UnknownNameError
 from dextouch.serving import configure_logging
 from services.evaluation.bundled_policies import trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.perceptual_networks import Metric
-from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.outside import load_policies
 from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.prediction import (
     ALL_TASKS,
@@ -161,21 +161,8 @@ def _policies(options: argparse.Namespace) -> dict[str, Policy]:
         InvalidInputError: two policies of one name, or one that does not load.
         UnknownNameError: arguments of a policy that is not given.
     """
-    policies: dict[str, Policy] = {}
-
-    def add(name: str, policy: Policy) -> None:
-        if name in policies or name == REPLAY:
-            raise InvalidInputError(f"policies: {name!r} is given twice; rename one, NAME=…")
-        policies[name] = policy
-
-    sources = [PolicySource.parse(text) for text in options.policy]
-    names = [source.name for source in sources]
-    if unknown := sorted(set(options.policy_arguments) - set(names)):
-        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
-    for source in sources:
-        add(source.name, source.load(options.policy_arguments.get(source.name, {})))
-    for name, path in options.cloned:
-        add(name, trained_policy(path))
-    if options.hold:
-        add("hold", HoldPolicy())
-    return policies
+    held = ["hold"] if options.hold else []
+    others = [REPLAY, *(name for name, _ in options.cloned), *held]
+    policies = load_policies(options.policy, options.policy_arguments, others)
+    policies |= {name: trained_policy(path) for name, path in options.cloned}
+    return policies | {name: HoldPolicy() for name in held}

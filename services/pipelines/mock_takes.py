@@ -4,11 +4,11 @@ The mock gloves know their own tare and gain, and their script its path delay; a
 same as at a station, by a rest take, known pressures and answers to time requests, so that errors
 contain those of a calibration.
 
-`write_through_devices` and `write_as_recorded` make episodes of such takes in one process: the way
-from a person's hands to 67-D actions of the robot, without HTTP. Episodes have the errors of an
-ordinary station (clocks, delays, tracking, calibration, lost packets) and, as labels, what only the
-twin knows: object poses, milestones and success. Labels are on the episode's time axis: the clock
-of the simulated host is that of the simulation.
+`write_by_station` makes episodes of such takes in one process: the way from a person's hands to
+67-D actions of the robot, without HTTP. Episodes have the errors of an ordinary station (clocks,
+delays, tracking, calibration, lost packets) and, as labels, what only the twin knows: object poses,
+milestones and success. Labels are on the episode's time axis: the clock of the simulated host is
+that of the simulation.
 """
 
 import tempfile
@@ -36,7 +36,7 @@ from dextouch.schemas import (
     matrix_rows,
     object_stream,
 )
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.faults import FaultScript
@@ -155,10 +155,11 @@ def measure_gloves(
         take = station.run_take(CALIBRATION)
         if not isinstance(clock, VirtualClock):
             found = _path_delays(station, [f"tactile_{side}" for side in gloves])
-    for side in gloves:
+    for side, glove in gloves.items():
         rest, *pressed = _parts(take, side)
-        tare = measure_tare(rest, side=side)
-        everywhere = np.ones(NUM_TAXELS, dtype=np.bool_)
+        layout = glove.descriptor.tactile_layout
+        tare = measure_tare(rest, side=side, layout=layout)
+        everywhere = np.ones(layout.num_taxels, dtype=np.bool_)
         presses = [
             TaxelPress(kpa, PRESSURE_SIGMA * kpa, counts, everywhere)
             for kpa, counts in zip(PRESSURES_KPA, pressed, strict=True)
@@ -198,10 +199,11 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
     per_part = round(PART_S * 1e9 / period_ns)
     values = np.repeat(true_kpa.astype(np.float32), per_part)[:, None]
     t_ns = np.arange(len(values), dtype=np.int64) * period_ns
-    return ReplayStream(stream.descriptor, t_ns, np.repeat(values, NUM_TAXELS, axis=1))
+    (num_taxels,) = stream.descriptor.shape
+    return ReplayStream(stream.descriptor, t_ns, np.repeat(values, num_taxels, axis=1))
 
 
-def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time 360"]]:
+def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
     """Counts of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)
@@ -218,46 +220,23 @@ def device_options(options: TakeOptions) -> TakeOptions:
     return replace(options, image_every=None, streams="all")
 
 
-def write_through_devices(
-    store: EpisodeStore, truth: TruthEpisode, *, episode_id: str, options: TakeOptions
-) -> None:
-    """Record a take of the twin with a mock station, align it and write it with the twin's labels.
-
-    Equal takes give equal episodes. The recording itself is not kept.
-
-    Args:
-        store: where the episode goes.
-        truth: recorded with `device_options`.
-        episode_id: of the new episode.
-        options: `streams` and `image_every` say what the episode has.
-
-    Raises:
-        ConflictError: the episode exists.
-        InvalidInputError: the take could not be aligned.
-        DeviceError: a mock device failed.
-    """
-    aligned, streams, origin_ns = _aligned(truth, ALIGNMENT, episode_id)
-    label = _label(truth.streams[LABELS], origin_ns, streams[0].t_ref_ns)
-    attributes = _with_truth(aligned, truth.attributes, origin_ns)
-    _write(store, attributes, [label, *streams], options)
-
-
-def write_as_recorded(
+def write_by_station(
     store: EpisodeStore,
     truth: TruthEpisode,
-    objects: SceneObjects,
+    objects: SceneObjects | None = None,
     *,
     episode_id: str,
     options: TakeOptions,
 ) -> None:
-    """Record a take with a mock station and write what alignment makes of it, and nothing else.
+    """Record a take of the twin with a mock station, and write what alignment makes of it.
 
-    Poses of objects are those of the markers in the images. Of the twin's truth the episode has
-    only the outcome, which an operator would see.
+    By default the episode also has the twin's labels, and equal takes give equal episodes. With
+    `objects`, poses of objects are those of the markers in the images, and of the twin's truth the
+    episode has only the outcome, which an operator would see. The recording itself is not kept.
 
     Args:
         store: where the episode goes.
-        truth: recorded with `device_options`, by a stage that shows the markers.
+        truth: recorded with `device_options`; with `objects` by a stage that shows the markers.
         objects: of the task, with their markers.
         episode_id: of the new episode.
         options: `streams` and `image_every` say what the episode has.
@@ -267,10 +246,14 @@ def write_as_recorded(
         InvalidInputError: the take could not be aligned.
         DeviceError: a mock device failed.
     """
-    alignment = ALIGNMENT.model_copy(update={"objects": objects})
-    attributes, streams, _ = _aligned(truth, alignment, episode_id)
-    # The recording is not kept, and the wall clock would differ each time.
-    attributes = attributes.model_copy(update={"created_at": None, "lineage": ()})
+    alignment = ALIGNMENT.model_copy(update={"objects": objects}) if objects else ALIGNMENT
+    attributes, streams, origin_ns = _aligned(truth, alignment, episode_id)
+    if objects is None:
+        streams = [_label(truth.streams[LABELS], origin_ns, streams[0].t_ref_ns), *streams]
+        attributes = _with_truth(attributes, truth.attributes, origin_ns)
+    else:
+        # The recording is not kept, and the wall clock would differ each time.
+        attributes = attributes.model_copy(update={"created_at": None, "lineage": ()})
     _write(store, attributes, streams, options)
 
 

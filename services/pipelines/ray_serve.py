@@ -35,8 +35,8 @@ def world_model(arguments: Mapping[str, str]) -> serve.Application:
 
 def twin(arguments: Mapping[str, str]) -> serve.Application:
     """The twin and its baseline; `num_replicas` of them."""
-    from services.twin.serving import twin_worlds
     from services.twin.settings import TwinServiceSettings
+    from services.twin.world import twin_worlds
 
     settings = TwinServiceSettings()
     worlds = partial(twin_worlds, settings.scene)

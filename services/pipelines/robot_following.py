@@ -16,7 +16,7 @@ from services.alignment.retargeting import (
     RetargetStatus,
     warm_up,
 )
-from services.alignment.retargeting.hand_profile import calibrated_profile
+from services.alignment.retargeting.hand_retargeter import calibrated_profile
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,

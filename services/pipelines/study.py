@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.jobs import Workers, results_of, run_jobs
@@ -16,15 +15,15 @@ from dextouch.serving import ChildProcess
 from services.evaluation.command_line import (
     EXIT_FAILED,
     instructions_for,
+    opened,
     print_failures,
     print_scores,
 )
-from services.evaluation.matched_starts import StudyWorlds, WorldAddress
+from services.evaluation.matched_starts import StudyWorlds
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, Outcome
-from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.studies.definition import StudyDefinition, WorldChoice, read_definition
+from services.evaluation.settings import DEFAULT_PROBE, ServedWorld
 from services.evaluation.studies.engine import (
     PolicyFactory,
     StudyParts,
@@ -32,7 +31,15 @@ from services.evaluation.studies.engine import (
     run_rollouts,
     run_study,
 )
-from services.evaluation.studies.results import PlannedRollout, StudyHeader, StudyResults, cells_of
+from services.evaluation.studies.results import (
+    PlannedRollout,
+    StudyDefinition,
+    StudyHeader,
+    StudyResults,
+    WorldChoice,
+    cells_of,
+    read_definition,
+)
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
@@ -64,7 +71,7 @@ def _run(options: argparse.Namespace) -> int:
     folder = options.folder or options.study.with_suffix("")
     refuse_training_seeds(definition)
     store_url = str(options.store or folder / "rollouts") if definition.keep_rollouts else None
-    addresses = dict[str, Address]()
+    addresses = dict[str, ServedWorld]()
     parts, digests = _parts(definition, addresses, store_url)
     with served_worlds(definition) as served:
         addresses |= served
@@ -88,7 +95,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _parts(
-    definition: StudyDefinition, addresses: Mapping[str, "Address"], store_url: str | None
+    definition: StudyDefinition, addresses: Mapping[str, ServedWorld], store_url: str | None
 ) -> tuple[StudyParts, dict[str, str]]:
     """What the rollouts of a study need, and digests of the files among it.
 
@@ -217,17 +224,8 @@ def _finish(results: StudyResults, json_path: Path | None) -> int:
     return EXIT_FAILED if figures["failures"] else 0
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where a world is served."""
-
-    url: str
-    world: str
-    api_key: str | None = None
-
-
 @contextmanager
-def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, Address]]:
+def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, ServedWorld]]:
     """Addresses of all worlds by name; those without a URL are served until the block ends.
 
     Raises:
@@ -254,30 +252,24 @@ def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, Address]]:
             if "refused" in answer:
                 raise InvalidInputError(f"world {name!r}: {answer['refused']}")
         yield {
-            name: Address(**served[name]) if name in served else _address(name, choice)
+            name: ServedWorld(**served[name]) if name in served else _address(name, choice)
             for name, choice in choices.items()
         }
 
 
-def _address(name: str, choice: WorldChoice) -> Address:
+def _address(name: str, choice: WorldChoice) -> ServedWorld:
     key, variable = None, choice.api_key_variable
     if variable is not None and (key := os.environ.get(variable)) is None:
         raise InvalidInputError(
             f"world {name!r}: its API key is expected in the variable {variable}, which is not set"
         )
-    return Address(str(choice.url), str(choice.world), key)
+    return ServedWorld(url=str(choice.url), world=str(choice.world), api_key=key)
 
 
-def connect(addresses: Mapping[str, Address], connections: ExitStack) -> StudyWorlds:
+def connect(addresses: Mapping[str, ServedWorld], connections: ExitStack) -> StudyWorlds:
     """Open connections to all worlds and ask what they are."""
-    opened = {
-        name: WorldAddress(
-            connections.enter_context(RolloutClient(one.url, one.api_key)), one.world
-        )
-        for name, one in addresses.items()
-    }
-    real = opened.pop(REAL)
-    return StudyWorlds.ask(real, opened)
+    worlds = {name: opened(one, connections) for name, one in addresses.items()}
+    return StudyWorlds.ask(worlds.pop(REAL), worlds)
 
 
 def refuse_training_seeds(definition: StudyDefinition) -> None:

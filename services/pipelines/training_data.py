@@ -24,12 +24,12 @@ from dextouch.serving import configure_logging
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
+from services.twin.cameras import Markers, marked_objects
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
-from services.twin.markers import Markers, marked_objects
 from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
+from services.twin.scene import Sizes, object_boxes_m
 from services.twin.settings import TwinSettings
-from services.twin.sizes import Sizes, object_boxes_m
 from services.twin.stage import Stage
 from services.twin.take_options import MIXES, Mix, PlayedActions, TakeOptions, options_of
 from services.twin.tasks import EVALUATED, named_tasks
@@ -197,30 +197,18 @@ def _write_directly(order: Order) -> TruthEpisode:
     return episode
 
 
-def _write_by_devices(order: Order) -> TruthEpisode:
+def _write_by_station(order: Order) -> TruthEpisode:
     # Loads the compiled solver of retargeting.
-    from services.pipelines.mock_takes import device_options, write_through_devices
+    from services.pipelines.mock_takes import device_options, write_by_station
 
-    episode = _recorded(order, device_options(order.options))
-    write_through_devices(
-        EpisodeStore(order.store), episode, episode_id=order.episode_id, options=order.options
-    )
-    return episode
-
-
-def _write_as_a_station(order: Order) -> TruthEpisode:
-    from services.pipelines.mock_takes import device_options, write_as_recorded
-
-    stage, objects = marked_stage(order.task, order.domain)
-    options = replace(device_options(order.options), image_every=1)
-    episode = record(stage, order.seed, options)
-    write_as_recorded(
-        EpisodeStore(order.store),
-        episode,
-        objects,
-        episode_id=order.episode_id,
-        options=order.options,
-    )
+    options, objects = device_options(order.options), None
+    if order.path == "station":
+        stage, objects = marked_stage(order.task, order.domain)
+        episode = record(stage, order.seed, replace(options, image_every=1))
+    else:
+        episode = _recorded(order, options)
+    store, name = EpisodeStore(order.store), order.episode_id
+    write_by_station(store, episode, objects, episode_id=name, options=order.options)
     return episode
 
 
@@ -228,8 +216,8 @@ def _write_as_a_station(order: Order) -> TruthEpisode:
 # the twin's labels; or the same without them, objects being measured by the markers on them.
 _WRITERS: Final[dict[TakePath, Callable[[Order], TruthEpisode]]] = {
     "direct": _write_directly,
-    "devices": _write_by_devices,
-    "station": _write_as_a_station,
+    "devices": _write_by_station,
+    "station": _write_by_station,
 }
 
 

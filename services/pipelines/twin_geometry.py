@@ -8,15 +8,20 @@ from jaxtyping import Float64, Int64
 
 from dextouch.episodes import EpisodeReader, object_track
 from dextouch.hands.actions import HandTrajectory, poses_from_actions
-from services.evaluation.prediction_scenes import FAR_M, Scene, SceneGeometry
-from services.twin.cameras import BACKGROUND
+from services.evaluation.prediction_scenes import (
+    BACKGROUND,
+    FAR_M,
+    FIRST_BODY,
+    TABLE,
+    Scene,
+    SceneGeometry,
+)
+from services.twin import cameras
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage, command_row
 
-BACKGROUND_LABEL: Final = 0
-TABLE_LABEL: Final = 1
-LEFT_HAND_LABEL: Final = 2
-FIRST_OBJECT_LABEL: Final = 4
+# The bodies are both hands, then the objects.
+FIRST_OBJECT: Final = FIRST_BODY + 2
 
 
 class SceneViews:
@@ -30,14 +35,14 @@ class SceneViews:
     def __init__(self, stage: Stage) -> None:
         self.stage, scene = stage, stage.simulation.scene
         self.names = ("background", "table", "left_hand", "right_hand", *scene.object_names)
-        labels = np.full(scene.model.ngeom, BACKGROUND_LABEL)
-        labels[scene.table_geom] = TABLE_LABEL
+        labels = np.full(scene.model.ngeom, BACKGROUND)
+        labels[scene.table_geom] = TABLE
         of_hand, of_object = scene.geom_hand >= 0, scene.geom_object >= 0
-        labels[of_hand] = LEFT_HAND_LABEL + scene.geom_hand[of_hand]
-        labels[of_object] = FIRST_OBJECT_LABEL + scene.geom_object[of_object]
+        labels[of_hand] = FIRST_BODY + scene.geom_hand[of_hand]
+        labels[of_object] = FIRST_OBJECT + scene.geom_object[of_object]
         self._labels: Int64[np.ndarray, " geoms"] = labels.astype(np.int64)
         rows = np.column_stack([labels, scene.model.geom_rgba[:, :3]])[labels > 0]
-        seen = np.vstack([[BACKGROUND_LABEL, *BACKGROUND], rows])
+        seen = np.vstack([[BACKGROUND, *cameras.BACKGROUND], rows])
         self.colours: Float64[np.ndarray, "colours 4"] = np.unique(seen.round(6), axis=0)
 
     def of(
@@ -55,7 +60,7 @@ class SceneViews:
         simulation = self.stage.simulation
         simulation.pose(command_row(poses, step), object_poses[step])
         geoms, depth_m = self.stage.rig.cast(simulation, "camera_head")
-        return np.where(geoms >= 0, self._labels[geoms], BACKGROUND_LABEL), depth_m
+        return np.where(geoms >= 0, self._labels[geoms], BACKGROUND), depth_m
 
 
 class TwinGeometry:
@@ -95,7 +100,7 @@ class TwinGeometry:
 
 def _table_m(stage: Stage, T_world_camera: np.ndarray) -> Float64[np.ndarray, "h w"]:
     """Depth of the table's plane z = 0 at every pixel; far where a ray does not meet it."""
-    rays = stage.rig.rays("camera_head")
+    rays = stage.rig.rays["camera_head"]
     down = -(rays @ T_world_camera[:3, :3].T)[:, 2]
     distance_m = T_world_camera[2, 3] / np.where(down > 1e-6, down, 1e-6)
     return np.minimum(distance_m * rays[:, 2], FAR_M).reshape(stage.rig.shape_px)

@@ -17,8 +17,8 @@ from services.twin.episodes import record, write_episode
 from services.twin.mistakes import Mistake
 from services.twin.names import Domain
 from services.twin.parser import twin_parser
+from services.twin.scene import Sizes
 from services.twin.settings import TwinSettings
-from services.twin.sizes import Sizes
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 

@@ -193,20 +193,13 @@ def with_motion(
         return _slipping(commands, motion.from_step, generator)
     draw = {"retreat": _retreat, "push": _push, "wander": _wander}[motion.kind]
     waypoints = draw(commands, motion.from_step, scene, generator)
-    changed = follow(waypoints, commands.Ts_world_camera_head)
-    return _spliced(commands, changed, motion.from_step + 1)
-
-
-def _spliced(before: HandTrajectory, after: HandTrajectory, from_step: int) -> HandTrajectory:
-    def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.concatenate([first[:from_step], second[from_step:]])
-
+    changed = vars(follow(waypoints, commands.Ts_world_camera_head))
+    stop = motion.from_step + 1
     return HandTrajectory(
-        joined(before.Ts_world_wrist_left, after.Ts_world_wrist_left),
-        joined(before.Ts_world_wrist_right, after.Ts_world_wrist_right),
-        joined(before.joints_left_rad, after.joints_left_rad),
-        joined(before.joints_right_rad, after.joints_right_rad),
-        before.Ts_world_camera_head,
+        **{
+            name: np.concatenate([before[:stop], changed[name][stop:]])
+            for name, before in vars(commands).items()
+        }
     )
 
 

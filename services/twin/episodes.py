@@ -25,8 +25,8 @@ from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene, with_motion
 from services.twin.hands import HumanHand
 from services.twin.mistakes import with_mistakes
 from services.twin.mjcf import PHYSICS_RATE_HZ
+from services.twin.scene import object_boxes_m
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
 
@@ -71,11 +71,7 @@ def record(
 ) -> TruthEpisode:
     """Record one take; equal stage, seed, options and actions give equal bytes.
 
-    Args:
-        stage: a task with the hands of a domain.
-        seed: seed of the scene and of all random numbers.
-        options: options of the take; they determine the commands unless `played` is given.
-        played: actions from another source.
+    The options determine the commands, unless actions are `played`.
     """
     sizes = options.sizes
     plan = stage.plan(

@@ -7,7 +7,7 @@ the wrist bones and the limits are our estimates from common anatomy. The thumb'
 oriented like the robot's, so that flexion and abduction have the same meaning.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
@@ -67,6 +67,9 @@ _THUMB_BASE_TURN: Final = (0.6294, -0.0606, -0.7201, 0.2856)
 _THUMB_SADDLE_TURN: Final = (0.9347, 0.0919, 0.3425, -0.0234)
 _THUMB_ROLL: Final = (0.9591, -0.0122, 0.0419, 0.2796)
 _NO_TURN: Final = (1.0, 0.0, 0.0, 0.0)
+_ORIGIN: Final = (0.0, 0.0, 0.0)
+# Of flexion, abduction and two more flexions.
+_AXES: Final = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 # As on the robot: the abduction hinge is the knuckle, the two flexions after it PIP and DIP.
 _POINTS: Final = (1, 2, 3)
 
@@ -98,9 +101,7 @@ _HUMAN_SHAPE: Final = HandShape(
 class HumanHand(HandModel):
     """A human hand with the robot's kinematic tree and joint order, but human bones and limits.
 
-    Args:
-        side: "left" or "right".
-        fingers: finger tables of a person, thumb first; default: average size.
+    `fingers` are a person's finger tables, thumb first; by default those of average size.
 
     Raises:
         UnknownNameError: any other side.
@@ -190,14 +191,24 @@ def twin_hand(side: Side, domain: Domain) -> TwinHand:
 def human_fingers(side: str) -> tuple[FingerTable, ...]:
     """Finger tables, thumb … little, of a "left" or "right" human hand."""
     right = (_thumb(), *(_finger(name) for name in METACARPAL_BASES_M))
-    if side == "right":
-        return right
-    mirrored = []
-    for finger in right:
-        rows = tuple(_mirrored(row) for row in finger.joints)
-        x, y, z = finger.tip_m
-        mirrored.append(FingerTable(finger.chain, rows, (x, -y, z), finger.points))
-    return tuple(mirrored)
+    return right if side == "right" else tuple(map(_mirrored, right))
+
+
+def _table(
+    chain: str,
+    joints: Iterable[str],
+    places: Iterable[Vector3],
+    turns: Iterable[Quaternion],
+    limits_rad: Iterable[tuple[float, float]],
+    distal_m: float,
+) -> FingerTable:
+    rows = zip(joints, zip(places, turns, _AXES, limits_rad, strict=True), strict=True)
+    return FingerTable(
+        chain,
+        tuple(JointRow(f"r_{joint}", *about) for joint, about in rows),
+        (0.0, 0.0, -distal_m),
+        _POINTS,
+    )
 
 
 def _finger(name: str) -> FingerTable:
@@ -208,44 +219,27 @@ def _finger(name: str) -> FingerTable:
     # The finger spreads half as much as its metacarpal, by a rotation about y.
     fan = (float(np.cos(lean / 4)), 0.0, float(-np.sin(lean / 4)), 0.0)
     firmware = "pinky" if name == "little" else f"{name}_finger"
-    flex, abd, pip, dip = _FINGER_LIMITS_RAD
-    x_axis, y_axis = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    joints = (f"{firmware}_{joint}" for joint in ("mcp_flex", "mcp_abd", "pip", "dip"))
     place: Vector3 = (float(knuckle[0]), float(knuckle[1]), float(knuckle[2]))
-    return FingerTable(
-        name,
-        (
-            JointRow(f"r_{firmware}_mcp_flex", place, fan, x_axis, flex),
-            JointRow(f"r_{firmware}_mcp_abd", (0.0, 0.0, 0.0), _NO_TURN, y_axis, abd),
-            JointRow(f"r_{firmware}_pip", (0.0, 0.0, -proximal), _NO_TURN, x_axis, pip),
-            JointRow(f"r_{firmware}_dip", (0.0, 0.0, -middle), _NO_TURN, x_axis, dip),
-        ),
-        (0.0, 0.0, -distal),
-        _POINTS,
-    )
+    places = (place, _ORIGIN, (0.0, 0.0, -proximal), (0.0, 0.0, -middle))
+    turns = (fan, _NO_TURN, _NO_TURN, _NO_TURN)
+    return _table(name, joints, places, turns, _FINGER_LIMITS_RAD, distal)
 
 
 def _thumb() -> FingerTable:
     metacarpal, proximal, distal = _THUMB_BONES_M
-    flex, abd, mcp, ip = _THUMB_LIMITS_RAD
-    x_axis, y_axis = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-    return FingerTable(
-        "thumb",
-        (
-            JointRow("r_thumb_cmc_flex", _THUMB_BASE_M, _THUMB_BASE_TURN, x_axis, flex),
-            JointRow("r_thumb_cmc_abd", (0.0, 0.0, 0.0), _THUMB_SADDLE_TURN, y_axis, abd),
-            JointRow("r_thumb_mcp", (0.0, 0.0, -metacarpal), _THUMB_ROLL, x_axis, mcp),
-            JointRow("r_thumb_ip", (0.0, 0.0, -proximal), _NO_TURN, x_axis, ip),
-        ),
-        (0.0, 0.0, -distal),
-        _POINTS,
-    )
+    joints = (f"thumb_{joint}" for joint in ("cmc_flex", "cmc_abd", "mcp", "ip"))
+    places = (_THUMB_BASE_M, _ORIGIN, (0.0, 0.0, -metacarpal), (0.0, 0.0, -proximal))
+    turns = (_THUMB_BASE_TURN, _THUMB_SADDLE_TURN, _THUMB_ROLL, _NO_TURN)
+    return _table("thumb", joints, places, turns, _THUMB_LIMITS_RAD, distal)
 
 
-def _mirrored(row: JointRow) -> JointRow:
-    """Mirror a row to the left hand: y positions and rotations about x and z change sign."""
-    x, y, z = row.position_m
-    qw, qx, qy, qz = row.q_wxyz
-    axis_x, axis_y, axis_z = row.axis
-    q: Quaternion = (qw, -qx, qy, -qz)
-    name = f"l_{row.name.removeprefix('r_')}"
-    return JointRow(name, (x, -y, z), q, (-axis_x, axis_y, -axis_z), row.limits_rad)
+def _mirrored(finger: FingerTable) -> FingerTable:
+    """A finger of the left hand: y positions and rotations about x and z change sign."""
+    rows = []
+    for row in finger.joints:
+        (x, y, z), (qw, qx, qy, qz), (a, b, c) = row.position_m, row.q_wxyz, row.axis
+        name, q = f"l_{row.name.removeprefix('r_')}", (qw, -qx, qy, -qz)
+        rows.append(JointRow(name, (x, -y, z), q, (-a, b, -c), row.limits_rad))
+    x, y, z = finger.tip_m
+    return FingerTable(finger.chain, tuple(rows), (x, -y, z), finger.points)

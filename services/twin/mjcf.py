@@ -4,7 +4,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dextouch.hands import JointRow
 from dextouch.tactile.layout import FINGERS
 from services.twin.hands import PALM_THICKNESS_M, TwinHand
 
@@ -31,20 +30,6 @@ def _tint(side: str, finger_index: int) -> str:
     return numbers([*(base * (0.80 + 0.06 * finger_index)).clip(0, 1), 1.0])
 
 
-def _capsule(name: str, end_m: Iterable[float], radius_m: float, rgba: str) -> str:
-    return (
-        f'<geom name="{name}" class="hand" type="capsule" fromto="0 0 0 {numbers(end_m)}" '
-        f'size="{radius_m!r}" rgba="{rgba}"/>'
-    )
-
-
-def _joint(row: JointRow) -> str:
-    return (
-        f'<joint name="{row.name}" class="finger" axis="{numbers(row.axis)}" '
-        f'range="{numbers(row.limits_rad)}"/>'
-    )
-
-
 def _finger(hand: TwinHand, index: int) -> str:
     table = hand.kinematics.fingers[index]
     straight_m, _ = hand.distal_m(index)
@@ -61,13 +46,17 @@ def _finger(hand: TwinHand, index: int) -> str:
     for link, row in enumerate(table.joints):
         parts.append(
             f'<body name="{prefix}_{link}" pos="{numbers(row.position_m)}" '
-            f'quat="{numbers(row.q_wxyz)}" gravcomp="1">{_joint(row)}'
+            f'quat="{numbers(row.q_wxyz)}" gravcomp="1"><joint name="{row.name}" class="finger" '
+            f'axis="{numbers(row.axis)}" range="{numbers(row.limits_rad)}"/>'
         )
         if link == 0:
             parts.append('<inertial mass="0.01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>')
         else:
             radius = hand.shape.radii_m[index][link - 1]
-            parts.append(_capsule(f"{prefix}_link{link}", ends[link], radius, rgba))
+            parts.append(
+                f'<geom name="{prefix}_link{link}" class="hand" type="capsule" '
+                f'fromto="0 0 0 {numbers(ends[link])}" size="{radius!r}" rgba="{rgba}"/>'
+            )
     parts.append(_skin(f"{prefix}_skin"))
     return "".join(parts) + "</body>" * len(table.joints)
 
@@ -148,11 +137,9 @@ def _sensors(hand: TwinHand) -> str:
 
 
 def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
-    """MJCF of the scene: table, a shelf behind the viewer for removed objects, hands and objects.
+    """MJCF of table, shelf behind the viewer for removed objects, hands (left first) and objects.
 
-    Args:
-        hands: hands to simulate, left before right.
-        objects: MJCF bodies; geoms of class "object".
+    `objects` are MJCF bodies with geoms of class "object".
     """
     bodies = "".join(_hand(hand) for hand in hands)
     return (

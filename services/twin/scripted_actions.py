@@ -1,6 +1,7 @@
 """Open-loop policies of graded quality: the demonstrator with mistakes, and three that fail."""
 
 import re
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -8,12 +9,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import UnknownNameError
 from dextouch.geometry import transform
-from dextouch.hands.actions import (
-    AnchorPoses,
-    HandTrajectory,
-    actions_from_poses,
-    poses_from_actions,
-)
+from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene
 from services.twin.mistakes import Mistake, with_mistakes
 from services.twin.stage import Stage
@@ -80,11 +76,6 @@ def _retreat(row: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "81 67
     still = poses_from_actions(np.repeat(row[None], NUM_GRID_STEPS, axis=0), anchor)
     way = np.minimum(np.arange(NUM_GRID_STEPS) / _RETREAT_STEPS, 1.0)
     offset = transform(np.eye(3), (way * way * (3 - 2 * way))[:, None] * _RETREAT_M)
-    moved = HandTrajectory(
-        offset @ still.Ts_world_wrist_left,
-        offset @ still.Ts_world_wrist_right,
-        still.joints_left_rad,
-        still.joints_right_rad,
-        still.Ts_world_camera_head,
-    )
+    left, right = offset @ still.Ts_world_wrist_left, offset @ still.Ts_world_wrist_right
+    moved = replace(still, Ts_world_wrist_left=left, Ts_world_wrist_right=right)
     return actions_from_poses(moved, anchor)

@@ -190,13 +190,9 @@ class Simulation:
         with_object = (self.scene.geom_object[geoms] == object_index).any(axis=1)
         return np.array(self.data.contact.pos[: self.data.ncon][with_hand & with_object])
 
-    def hand_touches(self, object_index: int) -> bool:
-        """Whether any part of a hand is in contact with one object."""
-        return bool(self.hand_contacts()[:, object_index].any())
-
-    def hand_touches_object(self) -> bool:
-        """Whether any part of a hand is in contact with any of the task's objects."""
-        return bool(self.hand_contacts().any())
+    def hand_touches(self, objects: int | slice = slice(None)) -> bool:
+        """Whether any part of a hand is in contact with one object, or with any."""
+        return bool(self.hand_contacts()[:, objects].any())
 
     def touches_table(self, object_index: int) -> bool:
         """Whether an object is in contact with the table top (fixed things never are)."""

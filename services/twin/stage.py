@@ -18,10 +18,9 @@ from services.twin.demonstrators import (
     head_sway,
 )
 from services.twin.names import Domain
-from services.twin.scene import compile_scene
+from services.twin.scene import USUAL, Geometry, Sizes, compile_scene, object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation
-from services.twin.sizes import USUAL, Geometry, Sizes, object_boxes_m
 from services.twin.tasks import get_task
 
 MAX_NOISE_M: Final = 0.2

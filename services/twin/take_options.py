@@ -13,7 +13,7 @@ from dextouch.hands.actions import ACTION_DIM, check_actions
 from services.twin.demonstrators import NUM_GRID_STEPS, Motion
 from services.twin.mistakes import DEVELOPMENT, TRAINING, Mistake
 from services.twin.names import CAMERAS, MOTION_KINDS, Domain, MotionKind, StreamChoice
-from services.twin.sizes import USUAL, Sizes
+from services.twin.scene import USUAL, Sizes
 
 # Success is decided within about 5 mm, so the levels are dense there.
 LADDER_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.040)
@@ -160,15 +160,7 @@ class PlayedActions:
 def episode_id(
     task: str, domain: Domain, seed: int, options: TakeOptions, *, played: str | None = None
 ) -> str:
-    """Descriptive id of an episode, unique for each combination of options.
-
-    Args:
-        task: name of the task.
-        domain: robot or human hands.
-        seed: seed of the scene.
-        options: options of the take.
-        played: name of the `PlayedActions`, if there are any.
-    """
+    """Descriptive id of an episode, unique for each combination of options and actions `played`."""
     parts = ["twin", task, domain, f"{seed:06d}"]
     parts += [f"n{round(options.noise_m * 1e6)}um"] * (options.noise_m > 0)
     parts += ["miss"] * options.miss

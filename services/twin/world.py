@@ -1,10 +1,11 @@
-"""The twin as a `World`: rollouts of commanded actions in the simulation."""
+"""The twin as a `World`, and its service: rollouts of commanded actions in the simulation."""
 
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,13 +20,14 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
+from dextouch.serving import load_settings
 from dextouch.streams import pack, unpack
-from dextouch.worlds import StartedRollout, SteppedRollout
+from dextouch.worlds import CopyFirstWorld, StartedRollout, SteppedRollout, World, serve_worlds
 from services.twin.episodes import GridLog
 from services.twin.names import CAMERAS
-from services.twin.settings import TwinSettings
+from services.twin.scene import Sizes
+from services.twin.settings import TwinServiceSettings, TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TACTILE
-from services.twin.sizes import Sizes
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
 
@@ -49,9 +51,6 @@ class TwinWorld:
     A rollout starts from task and seed, at the first observation of the demonstration of that seed;
     replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
     treated as commands. The physics has no noise, so the seed of a step has no effect.
-
-    Args:
-        settings: cameras and their image size.
 
     Raises:
         UnknownNameError: an unknown camera.
@@ -147,8 +146,8 @@ class TwinWorld:
             state.anchor,
         )
         seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
-        told = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
-        return SteppedRollout(after, seen, told)
+        info = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
+        return SteppedRollout(after, seen, info)
 
     def snapshot(self, state: TwinState) -> bytes:
         """See `World`."""
@@ -203,7 +202,6 @@ class _StepLog:
         self._since_step: list[np.ndarray] = []
 
     def touch(self) -> None:
-        """Record the current tactile sample."""
         self._since_step.append(self._stage.simulation.tactile_kpa)
 
     def step(self) -> None:
@@ -216,7 +214,6 @@ class _StepLog:
         self._grid.sample()
 
     def draw(self) -> None:
-        """Render the images of the last completed step."""
         for camera, images in self._images.items():
             images.append(self._stage.rig.image(self._stage.simulation, camera))
 
@@ -234,3 +231,20 @@ class _StepLog:
             reached_is_measured=True,
             success=self._stage.task.succeeded(self._stage.simulation),
         )
+
+
+def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
+    """The twin, and the baseline that every imagined world must beat."""
+    twin = TwinWorld(scene)
+    baseline = CopyFirstWorld.beside(twin.description)
+    return {"twin": twin, baseline.description.name: baseline}
+
+
+def serve(arguments: list[str]) -> None:
+    """Serve both over HTTP until SIGINT or SIGTERM.
+
+    Raises:
+        InvalidInputError: invalid settings.
+    """
+    settings = load_settings(TwinServiceSettings, arguments)
+    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin")

@@ -13,12 +13,12 @@ from dextouch.episodes import Split, scene_fraction, scene_of, split_of_scene
 from dextouch.errors import ConflictError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, EpisodeAttributes
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.networks.weight_files import (
     MAX_FILE_BYTES,
     available_memory,
     digest_of,
     half_weights,
-    holds,
     load_strictly,
     notes_of,
     read_history,
@@ -28,7 +28,11 @@ from services.networks.weight_files import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.network.configuration import NetworkConfig, TokenizerName
+from services.world_model.network.configuration import (
+    GloveNetworkConfig,
+    NetworkConfig,
+    TokenizerName,
+)
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
 from services.world_model.rendering.configuration import RendererConfig
@@ -46,10 +50,10 @@ LATER_STATISTICS = ("tokenizer.peak_kpa",)
 class TrainingSet(FrozenModel):
     """Episodes of one domain that a model was trained on, or that it was evaluated on (held out).
 
-    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes
-    (`dextouch.episodes`). `window_share` is the share of windows from the set, None where it
-    follows from the number of episodes. `checkpoint` is the digest of the ancestor that was trained
-    on the set, None for the checkpoint's own training.
+    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes,
+    `window_share` the share of windows from the set, None where it follows from the number of
+    episodes. `checkpoint` is the digest of the ancestor that was trained on the set, None for the
+    checkpoint's own training.
     """
 
     domain: Domain
@@ -68,16 +72,15 @@ def learned_tasks(sets: Iterable[TrainingSet]) -> set[str]:
 class CheckpointMetadata(FrozenModel):
     """Provenance and measured accuracy of a model, stored in its checkpoint.
 
-    `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
-    training episodes count as training episodes here, too. `tokenizer_digest` is that of the
-    pretrained tokenizer's file. None is not written, so that older releases can read the file.
-    `sets` are the episodes by domain, those of ancestors included; it is empty in files of older
-    releases.
+    `initialized_from` is the digest of the checkpoint that the weights were initialized from, whose
+    training episodes count here, too, and `tokenizer_digest` that of the pretrained tokenizer's
+    file. None is not written, so that older releases can read the file. `sets` are the episodes by
+    domain, those of ancestors included; empty in files of older releases.
     """
 
     format_version: int = 1
     name: str
-    network: NetworkConfig
+    network: GloveNetworkConfig | NetworkConfig
     tasks: tuple[str, ...]
     command: str
     seed: int
@@ -125,9 +128,11 @@ def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
     """
-    limit = _largest(path) if max_bytes is None else max_bytes
+    if max_bytes is None:
+        is_full_size = '"video_expert":"wan"' in notes_of(path).get(METADATA_KEY, "")
+        max_bytes = (available_memory() or sys.maxsize) if is_full_size else MAX_FILE_BYTES
     tensors, metadata, digest = read_weights(
-        path, CheckpointMetadata, METADATA_KEY, max_bytes=limit
+        path, CheckpointMetadata, METADATA_KEY, max_bytes=max_bytes
     )
     model = JointWorldModel(metadata.network)
     if model.text_features is not None:
@@ -141,20 +146,9 @@ def read_metadata(path: Path) -> CheckpointMetadata:
     """Metadata of a checkpoint, without reading its weights.
 
     Raises:
-        NotFoundError: no such file.
-        CorruptDataError: not a checkpoint of this form, or damaged metadata.
-        InvalidInputError: unsupported format version.
+        NotFoundError, CorruptDataError, InvalidInputError: as `read_weights`.
     """
     return read_history(path, CheckpointMetadata, METADATA_KEY)
-
-
-def _largest(path: Path) -> int:
-    """Largest size of a file of its kind, as its metadata declare it."""
-    text = notes_of(path).get(METADATA_KEY, "")
-    if '"video_expert":"wan"' not in text:
-        return MAX_FILE_BYTES
-    available = available_memory()
-    return sys.maxsize if available is None else available
 
 
 def list_checkpoints(folder: Path) -> dict[Path, str]:
@@ -166,9 +160,8 @@ class StateBounds(FrozenModel):
     """Limits beyond which a rollout is flagged as uncertain.
 
     `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
-    the length of the episodes that the cores were trained on. Bounds `of_chunks` apply to the worst
-    latent step of any 16 steps of an episode; those of older checkpoints apply to whole episodes:
-    to the worst disagreement and the mean distance.
+    the length of training episodes. Bounds `of_chunks` apply to the worst latent step of any 16
+    steps; those of older checkpoints to an episode's worst disagreement and mean distance.
     """
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
@@ -180,8 +173,7 @@ class StateBounds(FrozenModel):
     def latent_distance(self) -> float:
         """Largest distance at which a latent step is not flagged.
 
-        If the bound is on the mean over an episode, no step exceeds that mean times the number of
-        steps.
+        No step exceeds a bound on the mean over an episode times the number of steps.
         """
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
@@ -190,12 +182,11 @@ class StateMetadata(FrozenModel):
     """Provenance and measured accuracy of a state model, stored in its checkpoint.
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
-    (all splits if empty) but the share `heldout_share`, by hash; `training_scenes` are
-    `scene_digest` of those without a seed, which a station recorded. `task_splits` are the splits
-    by task, of tasks whose splits differ from `training_splits`. `object_sources` are the
-    numbers of training episodes whose object poses are from the twin, markers, trackers or clicks,
-    and of those without any ("none"). `sets` are the episodes by domain, those of the models that
-    it started from included; files of older releases have none.
+    (all splits if empty; `task_splits` has those of tasks that differ) but the share
+    `heldout_share`, by hash; `training_scenes` are `scene_digest` of recorded ones, without a seed.
+    `object_sources` are the numbers of training episodes by the source of their object poses, or
+    "none". `sets` are the episodes by domain, those of the models that it started from included;
+    files of older releases have none.
     """
 
     format_version: int = 5
@@ -271,7 +262,7 @@ class StateCheckpoint:
 
 def is_state_checkpoint(path: Path) -> bool:
     """Whether the metadata of a safetensors file declares a state model."""
-    return holds(path, _STATE_KEY)
+    return _STATE_KEY in notes_of(path)
 
 
 def write_state_checkpoint(
@@ -312,7 +303,8 @@ class TokenizerMetadata(FrozenModel):
     """Provenance and measured accuracy of a tokenizer.
 
     `train_scenes` are the scenes of the episodes trained on (`dextouch.episodes.scene_of`). `curve`
-    begins with the untrained network and ends with the stored one.
+    begins with the untrained network and ends with the stored one. `layout` is that of the taxels,
+    None of `dextouch_v1`.
     """
 
     format_version: int = 1
@@ -328,6 +320,7 @@ class TokenizerMetadata(FrozenModel):
     num_heldout_hands: int
     train_scenes: tuple[str, ...]
     data_hash: str
+    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
     curve: tuple[Reconstruction, ...] = Field(min_length=1)
 
     def network(self, config: NetworkConfig) -> NetworkConfig:
@@ -345,7 +338,7 @@ class TokenizerMetadata(FrozenModel):
                 "training: the tokenizer's file has other network settings (stored, requested): "
                 f"{others}; leave them out"
             )
-        return config.model_copy(update=ours)
+        return config.model_copy(update=ours).with_layout(self.layout or DEXTOUCH_V1)
 
 
 @dataclass(frozen=True)
@@ -359,7 +352,7 @@ class StoredTokenizer:
 
 def is_tokenizer(path: Path) -> bool:
     """Whether a file declares a tactile tokenizer."""
-    return holds(path, _TOKENIZER_KEY)
+    return _TOKENIZER_KEY in notes_of(path)
 
 
 def write_tokenizer(path: Path, tokenizer: TactileTokenizer, metadata: TokenizerMetadata) -> str:

@@ -4,9 +4,7 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from typing import TYPE_CHECKING, Any
 
 from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
@@ -38,6 +36,9 @@ from services.world_model.training.distribution import joined_processes
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
+if TYPE_CHECKING:
+    from services.world_model.training.state_trainer import StateReport
+
 
 def run_train(arguments: list[str]) -> int:
     """Train the form that --preset names; print the report and optionally write it to a file."""
@@ -51,7 +52,7 @@ def run_train(arguments: list[str]) -> int:
 
 
 def run_adapt(arguments: list[str]) -> int:
-    """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
+    """Adapt a checkpoint to new tasks, as `run_train`."""
     settings = load_settings(adapt_settings(arguments), arguments)
     if isinstance(settings, AdaptStateCommand):
         return _train_state(settings)
@@ -60,57 +61,43 @@ def run_adapt(arguments: list[str]) -> int:
 
 
 def run_distill(arguments: list[str]) -> int:
-    """Train a checkpoint to sample in few steps; print the report and optionally write it."""
+    """Train a checkpoint to sample in few steps, as `run_train`."""
     settings = load_settings(DistillCommand, arguments)
     network = read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
-    """Train with a progress bar of the first process, which prints the report."""
-    columns = (
-        TextColumn("training"),
-        BarColumn(),
-        TextColumn("step {task.fields[step]}  video {task.fields[video]:.3f}"),
-        TextColumn("touch {task.fields[tactile]:.3f}"),
-        TimeRemainingColumn(),
-    )
-    lines = ProgressLines("training")
-    with joined_processes() as processes, Progress(*columns, disable=not processes.is_first) as bar:
-        task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
+    lines = ProgressLines("training", has_bar=False)
 
-        def on_progress(now: TrainingProgress) -> None:
-            bar.update(
-                task,
-                completed=now.share,
-                step=now.step,
-                video=now.loss_video,
-                tactile=now.loss_tactile,
-            )
-            if processes.is_first:
-                losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
-                lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
+    def on_progress(now: TrainingProgress) -> None:
+        losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
+        lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
-        report = train(settings, on_progress, processes)
+    with joined_processes() as processes:
+        report = train(settings, on_progress if processes.is_first else None, processes)
     if report is not None:
-        print(_table(report))
-        write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
+        counts = f"{report.num_train_episodes} episodes, {report.num_heldout_episodes} held out"
+        _show(report, f"{report.steps} steps, {counts}", json_path)
     return 0
 
 
 def _train_state(settings: TrainStateCommand | AdaptStateCommand) -> int:
-    """Train a state model; print its evaluation and optionally write it to a file."""
     from services.world_model.training.state_trainer import train_state
 
     report = train_state(settings)
-    print(
-        f"{report.checkpoint}: {report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s, "
-        f"{report.num_training_episodes} episodes, {report.num_heldout_episodes} held out"
-    )
+    counts = f"{report.num_training_episodes} episodes, {report.num_heldout_episodes} held out"
+    _show(report, counts, settings.json_path)
+    return 0
+
+
+def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path | None) -> None:
+    """Print a report and optionally write it to a file."""
+    size = f"{report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s"
+    print(f"{report.checkpoint} ({report.digest[:16]}): {size}, {counts}")
     for name, value in report.metrics.items():
         print(f"{name:<36} {value:.3f}")
-    write_result(settings.json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
-    return 0
+    write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
 
 
 def run_serve(arguments: list[str]) -> int:
@@ -168,7 +155,6 @@ def run_show(arguments: list[str]) -> int:
 
 
 def _history(file: Path) -> dict[str, Any]:
-    """Metadata of a checkpoint of either kind, or of a tactile tokenizer."""
     if is_tokenizer(file):
         stored = read_tokenizer(file)
         about = stored.metadata.model_dump(mode="json", exclude={"train_scenes"})
@@ -183,16 +169,3 @@ def _history(file: Path) -> dict[str, Any]:
     digest = read_checkpoint(file).digest if small else digest_of(file)
     history = metadata.model_dump(mode="json", exclude={"train_fingerprints"})
     return {"file": file.name, "digest": digest, "form": "paper's form", **history}
-
-
-def _table(report: TrainingReport) -> str:
-    rows = [
-        ("checkpoint", str(report.checkpoint)),
-        ("digest", report.digest[:16]),
-        ("parameters", f"{report.num_parameters:,}"),
-        ("steps", f"{report.steps} in {report.cpu_s:.0f} CPU s"),
-        ("episodes", f"{report.num_train_episodes}, held out {report.num_heldout_episodes}"),
-        *((name, f"{value:.3f}") for name, value in report.metrics.items()),
-    ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)

@@ -19,18 +19,17 @@ from dextouch.serving import (
     service_config,
 )
 from services.networks.training_settings import (
-    AverageDecay,
+    AdamWSettings,
     Batch,
     CpuBudget,
     Device,
     LearningRate,
-    MaxGradientNorm,
     MaxSteps,
     Seed,
+    Share,
     Splits,
     Stores,
     WarmupSteps,
-    WeightDecay,
 )
 from services.world_model.network.configuration import (
     NetworkConfig,
@@ -50,22 +49,13 @@ from services.world_model.settings import (
 STATE: Final = "state"
 
 
-class OptimizerSettings(FrozenModel):
-    """Settings of the optimizer."""
+class OptimizerSettings(AdamWSettings):
+    """Settings of the optimizer and of the loss."""
 
-    batch: Batch = 8
-    learning_rate: LearningRate = 2e-3
-    warmup_steps: WarmupSteps = 100
-    weight_decay: WeightDecay = 0.02
-    max_gradient_norm: MaxGradientNorm = 1.0
-    ema_decay: AverageDecay = 0.995
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
-    precision: Precision = Field(
-        default="float32", description="of matrix products in training; weights keep theirs"
-    )
+    precision: Precision = Field(default="float32", description="of matrix products in training")
     touch_loss: Literal["all", "contact_or_changing"] = Field(
-        default="all",
-        description="tactile tokens that count in the loss: all, or those in contact or changing",
+        default="all", description="tactile tokens in the loss: all, or in contact or changing"
     )
 
 
@@ -79,17 +69,8 @@ class AdaptOptimizerSettings(OptimizerSettings):
 class WindowSettings(FrozenModel):
     """Sampling of training windows."""
 
-    commanded_fraction: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="share of windows with commanded actions, where available",
-    )
-    chained_fraction: float = Field(
-        default=0.3, ge=0, le=1, description="share of commanded windows anchored like later chunks"
-    )
-    short_fraction: float = Field(default=0.25, ge=0, le=1, description="share of short windows")
-    context_noise: float = Field(default=0.05, ge=0, le=1, description="noise on the first latents")
+    short_fraction: Share = Field(default=0.25, description="share of short windows")
+    context_noise: Share = Field(default=0.05, description="noise on the first latents")
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
@@ -102,8 +83,7 @@ class RunSettings(DataSettings):
     )
     name: str = Field(default="tiny", description="model name in the checkpoint")
     preset: str = Field(
-        default="tiny",
-        description=f"named settings that other flags override: {', '.join(PRESETS)}",
+        default="tiny", description=f"named settings, flags override: {', '.join(PRESETS)}"
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     cpu_budget_s: CpuBudget = 1000.0
@@ -112,10 +92,7 @@ class RunSettings(DataSettings):
     device: Device = "cpu"
     wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
     heldout_percent: int = Field(
-        default=10,
-        ge=1,
-        le=50,
-        description="percentage of episodes to evaluate on if no --heldout is given",
+        default=10, ge=1, le=50, description="percentage of episodes held out without --heldout"
     )
     evaluation_stride: int = Field(
         default=8, ge=1, description="evaluate on every n-th window of held-out episodes"
@@ -132,21 +109,15 @@ class RunSettings(DataSettings):
     state_every_cpu_s: float = Field(
         default=60.0, ge=0, description="CPU seconds between states saved for --resume"
     )
-    optimizer: OptimizerSettings = Field(
-        default=OptimizerSettings(), description="settings of the optimizer"
-    )
-    windows: WindowSettings = Field(
-        default=WindowSettings(), description="sampling of training windows"
-    )
+    optimizer: OptimizerSettings = Field(default=OptimizerSettings(), description="of training")
+    windows: WindowSettings = Field(default=WindowSettings(), description="sampling of windows")
 
 
 class TrainSettings(RunSettings):
     """Training of a network, from random weights or from those of a checkpoint."""
 
     init: Path | None = Field(
-        default=None,
-        description="checkpoint to initialize from; its network settings must be equal, except "
-        "those of sampling",
+        default=None, description="checkpoint to start from; of an equal network, but for sampling"
     )
     tokenizer: Path | None = Field(
         default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
@@ -171,7 +142,7 @@ class FromCheckpointSettings(RunSettings):
     init: Path = Field(description="checkpoint to start from")
     cpu_budget_s: CpuBudget = 300.0
     optimizer: AdaptOptimizerSettings = Field(
-        default=AdaptOptimizerSettings(), description="settings of the optimizer"
+        default=AdaptOptimizerSettings(), description="of training"
     )
 
     def training(self, network: NetworkConfig) -> TrainSettings:
@@ -181,43 +152,12 @@ class FromCheckpointSettings(RunSettings):
         return TrainSettings(**given, init=self.init, network=network)
 
 
-class AdaptSettings(AdaptationSettings, FromCheckpointSettings):
-    """Adaptation of a trained model to new tasks.
-
-    The network, its codecs and its normalizers are those of the checkpoint; human and robot
-    episodes may be of the same tasks, but not of those that the checkpoint was trained on.
-    """
-
-    init: Path = Field(description="checkpoint to adapt")
-
-
-class DistillSettings(FromCheckpointSettings):
-    """Training of a checkpoint to sample in few steps, on its own contexts and samples.
-
-    The network, its codecs and its normalizers are those of the checkpoint.
-    """
-
-    steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
-    output: Path = Field(
-        default=Path("runs/world_model/distilled.safetensors"), description="checkpoint to write"
-    )
-    name: str = Field(default="distilled", description="model name in the checkpoint")
-
-    def training(self, network: NetworkConfig) -> TrainSettings:
-        """The same run as training of a network from its checkpoint."""
-        few = network.model_copy(update={"sampling_steps": self.steps, "sampler": "euler"})
-        return super().training(few).model_copy(update={"self_forcing": True})
-
-
 class TokenizerOptimizer(FrozenModel):
     """Settings of the optimizer."""
 
     batch: Batch = 128
     learning_rate: LearningRate = 6e-3
     warmup_steps: WarmupSteps = 50
-    weight_decay: WeightDecay = 0.0
-    max_gradient_norm: MaxGradientNorm = 1.0
-    ema_decay: AverageDecay = 0.99
 
 
 class TrainTokenizerSettings(FrozenModel):
@@ -227,8 +167,7 @@ class TrainTokenizerSettings(FrozenModel):
     splits: Splits = ()
     tokenizer: TokenizerName = Field(
         default="split_hands",
-        description="split_hands (the paper's), grid (its baseline), or principal_axes, which is "
-        "fitted without steps",
+        description="split_hands (the paper's), grid (its baseline), or principal_axes",
     )
     output: Path = Field(
         default=Path("runs/world_model/tokenizer.safetensors"), description="file to write"
@@ -248,15 +187,9 @@ class TrainTokenizerSettings(FrozenModel):
         default=112, ge=1, le=240, description="latents per palm pad of principal_axes"
     )
     tactile_channels: int = Field(
-        default=192,
-        ge=6,
-        le=1920,
-        multiple_of=6,
-        description="latents per hand of split_hands and grid",
+        default=192, ge=6, le=1920, multiple_of=6, description="latents per hand of the others"
     )
-    optimizer: TokenizerOptimizer = Field(
-        default=TokenizerOptimizer(), description="settings of the optimizer"
-    )
+    optimizer: TokenizerOptimizer = Field(default=TokenizerOptimizer(), description="of training")
 
     def network(self) -> NetworkConfig:
         """Network configuration with this tokenizer and one token per hand."""
@@ -309,8 +242,11 @@ class TrainCommand(CommandSettings, TrainSettings):
         return (*given, PresetSource(settings_cls))
 
 
-class AdaptCommand(CommandSettings, AdaptSettings):
+class AdaptCommand(CommandSettings, AdaptationSettings, FromCheckpointSettings):
     """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
+
+    The network, its codecs and its normalizers are those of the checkpoint; human and robot
+    episodes may be of the same tasks, but not of those that the checkpoint was trained on.
 
     Example:
       dextouch train adapt --init runs/paper.safetensors --episodes runs/new --robot-episodes 200
@@ -318,11 +254,14 @@ class AdaptCommand(CommandSettings, AdaptSettings):
 
     model_config = service_config("world_model_adapt", "dextouch train adapt")
 
+    init: Path = Field(description="checkpoint to adapt")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class DistillCommand(CommandSettings, DistillSettings):
+class DistillCommand(CommandSettings, FromCheckpointSettings):
     """Train a world model in the paper's form to sample in few steps, by self-forcing.
+
+    The network, its codecs and its normalizers are those of the checkpoint.
 
     Example:
       dextouch train distill --init runs/paper.safetensors --steps 1 --episodes runs/episodes
@@ -330,7 +269,17 @@ class DistillCommand(CommandSettings, DistillSettings):
 
     model_config = service_config("world_model_distill", "dextouch train distill")
 
+    steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
+    output: Path = Field(
+        default=Path("runs/world_model/distilled.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="distilled", description="model name in the checkpoint")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+    def training(self, network: NetworkConfig) -> TrainSettings:
+        """The same run as training of a network from its checkpoint."""
+        few = network.model_copy(update={"sampling_steps": self.steps, "sampler": "euler"})
+        return super().training(few).model_copy(update={"self_forcing": True})
 
 
 class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):
@@ -345,9 +294,7 @@ class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):
     picture: Path | None = Field(
         default=None, description="SVG to draw: held-out error and Contact-IoU over training steps"
     )
-    beside: tuple[Path, ...] = Field(
-        default=(), description="files of other tokenizers to draw in the picture, too"
-    )
+    beside: tuple[Path, ...] = Field(default=(), description="other tokenizers to draw, too")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 

@@ -18,18 +18,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
-from services.world_model.network.configuration import (
-    NetworkConfig,
-    Precision,
-    WanConfig,
-    num_latents,
-)
+from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import MAX_WORDS, key_of
-from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
+from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
 
 _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
 # Text encoder of the published model, UMT5-XXL.
@@ -63,8 +57,8 @@ class Plan:
     """What one action chunk of one rollout needs.
 
     `kept_bytes` is what the sampler's steps share: keys and values of clean tokens, and conditions.
-    `training_bytes` are weights, gradients, two moments of AdamW and the average
-    of the weights; activations come on top.
+    `training_bytes` are weights, gradients, two moments of AdamW and the average of the weights;
+    activations come on top.
     """
 
     num_steps: int
@@ -76,19 +70,10 @@ class Plan:
     training_bytes: int
 
     @property
-    def weight_bytes(self) -> int:
-        """Memory of all weights."""
-        return sum(part.memory_bytes for part in self.parts)
-
-    @property
     def peak_bytes(self) -> int:
         """Weights, what is kept, and the most memory that a computation takes."""
-        return self.weight_bytes + self.kept_bytes + max(work.memory_bytes for work in self.work)
-
-    @property
-    def flops(self) -> int:
-        """FLOPs of one action chunk."""
-        return sum(work.times * work.flops for work in self.work)
+        weight_bytes = sum(part.memory_bytes for part in self.parts)
+        return weight_bytes + self.kept_bytes + max(work.memory_bytes for work in self.work)
 
 
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -135,37 +120,33 @@ def plan_table(config: NetworkConfig) -> str:
     if config.wan is not None:
         sizes = {one: config.wan.model_copy(update={"precision": one}) for one in _PRECISIONS}
         plans = {one: plan_of(config.model_copy(update={"wan": wan})) for one, wan in sizes.items()}
-    first, *_ = plans.values()
+    columns = list(plans.values())
+    first = columns[0]
 
     def row(name: str, amount: str, sizes: Iterable[int]) -> str:
-        columns = "".join(f"{size / 1e9:>15.3f} GB" for size in sizes)
-        return f"{name:<38}{amount:>18}{columns}"
+        return f"{name:<38}{amount:>18}" + "".join(f"{size / 1e9:>15.3f} GB" for size in sizes)
 
+    weights = [
+        row(f"  {one.name}", f"{one.num_weights:,}", (p.parts[i].memory_bytes for p in columns))
+        for i, one in enumerate(first.parts)
+    ]
+    times = [f"{one.times} x {one.flops / 1e9:,.2f} GF" for one in first.work]
+    work = [
+        row(f"  {one.name}", times[i], (p.work[i].memory_bytes for p in columns))
+        for i, one in enumerate(first.work)
+    ]
+    flops = sum(one.times * one.flops for one in first.work)
     return "\n".join(
         [
             f"one action chunk of {first.num_steps} steps, {first.num_video_tokens} video and "
             f"{first.num_tactile_tokens} tactile tokens",
             f"{'weights':<38}{'':>18}" + "".join(f"{name:>18}" for name in plans),
-            *(
-                row(
-                    f"  {part.name}",
-                    f"{part.num_weights:,}",
-                    (plan.parts[index].memory_bytes for plan in plans.values()),
-                )
-                for index, part in enumerate(first.parts)
-            ),
+            *weights,
             "work, with memory beside the weights",
-            *(
-                row(
-                    f"  {work.name}",
-                    f"{work.times} x {work.flops / 1e9:,.2f} GF",
-                    (plan.work[index].memory_bytes for plan in plans.values()),
-                )
-                for index, work in enumerate(first.work)
-            ),
-            row("all", f"{first.flops / 1e9:,.2f} GF", (p.peak_bytes for p in plans.values())),
-            row("shared by sampler steps", "", (plan.kept_bytes for plan in plans.values())),
-            row("training, without activations", "", (p.training_bytes for p in plans.values())),
+            *work,
+            row("all", f"{flops / 1e9:,.2f} GF", (plan.peak_bytes for plan in columns)),
+            row("shared by sampler steps", "", (plan.kept_bytes for plan in columns)),
+            row("training, without activations", "", (plan.training_bytes for plan in columns)),
         ]
     )
 
@@ -176,6 +157,7 @@ def plan_of(config: NetworkConfig) -> Plan:
     with torch.device("meta"), torch.no_grad():
         model = JointWorldModel(config).eval()
         work, kept_bytes = _work(model, 1 + steps)
+        learned = {n: p for n, p in model.named_parameters() if p.requires_grad}
         return Plan(
             num_steps=steps,
             num_video_tokens=num_latents(1 + steps) * config.tokens_per_latent,
@@ -183,7 +165,8 @@ def plan_of(config: NetworkConfig) -> Plan:
             parts=_parts(model),
             work=work,
             kept_bytes=kept_bytes,
-            training_bytes=_training(model),
+            # Gradient and two moments of each learned weight; the average copies the whole model.
+            training_bytes=2 * memory_of(model.state_dict()) + 3 * memory_of(learned),
         )
 
 
@@ -196,23 +179,19 @@ def _parts(model: JointWorldModel) -> tuple[Part, ...]:
         "visual codec": [model.codec],
         "tactile tokenizer": [model.tokenizer],
     }
-    parts = [_part(name, nn.ModuleList(modules)) for name, modules in groups.items()]
     wan = model.config.wan
     if wan is not None and wan.text_width == _TEXT_ENCODER["d_model"]:
-        parts.append(_part("text encoder (once per instruction)", _text_encoder(wan)))
+        from transformers import UMT5Config, UMT5EncoderModel
+
+        encoder = UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
+        groups["text encoder (once per instruction)"] = [encoder]
+    parts = []
+    for name, group in groups.items():
+        modules = nn.ModuleList(group)
+        # Shared weights are counted once.
+        tensors = {**dict(modules.named_parameters()), **dict(modules.named_buffers())}
+        parts.append(Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors)))
     return tuple(parts)
-
-
-def _part(name: str, module: nn.Module) -> Part:
-    # Shared weights are counted once.
-    tensors = {**dict(module.named_parameters()), **dict(module.named_buffers())}
-    return Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors))
-
-
-def _text_encoder(wan: WanConfig) -> nn.Module:
-    from transformers import UMT5Config, UMT5EncoderModel
-
-    return UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
 
 
 def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
@@ -229,34 +208,28 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
         first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
         first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
     )
-    context = model.with_clean_tokens(model.context(inputs, first), noisy)
+
+    def shared() -> Context:
+        return model.with_clean_tokens(model.context(inputs, first), noisy)
+
+    context, steps = shared(), config.sampling_steps
     jobs: dict[str, tuple[int, Callable[[], Any]]] = {
         "encode the first image": (1, lambda: model.first_latents(inputs)),
-        "what sampler steps share": (
-            1,
-            lambda: model.with_clean_tokens(model.context(inputs, first), noisy),
-        ),
-        "one sampler step": (
-            config.sampling_steps,
-            lambda: model.denoise(context, noisy, torch.ones(1)),
-        ),
+        "what sampler steps share": (1, shared),
+        "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
         "decode all images": (1, lambda: model.decode(first, noisy)),
     }
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
-    given = [*model.parameters(), *model.buffers(), *kept.values()]
-    work = tuple(_measured(given, name, *job) for name, job in jobs.items())
-    return work, memory_of(kept)
-
-
-def _measured(given: Iterable[Tensor], name: str, times: int, run: Callable[[], Any]) -> Work:
-    """FLOPs and new memory of a computation on tensors that are given."""
-    with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
-        run()
-    return Work(name, times, counter.get_total_flops(), memory.peak_bytes)
+    work = []
+    for name, (times, run) in jobs.items():
+        given = (*model.parameters(), *model.buffers(), *kept.values())
+        with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
+            run()
+        work.append(Work(name, times, counter.get_total_flops(), memory.peak_bytes))
+    return tuple(work), memory_of(kept)
 
 
 def _tensors_of(kept: object) -> list[Tensor]:
-    """Tensors of nested dataclasses and tuples."""
     if isinstance(kept, Tensor):
         return [kept]
     if is_dataclass(kept):
@@ -268,17 +241,11 @@ def _tensors_of(kept: object) -> list[Tensor]:
     return []
 
 
-def _training(model: JointWorldModel) -> int:
-    learned = {n: p for n, p in model.named_parameters() if p.requires_grad}
-    # Gradient and two moments of each learned weight; the average copies the whole model.
-    return 2 * memory_of(model.state_dict()) + 3 * memory_of(learned)
-
-
 def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
     cells = config.raster_cells
     return ModelInputs(
         first_image=torch.zeros(1, config.image_px, config.image_px, 3, dtype=torch.uint8),
-        first_tactile_kpa=torch.zeros(1, 2, NUM_TAXELS),
+        first_tactile_kpa=torch.zeros(1, 2, config.tactile_layout.num_taxels),
         hands=torch.zeros(1, num_steps, 2, HAND_DIM),
         camera=torch.zeros(1, num_steps, 2, CAMERA_DIM),
         layout=torch.zeros(1, 2, CAMERA_DIM),

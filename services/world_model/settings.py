@@ -18,7 +18,9 @@ from services.networks.training_settings import (
     Device,
     ImagePx,
     LearningRate,
+    NonNegative,
     NumSteps,
+    Share,
     Splits,
     Stores,
     Tasks,
@@ -31,22 +33,17 @@ from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpo
 
 
 class DataSettings(FrozenModel):
-    """Which episodes of people and robots a world model of either form is trained on.
+    """Episodes of people and robots that a world model of either form is trained on.
 
-    With `human` stores, only robot episodes are taken from `episodes` and `heldout`, and only human
-    ones from `human`.
+    With `human` stores, `episodes` and `heldout` give robot episodes alone, and `human` human ones.
     """
 
     human: tuple[str, ...] = Field(
         default=(), description="stores (folder or file:// URL) with human episodes to mix in"
     )
-    human_share: float = Field(
-        default=0.5, ge=0, le=1, description="share of training examples from human episodes"
-    )
+    human_share: Share = Field(default=0.5, description="share of examples from human episodes")
     robot_episodes: int | None = Field(
-        default=None,
-        ge=1,
-        description="number of episodes of `episodes` to train on, by hash; more contain fewer",
+        default=None, ge=1, description="number of `episodes` to train on; more contain fewer"
     )
     human_episodes: int | None = Field(
         default=None, ge=0, description="number of human episodes, in the same way"
@@ -90,7 +87,7 @@ class ReaderSettings(FrozenModel):
     batch: Batch = 32
     learning_rate: LearningRate = 2e-3
     ema_decay: AverageDecay = 0.995
-    first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of first steps")
+    first_fraction: Share = Field(default=0.6, description="share of first steps")
     bfloat16: bool | None = Field(
         default=None, description="convolve in bfloat16; default: if that is faster here"
     )
@@ -99,11 +96,11 @@ class ReaderSettings(FrozenModel):
 class CoreLossWeights(FrozenModel):
     """Weights of a core's training targets; 0 disables one."""
 
-    objects: float = Field(default=1.0, ge=0, description="weight of object positions and axes")
-    touch: float = Field(default=6.0, ge=0, description="weight of touch latents")
-    contact: float = Field(default=0.5, ge=0, description="weight of pad contact")
-    taxels: float = Field(default=2.0, ge=0, description="weight of taxel contact")
-    success: float = Field(default=1.0, ge=0, description="weight of final task success")
+    objects: NonNegative = Field(default=1.0, description="weight of object positions and axes")
+    touch: NonNegative = Field(default=6.0, description="weight of touch latents")
+    contact: NonNegative = Field(default=0.5, description="weight of pad contact")
+    taxels: NonNegative = Field(default=2.0, description="weight of taxel contact")
+    success: NonNegative = Field(default=1.0, description="weight of final task success")
 
 
 class CoreSettings(FrozenModel):
@@ -114,23 +111,18 @@ class CoreSettings(FrozenModel):
     learning_rate: LearningRate = 2e-3
     weight_decay: WeightDecay = 0.05
     ema_decay: AverageDecay = 0.99
-    first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of whole episodes")
-    measured_fraction: float = Field(
-        default=0.15, ge=0, le=1, description="share of examples with measured actions"
+    first_fraction: Share = Field(default=0.6, description="share of whole episodes")
+    held_fraction: Share = Field(
+        default=0.04, description="share of examples with hands held still"
     )
-    held_fraction: float = Field(
-        default=0.04, ge=0, le=1, description="share of examples with the hands held still"
+    pose_noise_m: NonNegative = Field(
+        default=0.012, description="largest noise on true start poses"
     )
-    pose_noise_m: float = Field(
-        default=0.012, ge=0, description="largest noise on ground-truth start poses"
-    )
-    weights: CoreLossWeights = Field(
-        default=CoreLossWeights(), description="weights of the training targets"
-    )
+    weights: CoreLossWeights = Field(default=CoreLossWeights(), description="weights of targets")
 
 
-# What is trained of a state model that a training starts from; its other parts are kept. "readers"
-# are the start readers and the estimate of success, "success" is that estimate alone.
+# What is trained of an initial state model: all but its codec; readers and the estimate of success;
+# or that estimate alone.
 Learned = Literal["all", "readers", "success"]
 
 
@@ -141,8 +133,7 @@ class StateTrainSettings(DataSettings):
     tasks: Tasks = ()
     clicks: Path | None = Field(
         default=None,
-        description="JSON file of the tasks' objects: how hands touch them, and clicks on them, "
-        "beside those that the dashboard stored (docs/objects.md)",
+        description="JSON file of objects: how hands touch them, and clicks (docs/objects.md)",
     )
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
@@ -153,8 +144,8 @@ class StateTrainSettings(DataSettings):
     )
     learn: Learned = Field(
         default="all",
-        description="of --init: all but its touch codec; readers, that is start readers and the "
-        "estimate of success, for new tasks from few takes; or the estimate of success alone",
+        description="of --init: all but its touch codec; start readers and the estimate of "
+        "success, for new tasks from few takes; or that estimate alone",
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
@@ -164,20 +155,13 @@ class StateTrainSettings(DataSettings):
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
     image_px: ImagePx = USUAL_IMAGE_PX
     labelled_share: float = Field(
-        default=1.0,
-        gt=0,
-        le=1,
-        description="share of scenes that train object poses; touch and success use all",
+        default=1.0, gt=0, le=1, description="share of scenes that train object poses"
     )
     width: int = Field(default=192, ge=8, le=1024, description="width of the recurrent cores")
-    reader: ReaderSettings = Field(
-        default=ReaderSettings(), description="training of start readers"
-    )
+    reader: ReaderSettings = Field(default=ReaderSettings(), description="training of readers")
     core: CoreSettings = Field(default=CoreSettings(), description="training of recurrent cores")
     renderer: RendererConfig = Field(default=RendererConfig(), description="shape of the renderer")
-    drawing: RendererTraining = Field(
-        default=RendererTraining(), description="training of the renderer"
-    )
+    drawing: RendererTraining = Field(default=RendererTraining(), description="its training")
 
 
 class AdaptReaderSettings(ReaderSettings):
@@ -201,12 +185,8 @@ class StateAdaptSettings(AdaptationSettings, StateTrainSettings):
     """
 
     init: Path = Field(description="checkpoint to adapt")
-    reader: AdaptReaderSettings = Field(
-        default=AdaptReaderSettings(), description="training of start readers"
-    )
-    core: AdaptCoreSettings = Field(
-        default=AdaptCoreSettings(), description="training of recurrent cores"
-    )
+    reader: AdaptReaderSettings = Field(default=AdaptReaderSettings(), description="of readers")
+    core: AdaptCoreSettings = Field(default=AdaptCoreSettings(), description="of recurrent cores")
 
 
 class TrainStateCommand(CommandSettings, StateTrainSettings):
@@ -254,12 +234,10 @@ class Placement(FrozenModel):
     )
     text: WanFiles = Field(
         default=WanFiles(),
-        description="files of the text encoder, for instructions that a checkpoint does not know",
+        description="text encoder, for instructions that are not in a checkpoint",
     )
     max_file_gb: float | None = Field(
-        default=None,
-        gt=0,
-        description="largest checkpoint; default: 64 MiB, for the full size the available memory",
+        default=None, gt=0, description="largest checkpoint; default: 64 MiB, at full size memory"
     )
 
 
@@ -275,8 +253,7 @@ class ShowCommand(CommandSettings):
 
     checkpoint: Path = Field(default=PRETRAINED, description="checkpoint, or folder of checkpoints")
     plan: CliImplicitFlag[bool] = Field(
-        default=False,
-        description="print memory and FLOPs per action chunk instead, for the paper's form",
+        default=False, description="print memory and FLOPs instead, for the paper's form"
     )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
@@ -304,8 +281,7 @@ class WorldModelSettings(WorldServiceSettings):
     )
     objects: Path | None = Field(
         default=None,
-        description="state model that finds the objects for a flow-matching model with contact "
-        "geometry (default: the package's)",
+        description="state model whose readers find objects for contact geometry (default: ours)",
     )
     placement: Placement = Field(
         default=Placement(), description="device and precision of a flow-matching model"
@@ -318,9 +294,12 @@ def recorded_command(
 ) -> str:
     """Command that repeats a run: every setting that differs from its default, but for `left_out`.
 
-    Of the `places`, settings that name stores and files, the last path component is given, since
-    folders differ between machines.
+    Of `places`, stores and files, the last path component is given: folders differ by machine.
     """
+
+    def last_name(url: str) -> str:
+        return url.rstrip("/").rsplit("/", 1)[-1]
+
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     known = {name: given.pop(name) for name in places if name in given}
     return " ".join([command, *flags_of(known, last_name), *flags_of(given)])
@@ -341,8 +320,3 @@ def flags_of(
             values = value if isinstance(value, list) else [value]
             flags += [f"--{flag}={shown(str(one))}" for one in values]
     return flags
-
-
-def last_name(url: str) -> str:
-    """Last component of a path or URL."""
-    return url.rstrip("/").rsplit("/", 1)[-1]

@@ -20,6 +20,7 @@ from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, c
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA, unpack
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import BOX_AXES, hand_motion, poses_from_objects
 from services.world_model.dynamics.model import first_steps, mean_poses
@@ -34,12 +35,12 @@ MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 class ObservedStart:
     """The step that a rollout begins with; its arrays are copies.
 
-    Touch is clipped at zero; the pose parts of `reached` are the identity, since actions are
-    relative to the poses of step 0.
+    Touch is clipped at zero; `reached` is relative to the poses of step 0, so its poses are the
+    identity.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
+    tactile_kpa: Float32[np.ndarray, "2 taxels"]
     reached: Float64[np.ndarray, "67"]
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
@@ -59,17 +60,18 @@ class ObservedStart:
 
 
 def observed_start(
-    start: RolloutStart, *, tasks: Sequence[str], image_px: int | None = None
+    start: RolloutStart,
+    *,
+    tasks: Sequence[str],
+    layout: TactileLayout = DEXTOUCH_V1,
+    image_px: int | None = None,
 ) -> ObservedStart:
-    """Validate the observed step of a start.
-
-    `image_px` is the side that the middle square of the image is scaled to; None leaves it as it
-    is.
+    """Validate the observed step of a start, and scale its image's middle square to `image_px`.
 
     Raises:
         InvalidInputError: missing observation, anchor or K_head.
         UnknownNameError: unknown task, or no head camera image.
-        ShapeError: more than one observed step.
+        ShapeError: more than one observed step, or touch of another glove layout.
         NonFiniteError: NaN or infinity in touch.
     """
     if start.task not in tasks:
@@ -84,6 +86,12 @@ def observed_start(
         raise UnknownNameError("camera of the start", "none of them", [HEAD_CAMERA])
     if len(observation) != 1:
         raise ShapeError(f"start: got {len(observation)} observed steps, expected one")
+    if observation.tactile_kpa.shape[-1] != layout.num_taxels:
+        raise ShapeError(
+            f"start: got touch of {observation.tactile_kpa.shape[-1]} taxels, expected "
+            f"{layout.num_taxels} of the glove layout {layout.name!r}, which this world was "
+            "trained with; start from an episode of that glove"
+        )
     if not np.isfinite(observation.tactile_kpa).all():
         raise NonFiniteError("start: touch contains NaN or infinity; mask the faulty taxels first")
     reached = observation.action_reached[-1].copy()
@@ -203,10 +211,7 @@ def refuse_non_finite(model: str, predicted: Mapping[str, Tensor]) -> None:
 
 
 class SceneReader:
-    """Finds the objects of requests, for a model that is conditioned on contact geometry.
-
-    The start readers of a state model are averaged.
-    """
+    """Finds objects for a model with contact geometry, by the mean of a state model's readers."""
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
         self._readers = checkpoint.dynamics.readers()
@@ -232,6 +237,7 @@ class SceneReader:
             [request.first_tactile_kpa for request in requests],
             hands,
             [self.tasks.index(task) for task in tasks],
+            self._metadata.dynamics.tactile_layout,
         )
         readings = [reader(first) for reader in self._readers]
         poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))

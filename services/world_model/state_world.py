@@ -20,6 +20,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
+from services.world_model import starts
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -50,16 +51,6 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
-from services.world_model.starts import (
-    ObservedStart,
-    check_geometry,
-    checked_chunk,
-    checked_selectors,
-    foreign_snapshot,
-    observed_start,
-    opened_snapshot,
-    refuse_non_finite,
-)
 
 MAX_SNAPSHOT_BYTES = 2**20
 MAX_CHUNK_STEPS = 64
@@ -128,6 +119,7 @@ class StateWorld(BatchWorld[StateRollout]):
             max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
             scales_images=True,
+            tactile_layout=config.layout,
         )
 
     @property
@@ -143,18 +135,23 @@ class StateWorld(BatchWorld[StateRollout]):
             UnknownNameError: a task or action kind that the model was not trained on.
             InvalidInputError: missing or invalid observation, anchor or K_head.
         """
-        first = observed_start(
-            start, tasks=self._description.tasks, image_px=self._metadata.dynamics.image_px
+        first = starts.observed_start(
+            start,
+            tasks=self._description.tasks,
+            layout=self._metadata.dynamics.tactile_layout,
+            image_px=self._metadata.dynamics.image_px,
         )
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
+        task = self._description.tasks.index(start.task)
         memory = self._dynamics.begin(
             first_steps(
                 [first.image],
                 [first.K_head],
                 [first.tactile_kpa],
                 [motion],
-                [self._description.tasks.index(start.task)],
+                [task],
+                self._metadata.dynamics.tactile_layout,
             ),
             torch.from_numpy(first.tactile_kpa)[None],
             Commands.holding([motion]),
@@ -173,9 +170,9 @@ class StateWorld(BatchWorld[StateRollout]):
         seen = first.observation(self._poses(memory.poses, start.task))
         return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
-    def _check_start(self, start: RolloutStart, first: ObservedStart) -> None:
-        """Run the checks shared by all world models; hands and camera must be within reach."""
-        check_geometry(first.anchor, first.K_head)
+    def _check_start(self, start: RolloutStart, first: starts.ObservedStart) -> None:
+        """Checks of all world models: hands and camera must be within reach."""
+        starts.check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
             first_image=first.image,
             first_tactile_kpa=first.tactile_kpa,
@@ -185,7 +182,9 @@ class StateWorld(BatchWorld[StateRollout]):
             anchor=first.anchor,
             K_head=first.K_head,
         )
-        build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
+        config = self._metadata.dynamics
+        limits = NetworkConfig(image_px=config.image_px).with_layout(config.tactile_layout)
+        build_inputs([request], limits)
 
     @torch.inference_mode()
     def step_batch(
@@ -204,10 +203,10 @@ class StateWorld(BatchWorld[StateRollout]):
             EndedError: the hands have moved four times as long as any episode of training.
             UnavailableError: the model predicts NaN or infinity.
         """
-        requested = checked_selectors(states, actions, seeds, selectors)
+        requested = starts.checked_selectors(states, actions, seeds, selectors)
         for state in states:
             self._refuse_ended(state)
-        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
+        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         for chunk in chunks:
             check_reach(chunk)
         motions = [
@@ -221,7 +220,7 @@ class StateWorld(BatchWorld[StateRollout]):
             "objects' place": imagined.poses.position_m,
             "objects' direction": imagined.poses.axes,
         }
-        refuse_non_finite("state model", checked)
+        starts.refuse_non_finite("state model", checked)
         answers = [
             self._answer(
                 replace(
@@ -236,7 +235,16 @@ class StateWorld(BatchWorld[StateRollout]):
             )
             for index, state in enumerate(states)
         ]
-        return self._drawn(answers)
+        images = iter(self._renderer.draw_all([drawing for _, drawing in answers if drawing]))
+        return [
+            stepped
+            if drawing is None
+            else replace(
+                stepped,
+                observation=replace(stepped.observation, images={HEAD_CAMERA: next(images)}),
+            )
+            for stepped, drawing in answers
+        ]
 
     def _refuse_ended(self, state: StateRollout) -> None:
         limit = LAST_HORIZONS * self._metadata.bounds.horizon_latents
@@ -274,12 +282,8 @@ class StateWorld(BatchWorld[StateRollout]):
         return SteppedRollout(state, observation), drawing
 
     def _drawing(
-        self,
-        state: StateRollout,
-        actions: Float64[np.ndarray, "n 67"],
-        poses: Float32[np.ndarray, "n objects 7"],
+        self, state: StateRollout, actions: np.ndarray, poses: Float32[np.ndarray, "n objects 7"]
     ) -> Drawing:
-        """Steps of a rollout to draw, with hands and objects at the given poses."""
         actions = np.concatenate([state.first_reached[None], actions])
         first = self._poses(mean_poses(state.memory.start.objects), state.task)
         poses = np.concatenate([first, poses])
@@ -290,27 +294,8 @@ class StateWorld(BatchWorld[StateRollout]):
         boxes_m = boxes_m * size[:, BOX_AXES]
         return Drawing(state.image, state.K_head, states, boxes_m)
 
-    def _drawn(
-        self, answers: Sequence[tuple[SteppedRollout[StateRollout], Drawing | None]]
-    ) -> list[SteppedRollout[StateRollout]]:
-        """The answers with their images, all drawn together."""
-        images = iter(self._renderer.draw_all([drawing for _, drawing in answers if drawing]))
-        return [
-            stepped
-            if drawing is None
-            else replace(
-                stepped,
-                observation=replace(stepped.observation, images={HEAD_CAMERA: next(images)}),
-            )
-            for stepped, drawing in answers
-        ]
-
     def _uncertainty(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Uncertainty:
-        """Uncertainty of a chunk.
-
-        `distance` is of the hands' motion alone; of the start image count which objects are found,
-        their sizes and where the members' readers disagree, but not the readers' own `sd_m`.
-        """
+        """`distance` is of the hands' motion alone, and no part uses the readers' own `sd_m`."""
         bounds = self._metadata.bounds
         # Of the worst latent step, independent of the chunk length.
         disagreement_m = float(steps.disagreement_m[index].max())
@@ -333,6 +318,9 @@ class StateWorld(BatchWorld[StateRollout]):
             reason = f"hands are {times:.1f} times as far from training as allowed"
         elif not self._knows_instruction(state):
             reason = "the instruction is none of training"
+        # Of movable objects, as a share of the usual size.
+        movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
+        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
         success = steps.success[:, index, -1]
         return Uncertainty(
             disagreement=disagreement_m,
@@ -341,21 +329,14 @@ class StateWorld(BatchWorld[StateRollout]):
             reason=reason,
             success_probability=float(success.logit(1e-6).mean().sigmoid()),
             success_spread=float(success.max() - success.min()),
-            size_deviation=self._size_deviation(state),
+            size_deviation=float(deviations.max()),
         )
 
     def _knows_instruction(self, state: StateRollout) -> bool:
-        """Whether the model reads no instruction, or was trained with that of the rollout."""
         cosines = functional.cosine_similarity(
             self._instructions, state.memory.start.instruction[0], dim=1
         )
         return not self._instructions.numel() or float(cosines.max()) > _SAME_INSTRUCTION
-
-    def _size_deviation(self, state: StateRollout) -> float:
-        """Largest deviation of a movable object's size from the usual one, as a share of it."""
-        movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
-        deviations = (state.memory.start.size.mean(0)[0] - 1.0).abs() * movable[:, None]
-        return float(deviations.max())
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
         """Poses of the task's objects; absent ones lie below the table."""
@@ -366,13 +347,8 @@ class StateWorld(BatchWorld[StateRollout]):
 
     def snapshot(self, state: StateRollout) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
-        fields = {
-            "digest": self._digest,
-            "task": state.task,
-            "action_kind": state.action_kind,
-            "step": state.step,
-            "num_moving": state.num_moving,
-        }
+        names = ("task", "action_kind", "step", "num_moving")
+        fields = {"digest": self._digest, **{name: getattr(state, name) for name in names}}
         arrays = {
             "image": state.image,
             "anchor": np.stack(state.anchor.as_tuple()),
@@ -388,7 +364,7 @@ class StateWorld(BatchWorld[StateRollout]):
             InvalidInputError: not a snapshot of this checkpoint.
             NonFiniteError: NaN or infinity.
         """
-        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")
         size = (config.image_px, config.image_px, 3)
@@ -396,15 +372,13 @@ class StateWorld(BatchWorld[StateRollout]):
         if (
             name not in config.tasks
             or fields.get("action_kind") not in ACTION_KINDS
-            or not isinstance(step, int)
-            or not isinstance(moving, int)
-            or min(step, moving) < 0
+            or not (isinstance(step, int) and isinstance(moving, int) and min(step, moving) >= 0)
             or arrays.get("image", np.zeros(0)).dtype != np.uint8
             or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
         ):
-            raise foreign_snapshot(fields, arrays)
+            raise starts.foreign_snapshot(fields, arrays)
         anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-        check_geometry(anchor, K_head)
+        starts.check_geometry(anchor, K_head)
         memory = memory_from_arrays(arrays, config, self._metadata.num_members)
         if int(memory.start.task[0, 0]) != config.tasks.index(name):
             raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")

@@ -20,28 +20,13 @@ from dextouch.schemas import (
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
 from services.networks.weight_files import on_device
-from services.world_model.checkpoints import (
-    Checkpoint,
-    is_state_checkpoint,
-    read_checkpoint,
-    read_state_checkpoint,
-)
-from services.world_model.network.configuration import Precision, Sampler
+from services.world_model import checkpoints, starts
+from services.world_model.network.configuration import GloveNetworkConfig, Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Sampling, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.starts import (
-    ObservedStart,
-    SceneReader,
-    checked_chunk,
-    checked_selectors,
-    foreign_snapshot,
-    observed_start,
-    opened_snapshot,
-    refuse_non_finite,
-)
 from services.world_model.state_world import StateWorld
 
 MAX_SNAPSHOT_BYTES = 4 * 2**20
@@ -49,7 +34,7 @@ _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
 
 
 @dataclass(frozen=True)
-class ModelState(ObservedStart):
+class ModelState(starts.ObservedStart):
     """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0."""
 
     instruction: str
@@ -62,8 +47,7 @@ class ModelWorld(BatchWorld[ModelState]):
     """A flow-matching model as a world.
 
     Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
-    products; codecs are always float32. A model that is conditioned on contact geometry needs a
-    `reader`, which finds the objects of every chunk's first step.
+    products; codecs are float32. With contact geometry, `reader` finds objects at a chunk's start.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks.
@@ -71,11 +55,11 @@ class ModelWorld(BatchWorld[ModelState]):
 
     def __init__(
         self,
-        checkpoint: Checkpoint,
+        checkpoint: checkpoints.Checkpoint,
         *,
         sampling: Sampling | None = None,
         precision: Precision = "float32",
-        reader: SceneReader | None = None,
+        reader: starts.SceneReader | None = None,
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
@@ -103,6 +87,9 @@ class ModelWorld(BatchWorld[ModelState]):
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
             predicts_touch=config.use_touch,
+            tactile_layout=(
+                config.tactile_layout if isinstance(config, GloveNetworkConfig) else None
+            ),
         )
 
     @property
@@ -118,7 +105,9 @@ class ModelWorld(BatchWorld[ModelState]):
             InvalidInputError: missing or invalid observation, anchor or K_head; an instruction that
                 the full size neither knows nor can encode.
         """
-        first = observed_start(start, tasks=self._description.tasks)
+        first = starts.observed_start(
+            start, tasks=self._description.tasks, layout=self._model.config.tactile_layout
+        )
         state = ModelState(
             **vars(first),
             instruction=start.instruction,
@@ -126,11 +115,9 @@ class ModelWorld(BatchWorld[ModelState]):
             step=0,
             task=start.task,
         )
-        # The checks of a chunk, so that they fail here rather than at the first one.
         if self._model.text_features is not None:
             self._model.text_features.of(start.instruction)
-        holding = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
-        build_inputs(self._requests([state], [holding]), self._model.config)
+        self._check_chunk(state)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
     def step_batch(
@@ -151,28 +138,23 @@ class ModelWorld(BatchWorld[ModelState]):
             InvalidInputError: physically impossible actions.
             UnavailableError: the model returned NaN or infinity.
         """
-        requested = checked_selectors(states, actions, seeds, selectors)
-        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
+        requested = starts.checked_selectors(states, actions, seeds, selectors)
+        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         requests = self._requests(states, chunks)
         inputs = build_inputs(requests, self._model.config)
-        noise = stack_noise(
-            [
-                self._model.noise(inputs.num_steps, torch.Generator().manual_seed(seed))
-                for seed in seeds
-            ]
-        )
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        noise = stack_noise([self._model.noise(inputs.num_steps, each) for each in generators])
         wanted = any(one.steps == "all" and one.wants(HEAD_CAMERA) for one in requested)
         future = self._model.predict(
             inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
         )
-        refuse_non_finite("world model", {"image": future.images, "touch": future.tactile_kpa})
+        starts.refuse_non_finite(
+            "world model", {"image": future.images, "touch": future.tactile_kpa}
+        )
         images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
-        return [
-            _advance(state, chunk, imagined, selector)
-            for state, chunk, imagined, selector in zip(
-                states, chunks, zip(images, touches, strict=True), requested, strict=True
-            )
-        ]
+        futures = zip(images, touches, strict=True)
+        each = zip(states, chunks, futures, requested, strict=True)
+        return [_advance(*one) for one in each]
 
     def _requests(
         self, states: Sequence[ModelState], chunks: Sequence[np.ndarray]
@@ -188,8 +170,8 @@ class ModelWorld(BatchWorld[ModelState]):
     def reconstruct(
         self,
         images: UInt8[np.ndarray, "steps h w 3"],
-        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
-    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        tactile_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode images and touch of 1 + 4k steps; gives those after the first."""
         codec, tokenizer, device = self._model.codec, self._model.tokenizer, self._model.device
         seen = codec.decode_future(
@@ -201,13 +183,8 @@ class ModelWorld(BatchWorld[ModelState]):
 
     def snapshot(self, state: ModelState) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
-        fields = {
-            "digest": self._digest,
-            "instruction": state.instruction,
-            "action_kind": state.action_kind,
-            "step": state.step,
-            "task": state.task,
-        }
+        names = ("instruction", "action_kind", "step", "task")
+        fields = {"digest": self._digest, **{name: getattr(state, name) for name in names}}
         arrays = {name: getattr(state, name) for name in _SNAPSHOT_ARRAYS}
         return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
@@ -217,7 +194,7 @@ class ModelWorld(BatchWorld[ModelState]):
         Raises:
             InvalidInputError: not a snapshot of this checkpoint.
         """
-        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         step, words, task = fields.get("step"), fields.get("instruction"), fields.get("task")
         if (
             set(arrays) != set(_SNAPSHOT_ARRAYS)
@@ -227,7 +204,7 @@ class ModelWorld(BatchWorld[ModelState]):
             or fields.get("action_kind") not in ACTION_KINDS
             or arrays["anchor"].shape != (3, 4, 4)
         ):
-            raise foreign_snapshot(fields, arrays)
+            raise starts.foreign_snapshot(fields, arrays)
         state = ModelState(
             image=arrays["image"],
             tactile_kpa=arrays["tactile_kpa"],
@@ -239,9 +216,13 @@ class ModelWorld(BatchWorld[ModelState]):
             step=step,
             task=str(task),
         )
+        self._check_chunk(state)
+        return state
+
+    def _check_chunk(self, state: ModelState) -> None:
+        """The checks of a chunk, so that they fail before the first one."""
         holding = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
         build_inputs(self._requests([state], [holding]), self._model.config)
-        return state
 
 
 def open_world(
@@ -259,8 +240,7 @@ def open_world(
         path: safetensors file; None for the one that ships with the package.
         sampling_steps: network calls per chunk of a flow-matching model; a state model has none.
         sampler: solver of a flow-matching model.
-        objects: state model whose start readers find the objects, for a flow-matching model that
-            is conditioned on contact geometry; None for the package's own.
+        objects: state model that reads objects for contact geometry; None for the package's own.
         needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
         placement: device and precision of a flow-matching model.
 
@@ -269,7 +249,7 @@ def open_world(
             needed.
     """
     file = path if path is not None else default_checkpoint()
-    if not is_state_checkpoint(file):
+    if not checkpoints.is_state_checkpoint(file):
         checkpoint = _placed(file, placement)
         if needs_touch and not checkpoint.metadata.network.use_touch:
             raise InvalidInputError(
@@ -278,20 +258,24 @@ def open_world(
             )
         reader = None
         if checkpoint.metadata.network.use_contact_geometry:
-            reader = SceneReader(read_state_checkpoint(objects or default_checkpoint()))
+            reader = starts.SceneReader(
+                checkpoints.read_state_checkpoint(objects or default_checkpoint())
+            )
         return ModelWorld(checkpoint, sampling=Sampling(sampling_steps, sampler), reader=reader)
     if sampling_steps is not None or sampler is not None:
         raise InvalidInputError(
             f"state model {file.name}: got {sampling_steps} sampling steps and the sampler "
             f"{sampler}, expected none: it predicts without sampling"
         )
-    return StateWorld(read_state_checkpoint(file))
+    return StateWorld(checkpoints.read_state_checkpoint(file))
 
 
-def _placed(file: Path, placement: Placement) -> Checkpoint:
+def _placed(file: Path, placement: Placement) -> checkpoints.Checkpoint:
     """The checkpoint on its device and in its precision."""
     limit = placement.max_file_gb
-    checkpoint = read_checkpoint(file, max_bytes=None if limit is None else int(limit * 1e9))
+    checkpoint = checkpoints.read_checkpoint(
+        file, max_bytes=None if limit is None else int(limit * 1e9)
+    )
     model = checkpoint.model
     if placement.precision == "bfloat16":
         model.to(torch.bfloat16)

@@ -30,8 +30,8 @@ JSON_HELP = "also write the result as JSON to this file; - for standard output"
 LINE_PERIOD_S = 5.0
 Item = TypeVar("Item")
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
-_asked_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
-    "asked_parsers", default=None
+_help_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
+    "help_parsers", default=None
 )
 
 
@@ -56,37 +56,29 @@ class CommandParser(argparse.ArgumentParser):
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
         """Print the help, or hand this parser to `parser_behind`."""
-        asked = _asked_parsers.get()
-        if asked is None:
+        shown = _help_parsers.get()
+        if shown is None:
             super().print_help(file)
         else:
-            asked.append(self)
+            shown.append(self)
 
 
 def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | None:
-    """The parser that would print its help; None if no parser did.
-
-    Args:
-        show_help: runs a command with `--help`; it prints nothing here.
-    """
-    asked: list[argparse.ArgumentParser] = []
-    token = _asked_parsers.set(asked)
+    """The parser that `show_help`, a command with `--help`, would print; None if no parser did."""
+    shown: list[argparse.ArgumentParser] = []
+    token = _help_parsers.set(shown)
     try:
         with suppress(SystemExit), redirect_stdout(StringIO()):
             show_help()
     finally:
-        _asked_parsers.reset(token)
-    return asked[0] if asked else None
+        _help_parsers.reset(token)
+    return shown[0] if shown else None
 
 
 class ProgressLines:
     """Progress of a long job as lines on standard error, where no terminal shows a bar.
 
-    Args:
-        title: of the job.
-        has_bar: whether a terminal shows a bar instead.
-        period_s: shortest time between two lines.
-        clock_s: tells the time.
+    If it `has_bar`, a terminal shows that instead; `period_s` is the shortest time between lines.
     """
 
     def __init__(
@@ -145,15 +137,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -> None:
-    """Write the result of a command as JSON.
+    """Write the result of a command as JSON to a file; `-` is standard output, None writes nothing.
 
-    Args:
-        path: file to write, `-` for standard output, None to write nothing.
-        result: values that JSON can hold.
-        allow_nan: False to refuse numbers that are not finite.
-
-    Raises:
-        ValueError: a number is not finite and `allow_nan` is False.
+    Raises ValueError for a number that is not finite unless `allow_nan`.
     """
     if path is not None:
         text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)

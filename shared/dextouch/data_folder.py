@@ -21,8 +21,7 @@ _PREFIXES = ("._", ".nfs", ".trash-", ".fuse_hidden")
 def data_folder() -> Path:
     """The folder below which commands keep their data unless a flag says otherwise.
 
-    Raises:
-        InvalidInputError: the variable holds a URL.
+    Raises InvalidInputError if the variable holds a URL.
     """
     text = os.environ.get(DATA_VARIABLE) or "data"
     if "://" in text:
@@ -46,6 +45,11 @@ def default_enrolment() -> Path:
 def default_spool() -> Path:
     """Where a station keeps its takes until they are uploaded."""
     return data_folder() / "spool"
+
+
+def practice_spool(spool: Path) -> Path:
+    """Where takes of the practice devices of a station are kept, beside its own."""
+    return spool.with_name(f"{spool.name}_practice")
 
 
 def is_system_file(path: PurePath | str) -> bool:

@@ -75,12 +75,8 @@ def texts_in(value: object) -> Iterator[str]:
 
 
 FreeText = Annotated[
-    str,
-    AfterValidator(check_line),
-    Field(json_schema_extra={"pattern": f"^[^{_IN_A_LINE}]*$"}),
+    str, AfterValidator(check_line), Field(json_schema_extra={"pattern": f"^[^{_IN_A_LINE}]*$"})
 ]
 FreeLines = Annotated[
-    str,
-    AfterValidator(check_lines),
-    Field(json_schema_extra={"pattern": f"^[^{_IN_LINES}]*$"}),
+    str, AfterValidator(check_lines), Field(json_schema_extra={"pattern": f"^[^{_IN_LINES}]*$"})
 ]

@@ -12,8 +12,7 @@ DEFAULT_QUALITY = 90
 def encode_jpeg(image: np.ndarray, *, quality: int = DEFAULT_QUALITY) -> bytes:
     """Encode one RGB image as JPEG, without chroma subsampling.
 
-    Raises:
-        ShapeError: not uint8 [h ≥ 1, w ≥ 1, 3].
+    Raises ShapeError unless it is uint8 [h ≥ 1, w ≥ 1, 3].
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ShapeError(f"image: got {image.dtype} {image.shape}, expected uint8 [h, w, 3]")
@@ -28,14 +27,10 @@ def decode_jpeg(
     gray: bool = False,
     **reduced: int,
 ) -> UInt8[np.ndarray, "h w c"]:
-    """Decode a JPEG to an RGB image.
+    """Decode a JPEG to an RGB image, or with `gray` its luma alone, to one channel.
 
-    Args:
-        data: of the file.
-        where: names it in messages.
-        size_px: expected height and width.
-        gray: decode its luma alone, to one channel.
-        reduced: `min_height`, `min_width` and `min_factor` of `simplejpeg`, for a smaller image.
+    `where` names it in messages, `size_px` is the expected height and width, and `reduced` are
+    `min_height`, `min_width` and `min_factor` of `simplejpeg`, for a smaller image.
 
     Raises:
         CorruptDataError: not a complete JPEG image, or one of another size.
@@ -52,11 +47,7 @@ def decode_jpeg(
 
 
 def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
-    """Height and width (pixels) of a JPEG, from its header.
-
-    Raises:
-        CorruptDataError: not a JPEG header.
-    """
+    """Height and width (pixels) of a JPEG, from its header; raises CorruptDataError without one."""
     try:
         height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)
     except ValueError as error:
@@ -80,12 +71,8 @@ def scaled_square(
 ) -> tuple[UInt8[np.ndarray, "n side side 3"], Float64[np.ndarray, "3 3"]]:
     """The middle square of images, each pixel the mean of the area that it covers, and its camera.
 
-    Images that have the side already are returned as they are.
-
-    Args:
-        images: of one camera.
-        K: of the camera (px), with pixel centres at half-integers.
-        side_px: wanted width and height.
+    Images that have the side already are returned as they are. K is in pixels, whose centres are at
+    half-integers.
     """
     height_px, width_px = images.shape[1:3]
     if height_px == width_px == side_px:

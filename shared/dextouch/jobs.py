@@ -62,11 +62,7 @@ class Job(Generic[Item, Result]):
     error: DexTouchError | None = None
 
     def result(self) -> Result:
-        """The result.
-
-        Raises:
-            DexTouchError: the job failed.
-        """
+        """The result; raises the error of a job that failed."""
         if self.error is not None:
             raise self.error
         # None may be a result.
@@ -85,15 +81,9 @@ def run_jobs(
 
     A `DexTouchError` is the error of its job; any other exception ends the run. A job whose worker
     is killed is repeated: on this machine up to twice, after all others and alone, so that only the
-    one that kills its worker fails; on a cluster three times.
-
-    Args:
-        function: of a module, so that other processes can import it; it and the items are pickled.
-        items: one for each job.
-        workers: where the jobs run.
-        prepare: called once in each worker process.
-        folders: folders of this machine that jobs write to; on a cluster, machines that do not see
-            them refuse their jobs.
+    one that kills its worker fails; on a cluster three times. The function and the items are
+    pickled; `prepare` is called once in each worker process. Jobs write to `folders` of this
+    machine: on a cluster, machines that do not see them refuse their jobs.
 
     Raises:
         UnavailableError: there is no cluster at the address.
@@ -257,9 +247,8 @@ class _Here:
     def enter(self) -> None:
         """Work in the same folder, so that relative paths mean the same files.
 
-        Raises:
-            NotFoundError: a folder that this machine does not see.
-            ConflictError: another version of DexTouch.
+        Raises NotFoundError for a folder that this machine does not see, ConflictError for another
+        version.
         """
         machine = os.uname().nodename
         missing = [mark.parent for mark in self.marks if not mark.exists()]
@@ -301,11 +290,7 @@ def worker_pool(
     """Fresh interpreters, which share no threads and locks with this process.
 
     If the block fails, waiting jobs are cancelled. If this process is killed, its workers end at
-    once; those of a bare pool would go on with their jobs.
-
-    Args:
-        num_workers: processes.
-        prepare: called once in each worker; picklable.
+    once; those of a bare pool would go on with their jobs. `prepare`, picklable, is called in each.
     """
     spawned = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(num_workers, spawned, _begin, (prepare,))

@@ -6,9 +6,14 @@ import time
 
 import numpy as np
 
-from benchmarks.retargeting.pinches import people, pinch_motion
-from benchmarks.simulated.hand_motions import Motion, robot_motion
-from benchmarks.simulated.tracking_faults import FAULTS, fuzzed
+from benchmarks.simulated.hand_motions import (
+    FAULTS,
+    Motion,
+    fuzzed,
+    people,
+    pinch_motion,
+    robot_motion,
+)
 from services.alignment.retargeting import HandRetargeter, RetargetStatus, warm_up
 
 # Of the robot, swaps of neighbours go untold for up to 8 samples; at the velocity limit as many

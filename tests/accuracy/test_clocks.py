@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.clocks.rivals import arrivals, ours_offline, ours_online
+from benchmarks.clocks.benchmark import arrivals, ours_offline, ours_online, score
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
@@ -17,7 +17,6 @@ from benchmarks.clocks.scenes import (
     Scene,
     simulate,
 )
-from benchmarks.clocks.scores import score
 from dextouch.clocks import date_by_counting, fit_clock
 
 SECONDS = 120.0

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.closure.methods import Method, retarget_take, robot_trajectory
+from benchmarks.closure.benchmark import Method, retarget_take, robot_trajectory
 from dextouch.episodes import EpisodeStore
 from dextouch.geometry import apply, interpolate_poses, invert, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
@@ -16,7 +16,7 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile import pad_forces_n
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.recording_error import compare_with_truth, match_streams
-from services.pipelines.mock_takes import SESSION_SEEDS, device_options, write_through_devices
+from services.pipelines.mock_takes import SESSION_SEEDS, device_options, write_by_station
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -50,7 +50,7 @@ def first(tmp_path_factory):
     """A take with its truth and its episode for training, the first one of its session."""
     truth = record(Stage("stand_bottle", "human", TwinSettings()), 43, device_options(TRAINING))
     store = EpisodeStore(tmp_path_factory.mktemp("first"))
-    write_through_devices(store, truth, episode_id=name_of(truth), options=TRAINING)
+    write_by_station(store, truth, episode_id=name_of(truth), options=TRAINING)
     return truth, store.open(name_of(truth))
 
 
@@ -61,7 +61,7 @@ def name_of(truth):
 def measured(truth, store):
     """Errors of a take with all streams, and its processor time."""
     start_s = time.process_time()
-    write_through_devices(store, truth, episode_id=name_of(truth), options=OPTIONS)
+    write_by_station(store, truth, episode_id=name_of(truth), options=OPTIONS)
     cpu_s = time.process_time() - start_s
     original = store.open(write_episode(store, truth))
     return {**errors(store.open(name_of(truth)), original, truth), "CPU s": cpu_s}

@@ -8,7 +8,7 @@ import pytest
 from dextouch.episodes import EpisodeStore, object_track
 from dextouch.geometry import interpolate_poses, transform_from_pose
 from dextouch.geometry.transforms import bracket
-from services.pipelines.mock_takes import device_options, write_as_recorded
+from services.pipelines.mock_takes import device_options, write_by_station
 from services.pipelines.training_data import marked_stage
 from services.twin.episodes import record
 from services.twin.take_options import TakeOptions
@@ -25,7 +25,7 @@ def taken(tmp_path_factory):
     stage, objects = marked_stage(TASK, "robot")
     truth = record(stage, SEED, replace(device_options(LEAN), image_every=1))
     store = EpisodeStore(tmp_path_factory.mktemp("station"))
-    write_as_recorded(store, truth, objects, episode_id="one", options=LEAN)
+    write_by_station(store, truth, objects, episode_id="one", options=LEAN)
     return truth, store.open("one")
 
 

@@ -6,9 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.retargeting.pinches import pinch_motions
-from benchmarks.retargeting.scores import score_pinches
-from benchmarks.simulated.hand_motions import with_noise
+from benchmarks.retargeting.compare import score_pinches
+from benchmarks.simulated.hand_motions import pinch_motions, with_noise
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus

@@ -9,11 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.retargeting.compare import scale_of
+from benchmarks.retargeting.compare import scale_of, score_bones
 from benchmarks.retargeting.rival_process import RivalProcess
 from benchmarks.retargeting.rivals import RIVALS, missing_modules
-from benchmarks.retargeting.scores import score_bones
-from benchmarks.simulated.oblique_people import oblique_motion
+from benchmarks.simulated.hand_motions import oblique_motion
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
 

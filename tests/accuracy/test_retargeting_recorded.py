@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from benchmarks.retargeting.scores import bone_angles_deg
+from benchmarks.retargeting.compare import bone_angles_deg
 from dextouch.hands import CHAINS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetStatus

@@ -10,9 +10,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from benchmarks.simulated.finger_contact import _capsules, segment_distance_m
-from benchmarks.simulated.hand_motions import Motion
-from benchmarks.simulated.tracking_faults import fuzzed
+from benchmarks.simulated.hand_motions import Motion, _capsules, fuzzed, segment_distance_m
 from services.pipelines.teleoperation.hand_follower import HandFollower, HandSample
 from services.pipelines.teleoperation.settings import CommandLimits
 from services.twin.hands import HumanHand, twin_hand

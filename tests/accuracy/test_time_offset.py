@@ -161,3 +161,13 @@ def test_what_is_no_tap_is_refused():
         estimate_tap_offset(t_a, pressure, t_b, 0 * height)
     with pytest.raises(InvalidInputError, match="NaN"):
         estimate_tap_offset(t_a, pressure, t_b, height * np.nan)
+
+
+@pytest.mark.parametrize("estimate", [estimate_time_offset, estimate_tap_offset])
+def test_streams_without_samples_are_refused(estimate):
+    """As of a device that was unplugged; one stream or both."""
+    times_ns, values = BASE_NS + np.arange(300) * 10_000_000, np.ones(300)
+    nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+    for streams_of_take in ((*nothing, *nothing), (*nothing, times_ns, values)):
+        with pytest.raises(InvalidInputError, match="got 0 stamps"):
+            estimate(*streams_of_take)

@@ -5,9 +5,15 @@ from statistics import mean
 
 import pytest
 
-from benchmarks.closure.contact_times import contact_times, timing_errors
-from benchmarks.closure.methods import METHODS, OURS, retarget_take
-from benchmarks.closure.replay import TASKS, close_take
+from benchmarks.closure.benchmark import (
+    METHODS,
+    OURS,
+    TASKS,
+    close_take,
+    contact_times,
+    retarget_take,
+    timing_errors,
+)
 from dextouch.errors import InvalidInputError
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings

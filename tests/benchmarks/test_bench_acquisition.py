@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 from benchmarks.acquisition import benchmark
-from benchmarks.acquisition.drivers import decode_all, make_talks
-from benchmarks.acquisition.families import make_families
-from benchmarks.acquisition.noise import (
+from benchmarks.acquisition.benchmark import requirements
+from benchmarks.acquisition.decoders import (
     Judgement,
     Line,
     count_split_differences,
+    decode_all,
     disturb,
     judge,
+    make_families,
+    make_talks,
 )
-from benchmarks.acquisition.tables import requirements
 from benchmarks.command import stage_parser, usage
 from benchmarks.figures import Figure
 from benchmarks.stages import STAGES

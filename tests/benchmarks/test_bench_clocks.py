@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clocks import benchmark
-from benchmarks.clocks.rivals import OFFLINE, ONLINE
+from benchmarks.clocks.benchmark import OFFLINE, ONLINE, score
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
@@ -21,7 +21,6 @@ from benchmarks.clocks.scenes import (
     Scene,
     simulate,
 )
-from benchmarks.clocks.scores import score
 from benchmarks.command import stage_parser
 from benchmarks.stages import named
 from dextouch.errors import InvalidInputError, UnknownNameError
@@ -41,7 +40,7 @@ def run(tmp_path_factory):
 def test_a_quick_run_measures_every_way(run):
     text, folder = run
     figures = json.loads((folder / "bench_clocks.json").read_text())
-    found = {(r["scene"], r["way"]): r["rounds"][0]["rms_ms"] for r in figures["results"]}
+    found = {(r["scene"], r["way"]): r["scores"][0]["rms_ms"] for r in figures["results"]}
     for scene in ("base", "step -30 ms"):
         assert all((scene, way) in found for way in (*ONLINE, *OFFLINE))
         assert found[scene, "ours, online"] < 0.3 < found[scene, "arrival stamps"]

@@ -10,11 +10,9 @@ import pytest
 
 from benchmarks import __main__ as entry_point
 from benchmarks import command
-from benchmarks.chart import Panel, Point, draw, linear_ticks, log_ticks
-from benchmarks.figures import Figure, Requirement
-from benchmarks.machine import NOT_INSTALLED, describe_machine
-from benchmarks.report import ResultTable, StageReport
-from benchmarks.rounds import interleaved
+from benchmarks.chart import Panel, Point, draw
+from benchmarks.figures import Figure, Requirement, interleaved
+from benchmarks.report import NOT_INSTALLED, ResultTable, StageReport, describe_machine
 from benchmarks.stages import STAGES, StageEntry
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 
@@ -70,14 +68,14 @@ def test_verdicts(figure, sense, verdict):
     assert Requirement("speed", figure, sense, 2.0).verdict() == verdict
 
 
-def test_ticks_are_round_numbers():
-    assert log_ticks(0.15, 6.0) == [0.2, 0.5, 1, 2, 5]
-    assert linear_ticks(0.0, 7.0) == [0, 2, 4, 6]
+SVG = "{http://www.w3.org/2000/svg}"
 
 
-def circles(svg):
-    found = ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}circle")  # noqa: S314 (our own)
-    return [(float(c.get("cx")), float(c.get("cy"))) for c in found]
+def places(svg):
+    """Pixels (x right, y down) of the markers, by the label of their design."""
+    groups = {g.get("id"): g for g in ET.fromstring(svg).iter(f"{SVG}g")}  # noqa: S314 (our own)
+    markers = {name: next(g.iter(f"{SVG}use"), None) for name, g in groups.items()}
+    return {n: (float(m.get("x")), float(m.get("y"))) for n, m in markers.items() if m is not None}
 
 
 def test_the_chart_puts_time_right_and_error_up():
@@ -85,25 +83,16 @@ def test_the_chart_puts_time_right_and_error_up():
         Point("quick & wrong", 1.0, 0.9, 1.1, 8.0, is_ours=True),
         Point("slow", 10.0, 9.0, 12.0, 2.0, is_ours=False),
     ]
-    svg = draw([Panel("Writing", "seconds", "error", points)], title="bench")
-    (quick_x, wrong_y), (slow_x, right_y) = circles(svg)
+    empty = Panel("Reading", "seconds", "error", [])
+    svg = draw([Panel("Writing", "seconds", "error", points), empty], title="bench")
+    (quick_x, wrong_y), (slow_x, right_y) = (
+        places(svg)[f"Writing: {point.label}"] for point in points
+    )
     assert quick_x < slow_x
     assert wrong_y < right_y  # pixels count downwards
-    assert "quick &amp; wrong" in svg
-
-
-def test_labels_do_not_cover_each_other():
-    points = [Point(f"design-{k}", 1.0, 1.0, 1.0, 5.0, is_ours=False) for k in range(5)]
-    svg = draw([Panel("Writing", "seconds", "error", points)], title="bench")
-    texts = ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")  # noqa: S314 (our own)
-    labels = {(t.get("x"), t.get("y")) for t in texts if (t.text or "").startswith("design")}
-    assert len(labels) == 5
-
-
-def test_a_panel_without_points_is_left_out():
-    svg = draw([Panel("Writing", "seconds", "error", [])], title="bench")
-    assert "Writing" not in svg
-    assert circles(svg) == []
+    assert "quick &amp; wrong</text>" in svg
+    assert "Writing</text>" in svg
+    assert "Reading" not in svg
 
 
 def test_the_machine_is_described():
@@ -191,13 +180,15 @@ def fake_stage(monkeypatch):
         with bar("measuring", 1) as step:
             step("it")
         figure = options.figure
+        point = Point("ours", 1.0, 1.0, 1.0, 2.0, is_ours=True)
         return StageReport(
             stage="fake",
             packages=["numpy"],
             options={},
             tables=[ResultTable("Results", ("design", "time"), [("ours", "1 [s]")])],
             requirements=[Requirement("speed", figure, "at least", 2.0, "m/s")],
-            data={"designs": {"ours": [figure]}},
+            data={"designs": {"ours": Figure.of([figure or 0.0])}},
+            panels=[Panel("Speed", "s", "error", [point])],
             notes=["rival is left out"],
         )
 

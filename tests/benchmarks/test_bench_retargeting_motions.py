@@ -3,22 +3,21 @@
 import numpy as np
 import pytest
 
-from benchmarks.retargeting.pinches import (
+from benchmarks.retargeting.compare import score_pinches, score_robot
+from benchmarks.simulated import hand_motions as sequences
+from benchmarks.simulated.hand_motions import (
     BONE_SPREAD,
+    MAX_SPEED_RAD_S,
     PINCHED_M,
+    RATE_HZ,
     SIZES,
     Person,
+    cold_postures,
     people,
     pinch_motion,
-)
-from benchmarks.retargeting.scores import score_pinches, score_robot
-from benchmarks.simulated import hand_motions as sequences
-from benchmarks.simulated.finger_contact import segment_distance_m, touching
-from benchmarks.simulated.hand_motions import (
-    MAX_SPEED_RAD_S,
-    RATE_HZ,
-    cold_postures,
     robot_motion,
+    segment_distance_m,
+    touching,
     with_dropouts,
     with_noise,
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.command import main
-from benchmarks.teleoperation.playing import Performance, played
+from benchmarks.teleoperation.benchmark import Performance, played
 from dextouch.serving import ChildProcess
 
 

@@ -13,11 +13,11 @@ import pytest
 
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
-from benchmarks.world_model import benchmark, tables
-from benchmarks.world_model.held_out import held_out
-from benchmarks.world_model.rollouts import (
+from benchmarks.world_model import benchmark
+from benchmarks.world_model.benchmark import (
     Imagined,
     RolloutError,
+    held_out,
     imagine,
     imagine_together,
     rollout_error,
@@ -45,9 +45,9 @@ def run(tmp_path_factory):
 def test_a_quick_run_measures_everything(run):
     folder, figures = run
     names = {one.name for one in benchmark.VARIANTS}
-    assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {tables.COPY_FIRST}
+    assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {benchmark.COPY_FIRST}
     assert len(figures["asked_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
-    assert len(figures["state_model_ms"]) == len(benchmark.SELECTORS) * len(tables.STATE_BATCHES)
+    assert len(figures["state_model_ms"]) == len(benchmark.SELECTORS) * len(benchmark.STATE_BATCHES)
     assert figures["options"]["served"] in names
     assert "as served" in (folder / "bench_world-model.md").read_text()
     assert "Imagined touch" in (folder / "bench_world-model.svg").read_text()
@@ -56,7 +56,7 @@ def test_a_quick_run_measures_everything(run):
 @pytest.mark.slow
 def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
     errors = run[1]["errors"]
-    ours, copied = errors[run[1]["options"]["served"]], errors[tables.COPY_FIRST]
+    ours, copied = errors[run[1]["options"]["served"]], errors[benchmark.COPY_FIRST]
     assert ours["image_levels"] < copied["image_levels"]
     assert ours["touch_kpa"] < copied["touch_kpa"]
 
@@ -66,8 +66,8 @@ def test_half_precision_is_near_full_precision_and_not_the_same(run):
     # Shape checks know float32 only, so half precision is tried without them.
     errors = run[1]["errors"]
     for steps in (1, 2, 4):
-        full = errors[tables.Variant(steps).name]
-        half = errors[tables.Variant(steps, precision="bfloat16").name]
+        full = errors[benchmark.Variant(steps).name]
+        half = errors[benchmark.Variant(steps, precision="bfloat16").name]
         assert half != full
         assert half == pytest.approx(full, rel=0.05)
 
@@ -76,8 +76,10 @@ def test_half_precision_is_near_full_precision_and_not_the_same(run):
 def test_a_kept_context_does_not_change_the_errors(run):
     errors = run[1]["errors"]
     for steps in (2, 4, 8):
-        kept = errors[tables.Variant(steps).name]
-        assert kept == pytest.approx(errors[tables.Variant(steps, recomputed=True).name], rel=1e-3)
+        kept = errors[benchmark.Variant(steps).name]
+        assert kept == pytest.approx(
+            errors[benchmark.Variant(steps, recomputed=True).name], rel=1e-3
+        )
 
 
 @pytest.fixture(scope="module")
@@ -124,24 +126,27 @@ def test_rollouts_may_show_less(episode):
 
 
 def test_verdicts():
-    served = tables.Variant(2).name
+    served = benchmark.Variant(2).name
     assert served == "2 Euler steps, float32"
-    errors = {tables.COPY_FIRST: RolloutError(30.0, 4.0, 0.0), served: RolloutError(15.0, 5.0, 0.9)}
-    found = tables.requirements({served: Figure.of([40.0])}, errors, served)
+    errors = {
+        benchmark.COPY_FIRST: RolloutError(30.0, 4.0, 0.0),
+        served: RolloutError(15.0, 5.0, 0.9),
+    }
+    found = benchmark.requirements({served: Figure.of([40.0])}, errors, served)
     assert [one.figure for one in found] == [40.0, 0.5, 1.25]
     assert [one.is_met for one in found] == [True, True, False]
 
 
 def test_the_state_model_is_judged_by_its_rounds():
     costs = {
-        tables.asked_name(asked, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
+        benchmark.asked_name(asked, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
         for asked in benchmark.SELECTORS
-        for batch in tables.STATE_BATCHES
+        for batch in benchmark.STATE_BATCHES
     }
-    found = tables.state_model_requirements(costs)
+    found = benchmark.state_model_requirements(costs)
     assert [one.figure for one in found] == [8.0, 8.0, 8.0, 16.0]
     assert [one.is_met for one in found] == [False, True, True, True]
-    rows = tables.state_model_table(costs, "state").rows
+    rows = benchmark.state_model_table(costs, "state").rows
     assert [row[3] for row in rows] == ["", "125", "2000", "", "500", "8000", "", "2000", "32000"]
 
 

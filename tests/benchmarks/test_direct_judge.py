@@ -213,7 +213,11 @@ def pressed_or_elsewhere(seed: int) -> ToyGrid:
 def test_a_trained_judge_tells_where_the_block_is(tmp_path):
     torch.set_num_threads(1)
     settings = JudgeSettings(
-        reader_steps=250, num_steps=300, max_cpu_s=60.0, batch_size=32, development_share=0.2
+        reader_steps=250,
+        num_training_steps=300,
+        max_cpu_s=60.0,
+        batch_size=32,
+        development_share=0.2,
     )
     episodes = [pressed_or_elsewhere(seed) for seed in range(200)]
     checkpoint = train_direct_judge(episodes, (), settings, command="test")

@@ -6,14 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.evaluator import kind_lines, rollouts, work
+from benchmarks.evaluator import lines, work
 from benchmarks.evaluator.benchmark import add_options, figures_of_tasks, row_table
 from benchmarks.evaluator.drawn import Rolled
 from benchmarks.evaluator.keeping import KeptRows
-from benchmarks.evaluator.kind_lines import VERDICTS, uncertainty_of
-from benchmarks.evaluator.kinds import KindsPlan, mistakes_digest
-from benchmarks.evaluator.lines import TaskFigures
-from benchmarks.evaluator.plan import StudyPlan, Trained
+from benchmarks.evaluator.lines import VERDICTS, TaskFigures, uncertainty_of
+from benchmarks.evaluator.plan import KindsPlan, StudyPlan, Trained, mistakes_digest
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.mistakes import DEVELOPMENT, HELD_OUT, TRAINING
@@ -154,7 +152,7 @@ def test_open_verdicts_are_more_doubtful_than_decided_ones():
 
 def test_policies_of_other_names_have_no_kind():
     with pytest.raises(ValueError, match="script 0 mm"):
-        kind_lines.kind_of(_rolled("script 0 mm", 1, real=True, told=0.5))
+        lines.kind_of(_rolled("script 0 mm", 1, real=True, told=0.5))
 
 
 def test_only_endings_of_mistakes_are_rolled_out_and_kept(tmp_path, monkeypatch):
@@ -176,7 +174,7 @@ def test_only_endings_of_mistakes_are_rolled_out_and_kept(tmp_path, monkeypatch)
         return noting
 
     for name in ("play_in_twin", "play_in_imagination"):
-        monkeypatch.setattr(rollouts, name, noted(getattr(rollouts, name)))
+        monkeypatch.setattr(work, name, noted(getattr(work, name)))
     kept = KeptRows(path)
     kept.add(study.rows("stand_bottle", 39_077, missing))
     assert [shape[0] for shape in shown] == [0, 0]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.evaluator.single_members import single_member, write_single_members
+from benchmarks.evaluator.work import single_member, write_single_members
 from dextouch.errors import CorruptDataError
 from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.shipped_checkpoints import PRETRAINED

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.evaluator.drawn import Line
-from benchmarks.evaluator.repetition import read_lines, repetition
+from benchmarks.evaluator.keeping import read_lines, repetition
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 

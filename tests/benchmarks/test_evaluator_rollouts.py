@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.evaluator import rollouts, work
+from benchmarks.evaluator import work
 from benchmarks.evaluator.benchmark import figures_of_tasks
-from benchmarks.evaluator.chunk_lines import f1
 from benchmarks.evaluator.keeping import KeptRows, array_path, read_arrays, write_arrays
-from benchmarks.evaluator.measuring import (
-    contact_counts,
-    object_region,
-    psnr_within,
-)
+from benchmarks.evaluator.lines import f1
 from benchmarks.evaluator.plan import (
     IDLE,
     ClonedPolicy,
@@ -25,7 +20,13 @@ from benchmarks.evaluator.plan import (
     Trained,
     trained_seeds,
 )
-from benchmarks.evaluator.playing import play_in_twin, start_in_twin
+from benchmarks.evaluator.playing import (
+    contact_counts,
+    object_region,
+    play_in_twin,
+    psnr_within,
+    start_in_twin,
+)
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.geometry import transform
 from services.evaluation.policies.colour_servo import ColourServo
@@ -102,7 +103,7 @@ def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
         raise AssertionError("rolled out again")
 
     for name in ("play_in_twin", "play_in_imagination"):
-        monkeypatch.setattr(rollouts, name, refuse)
+        monkeypatch.setattr(work, name, refuse)
     kept = KeptRows(path)
     kept.add(study.rows("stand_bottle", 39_077, {"script 0 mm": left}))
     assert list(study.missing(KeptRows(path), "stand_bottle", 39_077)) == list(IDLE)

@@ -32,8 +32,7 @@ from benchmarks.reproduction.tables import (
 from dextouch.errors import NotFoundError
 from services.cli.main import find_command, main
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
-from services.evaluation.studies.definition import read_definition
-from services.evaluation.studies.results import StudyHeader, StudyResults
+from services.evaluation.studies.results import StudyHeader, StudyResults, read_definition
 from services.twin.names import DOWNSTREAM
 
 # A command that appends its last word to a file and writes the result that its first word names.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from benchmarks.evaluator.resampling import (
+from benchmarks.evaluator.drawn import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
     interval_of_draws,

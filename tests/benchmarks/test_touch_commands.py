@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.closure.touch_commands import (
+from benchmarks.closure.benchmark import (
     HandServos,
     commands_from_touch,
     pressing_forces_n,

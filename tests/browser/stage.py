@@ -5,13 +5,16 @@ import time
 from datetime import UTC, datetime, timedelta
 
 import httpx
+import numpy as np
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import Review
 from dextouch.worlds import WorldServiceSettings, create_world_app
+from services.acquisition.mocks import pattern
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
+from services.alignment.station_calibration.record import write_entry
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app as create_store
@@ -108,6 +111,17 @@ def serve_store(serve, folder):
         "episode_store_url": serve(create_store(settings)),
         "goal_hours": {"stand_bottle": 0.02, "fold_towel": 0.01},
     }
+
+
+def know_the_lens(folder):
+    """Write the lens of the practice camera, as its own calibration would."""
+    lens = {
+        "K_head": pattern.K,
+        "K_head_sigma_px": np.full(4, 0.2),
+        "distortion_head": np.array([*pattern.DISTORTION, 0.0]),
+        "image_size_head_px": np.array(pattern.SIZE_PX, dtype=float),
+    }
+    write_entry(folder, "K_head", lens, {})
 
 
 def serve_alignment(serve, folder, station_url):

@@ -12,8 +12,10 @@ from services.pipelines.servers import bind, serve_all
 
 
 def main(spool, name, *streams):
-    found = [s for s in pattern.pattern_streams() if s.descriptor.name in streams]
-    pattern.pattern_streams = lambda: found
+    whole = pattern.pattern_streams
+    pattern.pattern_streams = lambda round_s=pattern.ROUND_S: [
+        stream for stream in whole(round_s) if stream.descriptor.name in streams
+    ]
     app = create_app(AcquisitionSettings(spool=Path(spool), mock=True, station=name))
     place = bind(name, host="127.0.0.1", port=0)
     asyncio.run(

@@ -12,6 +12,7 @@ from playwright.sync_api import expect
 from tests.browser.stage import (
     KEY,
     STREAMS,
+    know_the_lens,
     open_rollout,
     record_a_take,
     serve_alignment,
@@ -197,6 +198,25 @@ def test_stored_items(screens, serve, tmp_path):
     screens.look("hours")
 
 
+def look_at_calibration(screens, address, folder):
+    page = screens.page
+    page.goto(f"{address}/calibration")
+    expect(page.locator("#item_rows tr").first).to_be_visible()
+    screens.look("calibration")
+    know_the_lens(folder)
+    page.locator("#practice_start").click()
+    expect(page.locator("#practice_stop")).to_be_visible(timeout=120_000)
+    page.locator("tr[data-name=T_tracker_head_camera_head] button").click()
+    screens.look("calibration_begin")
+    page.keyboard.press("Enter")
+    expect(page.locator("#gauges li")).to_have_count(7)
+    screens.look("calibration_mount")
+    page.locator("#run_cancel").click()
+    expect(page.locator("#run_state")).to_have_text("cancelled")
+    page.locator("#practice_stop").click()
+    expect(page.locator("#practice_start")).to_be_visible()
+
+
 @pytest.mark.slow
 def test_services_and_worlds(screens, serve, station_process, tmp_path):
     page = screens.page
@@ -206,10 +226,7 @@ def test_services_and_worlds(screens, serve, station_process, tmp_path):
     address = serve_dashboard(serve, tmp_path, settings | {"acquisition_url": station})
     screens.may_ask(address, settings["rating_url"])
     sign_in(page, address)
-    page.goto(f"{address}/calibration")
-    expect(page.locator("#item_rows tr").first).to_be_visible()
-    page.locator("#item_rows button").first.click()
-    screens.look("calibration")
+    look_at_calibration(screens, address, tmp_path / "calibration" / "practice")
     with ExitStack() as stack:
         open_rollout(stack, settings["world_model_url"])
         page.goto(f"{address}/rollouts")

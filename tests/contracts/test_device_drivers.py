@@ -20,7 +20,6 @@ from services.acquisition.devices.pose_tracker import BridgePoseTrackerDecoder
 from services.acquisition.devices.robot_state import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link import BridgeDriver
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
@@ -30,6 +29,7 @@ from services.acquisition.mocks.trackers import (
     BridgePort,
     BridgePoseSource,
 )
+from services.acquisition.settings import MockLinks
 from tests.unit.acquisition.sleepy_clock import SleepyClock
 from tests.unit.acquisition.usb_bus import usb_trackers
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.finger_tracker import DESCRIPTOR_REPORT
 from services.acquisition.devices.robot_state import STREAM_SIZES
-from services.acquisition.health import TICK_NS, HealthMonitor
-from services.acquisition.mock_links import MockLinks
+from services.acquisition.drivers.base import DESCRIPTOR_REPORT
+from services.acquisition.health.monitor import TICK_NS, HealthMonitor
 from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.trackers import FingerTrackerSource
+from services.acquisition.settings import MockLinks
 from services.acquisition.supervisor import DeviceSupervisor
 
 ROUND_S = 16.0

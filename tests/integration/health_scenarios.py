@@ -10,12 +10,13 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import HealthEvent, TakePrompt
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.station_camera import StationCamera
-from services.acquisition.health import STATION, DiskCheck
-from services.acquisition.mock_links import MockLinks
+from services.acquisition.health.monitor import STATION
+from services.acquisition.health.station import DiskCheck
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript, Ledger
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.replay import MockPair, ReplayStream
+from services.acquisition.settings import MockLinks
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 # The device with the fault stands beside a head tracker that is never disturbed.

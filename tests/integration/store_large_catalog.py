@@ -10,7 +10,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.alignment.recordings import record
+from benchmarks.alignment.benchmark import record
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import decode_commit, encode_commit, group_metadata, sha256_hex
 from dextouch.episodes.spool import SpoolReader

@@ -15,12 +15,11 @@ from dextouch.images import decode_jpeg
 from dextouch.schemas import RecordingAttributes, SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.cameras_and_robot import video_camera
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
-from services.acquisition.settings import SpoolSafety
+from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
 from services.acquisition.take import Take
 from services.acquisition.take_check import TakeWatch

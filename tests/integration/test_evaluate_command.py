@@ -12,8 +12,8 @@ import pytest
 from dextouch.clients import http_link
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
-from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings
+from services.twin.world import twin_worlds
 from tests.unit.worlds.running import served
 
 ROOT = Path(__file__).parents[2]

@@ -8,8 +8,7 @@ import pytest
 
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import PeriodicCall, VirtualClock
-from services.acquisition.health import DiskCheck
-from services.acquisition.health.station import HostCheck
+from services.acquisition.health.station import DiskCheck, HostCheck
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.acquisition.health import CODES
+from services.acquisition.health.codes import CODES
 from tests.integration.health_scenarios import HARMLESS, SCENARIOS, observe
 
 # In every run of the tests; all of them are in the matrix.

@@ -11,9 +11,9 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.robot_state import STREAM_SIZES
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript
+from services.acquisition.settings import MockLinks
 from tests.integration.recording_streams import human_streams, robot_streams, stream
 from tests.unit.acquisition.ledgers import accepted
 from tests.unit.acquisition.usb_bus import usb_trackers

@@ -8,9 +8,9 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt
 from dextouch.tactile.layout import select_taxels
 from services.acquisition.clock import StationClock, VirtualClock
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import LEDGER_FILE, MockStation
 from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript
+from services.acquisition.settings import MockLinks
 from tests.integration.recording_streams import human_streams, robot_streams
 from tests.unit.acquisition.ledgers import load, true_times_ns
 

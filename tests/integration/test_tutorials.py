@@ -16,8 +16,8 @@ from dextouch.serving import load_settings
 from dextouch.worlds import create_world_app
 from services.alignment.retargeting import hand_retargeter
 from services.cli import up
-from services.twin.serving import twin_worlds
 from services.twin.settings import TwinServiceSettings
+from services.twin.world import twin_worlds
 from tests.integration.tutorial_page import TutorialPage, run_command
 from tests.unit.worlds.running import served
 

@@ -11,7 +11,7 @@ from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import RecordingAttributes
 from dextouch.serving.keys import ApiKey
 from dextouch.streams import SampleBatch, StreamDescriptor
-from services.acquisition.retention import Retention
+from services.acquisition.settings import Retention
 from services.acquisition.uploader import UPLOADED_FILE, Uploader, second_id
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings

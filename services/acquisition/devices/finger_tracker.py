@@ -13,20 +13,8 @@ from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, TrackerSettings, tracker_transport
-from services.acquisition.drivers.base import (
-    DESCRIPTOR_REPORT,
-    REPORT_BYTES,
-    Driver,
-    ReportDecoder,
-    check_packet,
-)
+from services.acquisition.drivers import base, sdk_link
 from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
-from services.acquisition.drivers.sdk_link import (
-    BridgedDevice,
-    BridgeDecoder,
-    BridgeDriver,
-    BridgeHello,
-)
 from services.acquisition.transports import Transport
 
 MAGIC = b"DXFT"
@@ -114,7 +102,7 @@ def unpack_keypoints(
     return keypoints, int(unseen.sum())
 
 
-class FingerTrackerDecoder(ReportDecoder):
+class FingerTrackerDecoder(base.ReportDecoder):
     """Joins reports, resolves nodes by the descriptor's ids, marks unseen nodes with NaN.
 
     Its `statistics` are those of the data packets.
@@ -147,28 +135,26 @@ class FingerTrackerDecoder(ReportDecoder):
         self._order = None
 
     def _is_data(self, report_id: int, body: bytes) -> bool:
-        if report_id == DESCRIPTOR_REPORT:
-            self._describe(body)
-        return report_id != DESCRIPTOR_REPORT
+        if report_id != base.DESCRIPTOR_REPORT:
+            return True
+        for packet in self._descriptor.feed(body):
+            base.check_packet(packet, device=self._device, source=self._side)
+            try:
+                self._order = np.array(parse_node_order(packet.payload))
+            except PacketError as error:
+                raise DeviceError(f"{self._device}: {error.message}") from error
+        return False
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
-        check_packet(packet, device=self._device, source=self._side)
+        base.check_packet(packet, device=self._device, source=self._side)
         if self._order is None:
             return None
         keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
         self.unseen_nodes += num_unseen
         return Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence)
 
-    def _describe(self, body: bytes) -> None:
-        for packet in self._descriptor.feed(body):
-            check_packet(packet, device=self._device, source=self._side)
-            try:
-                self._order = np.array(parse_node_order(packet.payload))
-            except PacketError as error:
-                raise DeviceError(f"{self._device}: {error.message}") from error
 
-
-class FingerTracker(Driver):
+class FingerTracker(base.Driver):
     """A finger tracker asks for the node descriptor before it reads."""
 
     def __init__(self, name: str, side: Side, *, transport: Transport, clock: StationClock) -> None:
@@ -182,7 +168,7 @@ class FingerTracker(Driver):
             DeviceError: absent, or it does not describe its nodes.
         """
         super().open()
-        self.transport.write(bytes([DESCRIPTOR_REPORT]).ljust(REPORT_BYTES, b"\0"))
+        self.transport.write(bytes([base.DESCRIPTOR_REPORT]).ljust(base.REPORT_BYTES, b"\0"))
         for _ in range(DESCRIPTOR_READS):
             super().read()
             if self._nodes.described:
@@ -190,12 +176,10 @@ class FingerTracker(Driver):
         raise DeviceError(f"{self.name}: {self.info} sends no node descriptor; wrong firmware?")
 
 
-class BridgeFingerTrackerDecoder(BridgeDecoder):
+class BridgeFingerTrackerDecoder(sdk_link.BridgeDecoder):
     """Keypoints (float32 [25, 3], m, wrist frame) of one hand behind a finger tracker's SDK.
 
-    Args:
-        side: which hand.
-        serial_number: of the glove; the bridge's only one of this side if None.
+    Without a serial number it is the bridge's only one of this side.
     """
 
     def __init__(self, side: Side, *, serial_number: str | None = None) -> None:
@@ -216,8 +200,7 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
         """Packets left out so far, by the reason, and nodes that were not seen."""
         return {**super().events(), "unseen_nodes": self.unseen_nodes}
 
-    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
-        """The order of the nodes and the frame."""
+    def _learn(self, hello: sdk_link.BridgeHello, chosen: sdk_link.BridgedDevice) -> None:
         try:
             self._order = np.array(resolve_nodes(hello.nodes or ()))
         except PacketError as error:
@@ -229,7 +212,7 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
         if packet.source != SOURCES[self._source]:
             # The other hand of the same bridge is none of ours; one it did not announce is a fault.
             if packet.source not in self._announced:
-                check_packet(packet, device=self._device, source=self._source)
+                base.check_packet(packet, device=self._device, source=self._source)
             return None
         if not self.is_fresh(packet.t_device_ns, t_host_ns):
             return None
@@ -246,13 +229,13 @@ class FingerTrackerSettings(TrackerSettings):
     side: Side
 
 
-def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:
+def build(settings: FingerTrackerSettings, clock: StationClock) -> base.Driver:
     """The driver of one tracker, by its link."""
     name = f"finger_tracker_{settings.side}"
     transport = tracker_transport(settings)
     if settings.link == "bridge":
         decoder = BridgeFingerTrackerDecoder(settings.side, serial_number=settings.serial_number)
-        return BridgeDriver(name, transport=transport, decoder=decoder, clock=clock)
+        return sdk_link.BridgeDriver(name, transport=transport, decoder=decoder, clock=clock)
     return FingerTracker(name, settings.side, transport=transport, clock=clock)
 
 

@@ -10,14 +10,21 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample
-from dextouch.tactile.layout import Side
+from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, glove_stream
+from services.acquisition.drivers.base import (
+    CellLayout,
+    Driver,
+    StreamDecoder,
+    check_raw_cells,
+    glove_stream,
+    raw_unit,
+)
 from services.acquisition.drivers.packets import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -136,6 +143,7 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
         full_scale: the largest reading; packets with larger ones are held back.
         rate_hz: nominal rate; the stream has no device clock.
         label: of a further glove of this hand.
+        layout: of its taxels; None where only the calibration maps them to those of `dextouch_v1`.
     """
 
     def __init__(
@@ -146,15 +154,20 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
         full_scale: float,
         rate_hz: float,
         label: str | None = None,
+        layout: TactileLayout | None = None,
     ) -> None:
+        if layout is not None:
+            check_raw_cells(layout, num_values, device=f"glove_{side}")
         frames = JustFloatFrames(num_values, full_scale)
         # The device sends neither its unit nor its time.
+        unit = "raw" if layout is None else raw_unit(layout)
         descriptor = glove_stream(
             side,
             label,
             shape=(num_values,),
             dtype="float32",
-            unit="raw",
+            unit=unit,
+            layout=layout,
             nominal_rate_hz=rate_hz,
             capabilities=ClockCapabilities(),
         )
@@ -187,6 +200,8 @@ def are_readings(values: Float32[np.ndarray, " n"], largest_bits: int) -> bool:
 class JustFloatGloveSettings(GloveSettings):
     """Settings of a glove on a serial port whose packets do not describe themselves.
 
+    Each must be set where no `layout` says it.
+
     Attributes:
         num_values: float32s of a packet.
         full_scale: the largest reading.
@@ -194,20 +209,42 @@ class JustFloatGloveSettings(GloveSettings):
     """
 
     kind: Literal["justfloat_glove"] = "justfloat_glove"
-    num_values: int = Field(ge=1, le=MAX_VALUES)
-    full_scale: float = Field(gt=0, le=1e30)
-    rate_hz: float = Field(gt=0, le=10_000)
+    num_values: int | None = Field(default=None, ge=1, le=MAX_VALUES)
+    full_scale: float | None = Field(default=None, gt=0, le=1e30)
+    rate_hz: float | None = Field(default=None, gt=0, le=10_000)
+
+    @model_validator(mode="after")
+    def _describes_the_packets(self) -> "JustFloatGloveSettings":
+        names = ("num_values", "full_scale", "rate_hz")
+        missing = [name for name in names if getattr(self, name) is None]
+        if missing and self.layout is None:
+            raise ValueError(
+                f"got no {', '.join(missing)}, expected them, or a layout (a file) that says what "
+                "this glove sends"
+            )
+        return self
 
 
 def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
     """The driver of one glove."""
     transport = serial_transport(settings, device=settings.device)
+    layout = settings.read_layout()
+
+    def setting(name: str, of_layout: str) -> float:
+        value = getattr(settings, name)
+        if value is None and layout is not None:
+            value = getattr(layout, of_layout)
+        if value is None:
+            raise InvalidInputError(f"{settings.device}: got no {name}, expected one or a layout")
+        return float(value)
+
     decoder = JustFloatGloveDecoder(
         settings.side,
-        num_values=settings.num_values,
-        full_scale=settings.full_scale,
-        rate_hz=settings.rate_hz,
+        num_values=int(setting("num_values", "num_raw_cells")),
+        full_scale=setting("full_scale", "full_scale"),
+        rate_hz=setting("rate_hz", "nominal_rate_hz"),
         label=settings.label,
+        layout=layout,
     )
     return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 

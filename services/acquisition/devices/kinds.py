@@ -15,12 +15,12 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, Field, SerializeAsAny, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
-from dextouch.tactile.layout import Side
+from dextouch.tactile.layout import Side, TactileLayout, read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, hand_name
 from services.acquisition.hid_process import HidProcessTransport
@@ -118,10 +118,22 @@ class GloveSettings(SerialLineSettings):
 
     Without a label it gives the stream that episodes need (`tactile_left`). With one it is a
     further glove or patch of cells; its stream (`tactile_left_LABEL`) and calibration are named so.
+    `layout` is the file with the layout of its taxels (docs/stations.md#layout-of-a-glove); by
+    default they are those of `dextouch_v1`.
     """
 
     side: Side
     label: str | None = Field(default=None, pattern=r"^[a-z0-9][a-z0-9_]{0,31}$")
+    layout: Path | None = None
+
+    def read_layout(self) -> TactileLayout | None:
+        """Layout of the file; None where the settings name none.
+
+        Raises:
+            NotFoundError, StorageError, LimitExceededError, InvalidInputError: as
+                `dextouch.tactile.read_layout`.
+        """
+        return None if self.layout is None else read_layout(self.layout)
 
     @property
     def device(self) -> str:
@@ -259,7 +271,8 @@ def _wrong(point: EntryPoint, got: str, expected: str) -> InvalidInputError:
     )
 
 
-def _validated(value: object) -> DeviceSettings:
+def chosen_device(value: object) -> DeviceSettings:
+    """Settings of a device by the kind that they name; ValueError says what is wrong."""
     if isinstance(value, DeviceSettings):
         return value
     if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
@@ -271,9 +284,6 @@ def _validated(value: object) -> DeviceSettings:
     except InvalidInputError as error:
         raise ValueError(error.message) from error
     return settings.model_validate(value)
-
-
-ChosenDevice = Annotated[SerializeAsAny[DeviceSettings], BeforeValidator(_validated)]
 
 
 def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> list[Driver]:

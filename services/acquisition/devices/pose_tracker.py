@@ -24,16 +24,9 @@ from services.acquisition.devices.kinds import (
     TrackerSettings,
     tracker_transport,
 )
+from services.acquisition.drivers import sdk_link
 from services.acquisition.drivers.base import Driver, ReportDecoder, check_packet
 from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
-from services.acquisition.drivers.sdk_link import (
-    DROPPED,
-    BridgedDevice,
-    BridgeDecoder,
-    BridgeDriver,
-    BridgeHello,
-    FrameConvention,
-)
 
 NOMINAL_RATE_HZ = 100.0
 NORM_TOLERANCE = 1e-3
@@ -69,11 +62,9 @@ class PoseGate:
 
     Reachable means: at 5 m/s and 2000 °/s at most. The time in between is the device's, at least
     half a period for every packet, so that a step of its clock cannot shut the gate for good. A
-    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from
-    another one. A quaternion and its negative are the same rotation.
-
-    Args:
-        dropped: where packets that become no sample are counted, by the reason.
+    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from another
+    one. A quaternion and its negative are the same rotation. `dropped` counts packets that become
+    no sample, by the reason.
     """
 
     def __init__(self, dropped: dict[str, int]) -> None:
@@ -94,14 +85,7 @@ class PoseGate:
     def take(
         self, pose: Sequence[float], *, sequence: int, t_device_ns: int, t_host_ns: int
     ) -> Sample | None:
-        """The sample of a running tracker's pose; None where it jumps.
-
-        Args:
-            pose: x y z (m) qw qx qy qz (unit) in the world frame.
-            sequence: of the packet.
-            t_device_ns: when the pose was taken.
-            t_host_ns: when it arrived.
-        """
+        """The sample of a pose x y z (m) qw qx qy qz (unit) in the world; None where it jumps."""
         self._pass_time(t_device_ns)
         if self._last is not None and not self._is_reachable(self._last, pose):
             self._dropped["jumped"] += 1
@@ -157,14 +141,10 @@ class SenderFrame:
     With p_ours = M p_theirs for the world and for the body, R_ours = M R Mᵀ and t_ours = s M t.
     This holds for a left-handed sender too: both mirrors cancel in the rotation, whose axis is
     det(M) M times the sender's and whose angle is the same. M only renames axes and turns some
-    round, so numbers are picked and signed.
-
-    Args:
-        convention: says M.
-        scale_m: s, metres of the sender's unit.
+    round, so numbers are picked and signed. `scale_m` is s, metres of the sender's unit.
     """
 
-    def __init__(self, convention: FrameConvention, scale_m: float) -> None:
+    def __init__(self, convention: sdk_link.FrameConvention, scale_m: float) -> None:
         M = convention.ours_from_theirs()
         # Which of the sender's axes is our x, y, z, and what it is multiplied by.
         self._places = np.abs(M).argmax(axis=1).tolist()
@@ -245,7 +225,7 @@ class PoseTrackerDecoder(ReportDecoder):
     def __init__(self, stream: str) -> None:
         packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
         super().__init__(pose_descriptor(stream), packets)
-        self.tracking = dict.fromkeys(DROPPED, 0)
+        self.tracking = dict.fromkeys(sdk_link.DROPPED, 0)
         self._gate = PoseGate(self.tracking)
         self._device = f"pose_tracker_{stream}"
         self._source = source_of(stream)
@@ -290,16 +270,13 @@ class TrackingResult(IntEnum):
     FALLBACK_ROTATION_ONLY = 300
 
 
-class BridgePoseTrackerDecoder(BridgeDecoder):
+class BridgePoseTrackerDecoder(sdk_link.BridgeDecoder):
     """Poses [x y z qw qx qy qz] (m, world frame) of one device of an OpenVR-like source.
 
     Only the result RUNNING_OK makes a sample. The pose-valid flag never does: such sources keep it
     set while a lost tracker drifts. A running pose that is flagged invalid is dropped too, and a
-    matrix that is no pose is counted as `refused`.
-
-    Args:
-        stream: `wrist_left`, `wrist_right`, `head`, or the name of another place.
-        serial_number: of the tracker; the bridge's only one at this place if None.
+    matrix that is no pose is counted as `refused`. Without a serial number it is the bridge's only
+    device at this place.
     """
 
     def __init__(self, stream: str, *, serial_number: str | None = None) -> None:
@@ -321,7 +298,7 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
         super().reset()
         self._gate.reset()
 
-    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
+    def _learn(self, hello: sdk_link.BridgeHello, chosen: sdk_link.BridgedDevice) -> None:
         self._index, self._frame = chosen.index, SenderFrame(hello.frame, hello.scale_m())
 
     def _new_sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
@@ -376,7 +353,7 @@ def build(settings: PoseTrackerSettings, clock: StationClock) -> Driver:
     transport = tracker_transport(settings)
     if settings.link == "bridge":
         bridged = BridgePoseTrackerDecoder(settings.stream, serial_number=settings.serial_number)
-        return BridgeDriver(name, transport=transport, decoder=bridged, clock=clock)
+        return sdk_link.BridgeDriver(name, transport=transport, decoder=bridged, clock=clock)
     decoder = PoseTrackerDecoder(settings.stream)
     return Driver(name, transport=transport, decoder=decoder, clock=clock)
 

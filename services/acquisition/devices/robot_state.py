@@ -57,9 +57,7 @@ def robot_descriptor(stream: str) -> StreamDescriptor:
 class RobotStateDecoder(Decoder):
     """One packet gives one sample of each stream, all with the same stamps.
 
-    Args:
-        streams: names of those that are wanted, of `STREAM_SIZES`; the packets hold all six. A
-            station whose trackers give the wrists leaves these out.
+    `streams` are those that are wanted; the packets hold all six of `STREAM_SIZES`.
 
     Raises:
         InvalidInputError: no stream, or an unknown or repeated one.

@@ -29,13 +29,8 @@ from dextouch.streams import (
 )
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import CameraStream, DeviceKind, DeviceSettings
+from services.acquisition.drivers import images
 from services.acquisition.drivers.base import Decoder, Driver, Readings
-from services.acquisition.drivers.images import (
-    EncodingQueue,
-    ImageChecker,
-    ImageEncoder,
-    ImageQuality,
-)
 from services.acquisition.drivers.packets import DecoderStatistics
 from services.acquisition.transports import Handle, HandleTransport, TransportInfo
 
@@ -132,8 +127,7 @@ class CapturedImage:
 class CaptureLink(HandleTransport[Handle]):
     """Base of transports to a camera, which gives images instead of bytes.
 
-    Attributes:
-        exposure_ns: what the opened camera states; None where it does not.
+    `exposure_ns` is what the opened camera states; None where it does not.
     """
 
     advice = "is it plugged in, is it in use, may this user read it?"
@@ -164,9 +158,7 @@ class CaptureLink(HandleTransport[Handle]):
 class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
     """A camera by OpenCV's V4L2 backend.
 
-    Args:
-        find: gives the device, such as /dev/video0, at every opening.
-        request: size, rate, pixel format and exposure that it must give.
+    `find` gives the device, such as /dev/video0, at every opening.
     """
 
     def __init__(self, find: Callable[[], str], request: StationCameraSettings) -> None:
@@ -176,11 +168,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
         self._request = request
 
     def wait(self, timeout_s: float) -> bool:
-        """Fetch the next image; False when none came in time.
-
-        Raises:
-            DeviceError: the camera is gone, or not open.
-        """
+        """See `CaptureLink`."""
         import cv2
 
         timeout_ns = max(1, round(timeout_s * 1e9))
@@ -194,7 +182,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
         return bool(came)
 
     def retrieve(self) -> CapturedImage | None:
-        """Decode the image fetched by `wait`; None when it is damaged."""
+        """See `CaptureLink`."""
         import cv2
 
         video = self._opened()
@@ -280,11 +268,7 @@ class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
 
 
 def find_camera(serial_number: str, folder: Path = BY_ID) -> str:
-    """The device of the camera with this serial number, whatever its name is today.
-
-    Args:
-        serial_number: as the kernel has it in the names of `folder`.
-        folder: where the kernel's links are.
+    """The device of the camera with this serial number, by the kernel's links in `folder`.
 
     Raises:
         DeviceError: no such camera is plugged in, or two are; the message lists those that are.
@@ -398,12 +382,8 @@ class StationCamera(Driver):
     `t_host_ns` of a sample is when its image was fetched, `t_device_ns` the middle of its exposure
     by the driver's stamp, on the same clock.
 
-    Args:
-        settings: name, size, rate, encoding and timing.
-        link: opens the camera.
-        clock: of the station.
-        max_encode_wait_s: how long a read waits for the encoder, so that an image need not wait
-            for the next one; half a period if None.
+    A read waits `max_encode_wait_s` for the encoder, half a period if None, so that an image need
+    not wait for the next one.
     """
 
     def __init__(
@@ -419,9 +399,9 @@ class StationCamera(Driver):
         self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
-        encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
-        self._queue = EncodingQueue(encoder, name=settings.stream)
-        self._checker = ImageChecker(period_ns=settings.period_ns)
+        encoder = images.ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
+        self._queue = images.EncodingQueue(encoder, name=settings.stream)
+        self._checker = images.ImageChecker(period_ns=settings.period_ns)
         period_s = settings.period_ns / 1e9
         self._encode_wait_s = period_s / 2 if max_encode_wait_s is None else max_encode_wait_s
         self._exposure_ns = settings.exposure_ns
@@ -429,7 +409,7 @@ class StationCamera(Driver):
         self._silence_ns = FIRST_IMAGE_NS
 
     @property
-    def quality(self) -> ImageQuality:
+    def quality(self) -> images.ImageQuality:
         """What the images are like."""
         return replace(self._checker.quality, num_dropped=self._queue.num_dropped)
 
@@ -504,7 +484,9 @@ class StationCamera(Driver):
         self._checker.check(image, t_driver_ns if has_time else None)
         t_device_ns = NO_DEVICE_TIME
         if has_time:
-            t_device_ns = self._middle_of_exposure_ns(self._on_station_clock(t_driver_ns))
+            half_ns = (self._exposure_ns or 0) // 2
+            to_middle_ns = half_ns if self._settings.stamp_point == "start" else -half_ns
+            t_device_ns = self._on_station_clock(t_driver_ns) + to_middle_ns
         if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
 
@@ -515,14 +497,6 @@ class StationCamera(Driver):
         ahead_ns = [raw_ns - monotonic_ns for monotonic_ns, raw_ns in self._clock_pairs]
         rest_ns = np.interp(0, since_ns, [ahead - ahead_ns[-1] for ahead in ahead_ns])
         return t_driver_ns + ahead_ns[-1] + round(float(rest_ns)) + self._clock.suspended_ns()
-
-    def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
-        half_ns = (self._exposure_ns or 0) // 2
-        return (
-            t_driver_ns + half_ns
-            if self._settings.stamp_point == "start"
-            else t_driver_ns - half_ns
-        )
 
     def _check_silence(self) -> None:
         if self._heard_ns is None:

@@ -14,7 +14,7 @@ import numpy as np
 from dextouch.clocks import RoundTrip
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
+from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
 from services.acquisition.drivers.base import (
@@ -24,6 +24,7 @@ from services.acquisition.drivers.base import (
     check_packet,
     glove_stream,
     hand_name,
+    raw_unit,
 )
 from services.acquisition.drivers.packets import (
     SEQUENCE_MODULUS,
@@ -46,10 +47,10 @@ IDENTITY = struct.Struct("<16s3Bx")
 TIME_SYNC = struct.Struct("<Q")
 MIN_REPLY, MAX_REPLY = REPLY_HEAD.size, REPLY_HEAD.size + IDENTITY.size
 MAGIC = b"DXTG"
-PAYLOAD_BYTES = 2 * NUM_RAW_TAXELS
-NOMINAL_RATE_HZ = 60.0
-FULL_SCALE_COUNTS = 65_535
 _COUNT = np.dtype("<u2")
+# Of a `dextouch_v1`.
+PAYLOAD_BYTES = _COUNT.itemsize * DEXTOUCH_V1.num_raw_cells
+FULL_SCALE_COUNTS = 65_535
 ANSWER_TIMEOUT_NS = 300_000_000
 NUM_ATTEMPTS = 3
 # A virtual clock does not advance while a device is opened; count empty reads instead.
@@ -152,27 +153,42 @@ def _unpacked(what: str, layout: struct.Struct, body: bytes) -> tuple[Any, ...]:
     return layout.unpack(body)
 
 
-def glove_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
-    """The raw stream of one glove."""
+def glove_descriptor(
+    side: Side, label: str | None = None, layout: TactileLayout | None = None
+) -> StreamDescriptor:
+    """The raw stream of one glove; without a layout it is a `dextouch_v1`.
+
+    Raises:
+        InvalidInputError: the layout has readings beyond 16 bits.
+    """
+    about = DEXTOUCH_V1 if layout is None else layout
+    if about.full_scale > FULL_SCALE_COUNTS:
+        raise InvalidInputError(
+            f"glove_{hand_name(side, label)}: got layout {about.name!r} with full_scale "
+            f"{about.full_scale:g}, expected at most {FULL_SCALE_COUNTS}, since its packets hold "
+            "16 bits a cell"
+        )
     return glove_stream(
         side,
         label,
-        shape=(NUM_RAW_TAXELS,),
+        shape=(about.num_raw_cells,),
         dtype="uint16",
-        unit="counts",
-        nominal_rate_hz=NOMINAL_RATE_HZ,
+        unit=raw_unit(about),
+        nominal_rate_hz=about.nominal_rate_hz,
+        layout=layout,
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
 
 class TactileGloveDecoder(StreamDecoder[Packet]):
-    """Decodes one glove's byte stream to uint16 counts [360] in raw scan order.
+    """Decodes one glove's byte stream to uint16 counts [cells] in raw scan order.
 
     Args:
         side: which glove it must be; None takes any.
         on_reply: takes each reply to a command with its arrival; without it replies are passed
             over.
         label: of a further glove of this hand.
+        layout: of its taxels; None of `dextouch_v1`.
     """
 
     def __init__(
@@ -181,15 +197,17 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
         *,
         on_reply: Callable[[Packet, int], None] | None = None,
         label: str | None = None,
+        layout: TactileLayout | None = None,
     ) -> None:
+        # Where the side is open, the stream is named for the left hand.
+        descriptor = glove_descriptor(side or "left", label, layout)
         packets = PacketDecoder(
             MAGIC,
-            min_payload=PAYLOAD_BYTES,
-            max_payload=PAYLOAD_BYTES,
+            min_payload=descriptor.sample_bytes(),
+            max_payload=descriptor.sample_bytes(),
             others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
         )
-        # Where the side is open, the stream is named for the left hand.
-        super().__init__(glove_descriptor(side or "left", label), packets)
+        super().__init__(descriptor, packets)
         self._side: Side | None = side
         self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
         self._on_reply = on_reply
@@ -229,6 +247,7 @@ class TactileGlove(Driver):
         clock: of the station.
         serial_number: that it must have; None takes any.
         label: of a further glove of this hand.
+        layout: of its taxels; None of `dextouch_v1`.
     """
 
     def __init__(
@@ -239,8 +258,9 @@ class TactileGlove(Driver):
         clock: StationClock,
         serial_number: str | None = None,
         label: str | None = None,
+        layout: TactileLayout | None = None,
     ) -> None:
-        decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label)
+        decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label, layout=layout)
         name = f"glove_{hand_name(side, label)}"
         super().__init__(name, transport=transport, decoder=decoder, clock=clock)
         self._side: Side = side
@@ -372,6 +392,7 @@ def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
         clock=clock,
         serial_number=settings.serial_number,
         label=settings.label,
+        layout=settings.read_layout(),
     )
 
 

@@ -10,10 +10,16 @@ from jaxtyping import Float32
 
 from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample
-from dextouch.tactile.layout import Side
+from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, glove_stream
+from services.acquisition.drivers.base import (
+    CellLayout,
+    Driver,
+    StreamDecoder,
+    check_raw_cells,
+    glove_stream,
+)
 from services.acquisition.drivers.packets import FrameSearch
 
 MARK = b"\xaa\x55"
@@ -90,18 +96,24 @@ class WujiFrames(FrameSearch[WujiPacket]):
 class WujiGloveDecoder(StreamDecoder[WujiPacket]):
     """Decodes one glove's byte stream to float32 [768] of full scale, 0 … 1, row by row.
 
-    Cells that the glove has not are NaN, as it sends them.
+    Cells that the glove has not are NaN, as it sends them. Without a `layout` only the calibration
+    maps them to the taxels of `dextouch_v1`.
     """
 
     cells = CellLayout(1.0, GRID)
 
-    def __init__(self, side: Side, *, label: str | None = None) -> None:
+    def __init__(
+        self, side: Side, *, label: str | None = None, layout: TactileLayout | None = None
+    ) -> None:
+        if layout is not None:
+            check_raw_cells(layout, NUM_CELLS, device=f"glove_{side}")
         descriptor = glove_stream(
             side,
             label,
             shape=(NUM_CELLS,),
             dtype="float32",
             unit="full_scale",
+            layout=layout,
             nominal_rate_hz=NOMINAL_RATE_HZ,
             capabilities=ClockCapabilities(
                 crc=True,
@@ -147,7 +159,8 @@ class WujiGloveSettings(GloveSettings):
 def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
     """The driver of one glove."""
     transport = serial_transport(settings, device=settings.device)
-    decoder = WujiGloveDecoder(settings.side, label=settings.label)
+    layout = settings.read_layout()
+    decoder = WujiGloveDecoder(settings.side, label=settings.label, layout=layout)
     return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 

@@ -8,8 +8,8 @@ from typing import Any, Generic
 
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix
-from dextouch.streams import Sample, StreamDescriptor
-from dextouch.tactile.layout import Side
+from dextouch.streams import TAXEL_UNIT, Sample, StreamDescriptor
+from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.images import ImageQuality
 from services.acquisition.drivers.packets import (
@@ -35,16 +35,32 @@ MAX_PARTS = 255
 
 @dataclass(frozen=True)
 class CellLayout:
-    """Layout and range of a glove's cells, for health checks.
+    """A glove's largest reading, in the unit of its stream, and the grid of its cells.
 
-    Attributes:
-        full_scale: the largest reading, in the unit of the stream.
-        grid: rows and columns of the cells of a sample, in row-major order; None if the neighbours
-            of cells are unknown. Cells that read NaN from the start do not exist.
+    `grid` are rows and columns of a sample, row by row, None if the neighbours of cells are
+    unknown; cells that read NaN from the start do not exist.
     """
 
     full_scale: float
     grid: tuple[int, int] | None
+
+
+def raw_unit(layout: TactileLayout) -> str:
+    """Unit of the raw stream of a glove, which is never that of taxels in anatomical order."""
+    return "raw" if layout.unit == TAXEL_UNIT else layout.unit
+
+
+def check_raw_cells(layout: TactileLayout, num_cells: int, *, device: str) -> None:
+    """Check that a layout is one of a device that sends so many numbers.
+
+    Raises:
+        InvalidInputError: it is not.
+    """
+    if layout.num_raw_cells != num_cells:
+        raise InvalidInputError(
+            f"{device}: got layout {layout.name!r} with num_raw_cells {layout.num_raw_cells}, "
+            f"expected {num_cells}, the numbers that this glove sends in each sample"
+        )
 
 
 class Decoder(ABC):
@@ -247,15 +263,10 @@ def split_into_reports(report_id: int, counter: int, data: bytes) -> list[bytes]
 
 
 class ReportReassembler:
-    """Joins the parts of one message; a missing part costs that message alone.
-
-    Attributes:
-        num_reports: how many came.
-        num_incomplete: messages of which a part was missing.
-    """
+    """Joins the parts of one message; a missing part costs that message alone."""
 
     def __init__(self) -> None:
-        self.num_reports = self.num_incomplete = 0
+        self.num_incomplete = 0
         self._parts: list[bytes] = []
         self._key = (0, 0, 0)
 
@@ -266,7 +277,6 @@ class ReportReassembler:
 
     def feed(self, report: bytes) -> tuple[int, bytes] | None:
         """(report id, message) when this report completes one; None of one that is malformed."""
-        self.num_reports += 1
         if len(report) != REPORT_BYTES:
             return None
         report_id, counter, part, num_parts, length = REPORT_HEADER.unpack_from(report)

@@ -15,16 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from dextouch.episodes import (
-    FULL_FORM,
-    GOP_IMAGES,
-    GopEncoder,
-    VideoSettings,
-    check_video_size,
-    decoder_of_this_thread,
-    first_gap,
-    is_keyframe,
-)
+from dextouch import episodes
 from dextouch.errors import CorruptDataError, DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.streams import Sample, encoded_values
@@ -55,18 +46,11 @@ MAX_WAITING_IMAGES = 8
 class ImageQuality:
     """Quality of the newest images of one camera, and counters since the start.
 
-    Attributes:
-        frozen: more than three images in a row were equal, or over 40 % equal the one before.
-        blurred: sharpness below 0.3 of the session's median.
-        clipped_ratio: share of pixels at the dark or the bright end, 0 … 1.
-        gap: at least one image is missing in the driver's timestamps within the last second.
-        num_checked: images whose sharpness and exposure were checked.
-        num_images: all images seen.
-        num_frozen: images that were equal to at least three before them, or repeated regularly.
-        num_blurred: of the checked ones.
-        num_clipped: of the checked ones, those with more than 20 % clipped pixels.
-        num_gaps: gaps of the driver's stamps.
-        num_dropped: images that found the encoder's queue full.
+    `frozen`: more than three images in a row were equal, or over 40 % equal the one before;
+    `blurred`: sharpness is below 0.3 of the session's median; `clipped_ratio`: pixels at the dark
+    or the bright end; `gap`: an image is missing in the driver's timestamps within the last second.
+    Sharpness and exposure are those of the checked images; dropped ones found the encoder's queue
+    full.
     """
 
     frozen: bool = False
@@ -193,16 +177,12 @@ def quarter_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b"]:
     Images of less than 12 pixels are taken as they are.
     """
     green = image[..., 1]
-    height, width = image.shape[0] // _QUARTER * _QUARTER, image.shape[1] // _QUARTER * _QUARTER
+    height, width = (size // _QUARTER * _QUARTER for size in green.shape)
     if min(height, width) < 3 * _QUARTER:
         return np.ascontiguousarray(green)
-    rows, columns = slice(0, height, _QUARTER), slice(0, width, _QUARTER)
-    lower, right = slice(2, height, _QUARTER), slice(2, width, _QUARTER)
-    total = green[rows, columns].astype(np.uint16)
-    total += green[rows, right]
-    total += green[lower, columns]
-    total += green[lower, right]
-    return (total >> 2).astype(np.uint8)
+    every_other = green[:height:2, :width:2].astype(np.uint16)
+    rows = every_other[::2] + every_other[1::2]
+    return ((rows[:, ::2] + rows[:, 1::2]) >> 2).astype(np.uint8)
 
 
 def laplacian_variance(gray: UInt8[np.ndarray, "h w"]) -> float:
@@ -225,10 +205,7 @@ def laplacian_variance(gray: UInt8[np.ndarray, "h w"]) -> float:
 class ImageEncoder:
     """Encodes the images of one camera in their order; used by one thread.
 
-    Args:
-        encoding: `rgb8` leaves the image as it is.
-        size_px: height and width; even for `h264`.
-        rate_hz: nominal.
+    `rgb8` leaves images as they are; for `h264` height and width must be even.
 
     Raises:
         InvalidInputError: a size that H.264 cannot have.
@@ -240,16 +217,14 @@ class ImageEncoder:
         self.encoding: ImageEncoding = encoding
         self._size_px, self._rate_hz = size_px, rate_hz
         if encoding == "h264":
-            check_video_size(*size_px)
+            episodes.check_video_size(*size_px)
             # Now, since it takes longer than the first images would wait.
             self._video = self._new_video()
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"], *, begins: bool) -> np.ndarray:
-        """The values of the image's sample: uint8 [h, w, 3], or bytes as a 0-d object array.
+        """The values of a sample: uint8 [h, w, 3] RGB, or bytes as a 0-d object array.
 
-        Args:
-            image: RGB.
-            begins: whether it must begin a group of pictures.
+        `begins` says that the image must begin a group of pictures.
         """
         if self.encoding == "rgb8":
             return image
@@ -260,18 +235,16 @@ class ImageEncoder:
             self._video = self._new_video()
         return encoded_values([self._video.encode(image)]).reshape(())
 
-    def _new_video(self) -> GopEncoder:
-        return GopEncoder(*self._size_px, rate_hz=self._rate_hz, settings=VideoSettings())
+    def _new_video(self) -> episodes.GopEncoder:
+        return episodes.GopEncoder(
+            *self._size_px, rate_hz=self._rate_hz, settings=episodes.VideoSettings()
+        )
 
 
 class EncodingQueue:
     """Passes images to an encoder in a separate thread; what finds the queue full is dropped.
 
     `put` and `collect` belong to the reader thread, `begin_group` to any.
-
-    Args:
-        encoder: of the camera; used by the queue's thread alone.
-        name: of the stream, for the thread.
     """
 
     def __init__(self, encoder: ImageEncoder, *, name: str) -> None:
@@ -288,11 +261,7 @@ class EncodingQueue:
             self._is_group_wanted = True
 
     def put(self, image: Sample) -> bool:
-        """Queue an image, whose pixels must not change any more; False when it was dropped.
-
-        Args:
-            image: uint8 [h, w, 3], RGB, with the stamps of its sample.
-        """
+        """Queue an image, uint8 [h, w, 3] RGB, which must not change any more; False if dropped."""
         num_waiting = sum(not future.done() for future in self._waiting)
         if num_waiting >= MAX_WAITING_IMAGES:
             self.num_dropped += 1
@@ -339,9 +308,9 @@ class GroupPreview:
 
     def add(self, access_unit: bytes) -> None:
         """The next image."""
-        if is_keyframe(access_unit):
+        if episodes.is_keyframe(access_unit):
             self._group = (access_unit,)
-        elif 0 < len(self._group) < GOP_IMAGES:
+        elif 0 < len(self._group) < episodes.GOP_IMAGES:
             self._group = (*self._group, access_unit)
         else:
             self._group = ()
@@ -357,8 +326,8 @@ class GroupPreview:
         if not group:
             raise NotFoundError("H.264 preview: no key frame has come yet; ask again in a moment")
         pixels = np.empty((1, *self._size_px, 3), dtype=np.uint8)
-        decoder = decoder_of_this_thread(*self._size_px)
-        decoder.decode(group, [len(group) - 1], FULL_FORM, pixels)
+        decoder = episodes.decoder_of_this_thread(*self._size_px)
+        decoder.decode(group, [len(group) - 1], episodes.FULL_FORM, pixels)
         return pixels[0]
 
 
@@ -366,11 +335,8 @@ class WholeGroups:
     """Gives the H.264 samples of a device that encodes itself in whole groups only.
 
     A group that lost an image is dropped as a whole: the store could not take the rest of it. The
-    images' own numbers tell what was lost before the device numbered its packets.
-
-    Args:
-        stream: for messages.
-        statistics: where dropped images are counted as refused.
+    images' own numbers tell what was lost before the device numbered its packets. Dropped images
+    are counted as refused.
     """
 
     def __init__(self, stream: str, statistics: DecoderStatistics) -> None:
@@ -387,30 +353,31 @@ class WholeGroups:
         Raises:
             DeviceError: the device's groups have another length.
         """
-        begins = is_keyframe(sample.values.item())
+        begins = episodes.is_keyframe(sample.values.item())
         follows = _follow(self._group, sample)
         # Nothing is missing in either case: the device means its groups to be so long.
         is_too_short = begins and follows and self._is_meant_short()
+        # A picture of a later group neither continues the last one nor repeats its last number.
         is_too_long = (
             not begins
             and _follow(self._complete, sample)
-            and not _is_of_later_group(self._complete, sample)
+            and any(_is_complete([*self._complete[:end], sample]) for end in (None, -1))
         )
         if begins or not follows:
             self.reset()
         if is_too_short or is_too_long:
             self._statistics.refused += 1
             raise DeviceError(
-                f"{self._stream}: its H.264 groups have another length than {GOP_IMAGES} images; "
-                "set the bridge's encoder, or let it send JPEG images"
+                f"{self._stream}: its H.264 groups have another length than "
+                f"{episodes.GOP_IMAGES} images; set the bridge's encoder, or send JPEG images"
             )
         if not (begins or follows):
             self._statistics.refused += 1
             return []
         self._group.append(sample)
-        if len(self._group) < GOP_IMAGES:
+        if len(self._group) < episodes.GOP_IMAGES:
             return []
-        self._last_length = GOP_IMAGES
+        self._last_length = episodes.GOP_IMAGES
         self._complete, self._group = self._group, []
         return self._complete
 
@@ -437,11 +404,6 @@ def _follow(samples: list[Sample], sample: Sample) -> bool:
 def _is_complete(samples: list[Sample]) -> bool:
     """Whether no picture is missing between these, by their own numbers."""
     try:
-        return first_gap([one.values.item() for one in samples]) is None
+        return episodes.first_gap([one.values.item() for one in samples]) is None
     except CorruptDataError:
         return False
-
-
-def _is_of_later_group(group: list[Sample], sample: Sample) -> bool:
-    """Whether a picture neither continues a group nor repeats its last number."""
-    return not (_is_complete([*group, sample]) or _is_complete([*group[:-1], sample]))

@@ -74,10 +74,7 @@ class SequenceCounter:
     ) -> None:
         """One packet came.
 
-        Args:
-            sequence: its number.
-            t_device_ns: its time, if the device has a clock.
-            is_restarted: the device's clock says that it started anew, so the number may be any.
+        `is_restarted`: its clock says that the device started anew, so that the number may be any.
         """
         statistics = self._statistics
         statistics.packets += 1
@@ -96,7 +93,9 @@ class SequenceCounter:
         if self._is_repeated(came) and not (is_restarted and t_device_ns is None):
             statistics.repeated += 1
             return
-        stands_still = step == 0 and self._stands_still(sequence)
+        # The newest two packets had this number, too: the device does not count.
+        numbers = [number for number, _ in self._came][-2:]
+        stands_still = step == 0 and numbers == [sequence, sequence]
         if (0 < step < self._modulus // 2 or stands_still) and not is_restarted:
             statistics.lost += max(0, step - 1)
             self._go_on(sequence, step)
@@ -114,11 +113,6 @@ class SequenceCounter:
         # As long before the oldest of the newest packets as that is before the newest one.
         reach_ns = max(2 * (newest_ns - min(times_ns)), MIN_LATE_NS)
         return newest_ns - reach_ns <= t_device_ns <= newest_ns
-
-    def _stands_still(self, sequence: int) -> bool:
-        """Whether the newest two packets had this number, too: the device does not count."""
-        came = self._came
-        return len(came) > 1 and came[-1][0] == came[-2][0] == sequence
 
     def _is_repeated(self, came: tuple[int, int | None]) -> bool:
         if self._last is None or (self._last - came[0]) % self._modulus >= LATE_PACKETS:
@@ -194,9 +188,7 @@ class FrameSearch(PortionedSearch[Found]):
     After an invalid frame the search continues one byte further, not after its claimed end, so that
     only the damaged frame is lost.
 
-    Args:
-        mark: the bytes that every frame begins with.
-        sequence_bits: of the sequence number; `_take` gives each to `self.sequence.count`.
+    `_take` gives each sequence number to `self.sequence.count`.
     """
 
     def __init__(self, mark: bytes, *, sequence_bits: int) -> None:
@@ -261,12 +253,8 @@ def encode_packet(magic: bytes, packet: Packet) -> bytes:
 class PacketDecoder(FrameSearch[Packet]):
     """Finds packets of our documented devices; late and repeated ones are counted and left out.
 
-    Args:
-        magic: of the kind whose sequence is counted.
-        min_payload: smallest payload of this kind in bytes.
-        max_payload: largest.
-        others: further kinds on the same link with their smallest and largest payloads; their
-            packets are returned too, but are not part of the sequence.
+    Packets of `others`, further kinds on the same link with their smallest and largest payloads in
+    bytes, are returned too, but are not part of the sequence.
     """
 
     def __init__(

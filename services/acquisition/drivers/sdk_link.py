@@ -27,12 +27,14 @@ MAX_AGE_NS = 200_000_000
 RESTART_NS = 1_000_000_000
 # How fast a source's clock may drift away from the host's before its data counts as old.
 MAX_DRIFT_PPM = 200
+# Chosen: a packet of 8 KiB, as many numbers as a large tactile array has cells.
+MAX_CHANNELS = 1024
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Why packets of a tracker become no sample.
 DROPPED = ("occluded", "jumped", "stale")
 
-BridgeKind = Literal["finger_tracker", "pose_tracker"]
+BridgeKind = Literal["finger_tracker", "pose_tracker", "numbers"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 HELLO_READS = 20
 SILENCE_NS = 200_000_000
@@ -86,6 +88,7 @@ class BridgeHello(FrozenModel):
     frame: FrameConvention
     length_unit: Literal["m", "cm", "mm"]
     nodes: tuple[tuple[str, str], ...] | None = None
+    channels: int | None = Field(default=None, ge=1, le=MAX_CHANNELS)
 
     @model_validator(mode="after")
     def _tells_devices_apart(self) -> "BridgeHello":
@@ -95,6 +98,8 @@ class BridgeHello(FrozenModel):
                 raise ValueError(f"devices: {name} {values} are not all different")
         if (self.nodes is None) is (self.kind == "finger_tracker"):
             raise ValueError("nodes: needed from a finger tracker, and from nothing else")
+        if (self.channels is None) is (self.kind == "numbers"):
+            raise ValueError("channels: needed from a source of numbers, and from nothing else")
         return self
 
     def scale_m(self) -> float:
@@ -161,18 +166,9 @@ class FreshnessGate:
 class BridgeDecoder(StreamDecoder[Packet]):
     """Base of the decoders of one device behind a bridge: its hello, and which packets are new.
 
-    Args:
-        kind: what the bridge must be.
-        descriptor: of the stream.
-        source: where the wanted device sits.
-        serial_number: of the wanted device; the only one of its source if None.
-        magic: of its packets; those without a payload are heartbeats.
-        payload_bytes: of a packet with a sample.
-
-    Attributes:
-        hello: of this connection; None before it came.
-        tracking: counts of packets that became no sample, by the reason.
-        statistics: of all devices of the bridge; `refused` counts packets of a wrong size too.
+    Without a serial number the wanted device is the only one of its source. Packets without a
+    payload are heartbeats. `statistics` are of all devices of the bridge; `refused` counts packets
+    of a wrong size, too.
     """
 
     def __init__(

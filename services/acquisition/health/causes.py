@@ -57,7 +57,6 @@ class _Unexplained:
         self._left = {stream.stream: list(stream.findings) for stream in streams}
 
     def of(self, stream: StreamHealth) -> Sequence[RaisedFinding]:
-        """What is left of one stream."""
         return self._left[stream.stream]
 
     def take(
@@ -88,11 +87,7 @@ def find_causes(
 ) -> tuple[HealthCause, ...]:
     """Why the station is not well, widest and gravest cause first.
 
-    Args:
-        streams: with their findings.
-        devices: of the streams, with what they share.
-        findings: of the station itself.
-        cpu_ratio: share of the processors' time that was used in the last 10 s.
+    `cpu_ratio` is the share of the processors' time that was used in the last 10 s.
     """
     left = _Unexplained(streams)
     known = {device.device: device for device in devices}
@@ -103,7 +98,11 @@ def find_causes(
         *_shared(left, known, LINK_CODES),
         *_clocks(left, known),
         *_own(left, known),
-        *(_of_station(finding) for finding in findings if finding.code not in HOST_FINDINGS),
+        *(
+            _cause("station", f.code, f.message, [], [f], advice=f.advice)
+            for f in findings
+            if f.code not in HOST_FINDINGS
+        ),
     ]
     return tuple(
         sorted(causes, key=lambda cause: (_ORDER.index(cause.code), -SEVERITY.index(cause.level)))
@@ -171,7 +170,6 @@ def _gone(left: _Unexplained, known: Mapping[str, DeviceHealth]) -> Iterator[Hea
 
 
 def _clocks(left: _Unexplained, known: Mapping[str, DeviceHealth]) -> Iterator[HealthCause]:
-    """Devices whose clock was set, or which restarted."""
     for device, streams in left.devices({"clock_step"}).items():
         explained = left.take(streams, lambda finding: finding.code in CLOCK_CODES)
         step = next(finding for _, finding in explained if finding.code == "clock_step")
@@ -196,10 +194,6 @@ def _of_device(
     is_simulated = device in known and known[device].simulated
     advice = SIMULATED_ADVICE if is_simulated else leading.advice
     return _cause(code, device, f"{device}: {leading.message}", explained, advice=advice)
-
-
-def _of_station(finding: RaisedFinding) -> HealthCause:
-    return _cause("station", finding.code, finding.message, [], [finding], advice=finding.advice)
 
 
 def _cause(

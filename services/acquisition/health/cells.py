@@ -2,9 +2,9 @@
 
 A cell that does not change is not necessarily faulty, because a hand at rest looks the same. It is
 reported if its neighbours change while it does not, or if no load explains its reading.
-`TaxelCheck` checks our own glove by its tare. `CellCheck` checks gloves of other manufacturers,
-which have none: a position that never had a reading is not a cell, and if the layout is unknown, a
-cell that never changed may be an unused position.
+`TaxelCheck` checks gloves that send counts, whose layout wires their taxels, by their tare.
+`CellCheck` checks gloves of other manufacturers: a position that never had a reading is not a cell,
+and if the layout is unknown, a cell that never changed may be an unused position.
 """
 
 import math
@@ -20,15 +20,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix, TaxelState
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import (
-    NUM_RAW_TAXELS,
-    NUM_TAXELS,
-    Side,
-    join_pads,
-    raw_indices,
-    split_pads,
-)
-from services.acquisition.devices.tactile_glove import FULL_SCALE_COUNTS
+from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.drivers.base import CellLayout, Decoder
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
@@ -62,10 +54,18 @@ PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
 
 
-def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
-    """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
-    tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
-    return join_pads(tips, palm)
+def neighbour_share(
+    moved: Bool[np.ndarray, " taxels"],
+    layout: TactileLayout = DEXTOUCH_V1,
+    exists: Bool[np.ndarray, " taxels"] | None = None,
+) -> Float64[np.ndarray, " taxels"]:
+    """Share of the up to 8 neighbours on its pad that moved, for each taxel.
+
+    Only taxels that exist are neighbours; by default all do.
+    """
+    others = np.ones_like(moved) if exists is None else exists
+    stacks = zip(layout.split(moved), layout.split(others), strict=True)
+    return layout.join([share_around(*stack) for stack in stacks])
 
 
 def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
@@ -149,17 +149,14 @@ class _PressureCheck(ABC):
     ) -> None:
         """Name the taxels in each state; a taxel has the first of the states that it is in.
 
-        Args:
-            evaluation: gets them.
-            states: masks of the taxels, or of the cells.
-            cells: the cell of each taxel where the masks are those of cells.
+        `cells` is the cell of each taxel where the masks are those of cells.
         """
-        left = np.ones(NUM_TAXELS, dtype=np.bool_)
+        left = np.ones((), dtype=np.bool_)
         for state, mask in states.items():
             taxels = mask if cells is None else mask[cells] & (cells != NO_CELL)
             if (marked := np.flatnonzero(taxels & left)).size:
                 evaluation.taxels[state] = tuple(marked.tolist())
-            left &= ~taxels
+            left = left & ~taxels
 
     def _report(
         self,
@@ -179,34 +176,41 @@ class _PressureCheck(ABC):
 
 
 class TaxelCheck(_PressureCheck):
-    """Checks the 320 taxels of our own glove from its raw counts.
+    """Checks the taxels of a glove from its raw counts.
 
     A taxel drifts if for 10 s it read 2 kPa or more above its tare, or below it, while three
     quarters of its neighbours read less than half of that: what presses there would press them,
     too. This is only marked and raises nothing, because a point that presses one taxel looks alike.
-
-    Args:
-        record: calibration of the glove.
-        refused: taxels whose gain the calibration refused.
+    `refused` are taxels whose gain the calibration refused, `layout` is that of the glove.
     """
 
-    def __init__(self, record: GloveRecord, refused: Bool[np.ndarray, "320"] | None = None) -> None:
-        super().__init__(float(FULL_SCALE_COUNTS), "taxels")
+    def __init__(
+        self,
+        record: GloveRecord,
+        refused: Bool[np.ndarray, " taxels"] | None = None,
+        layout: TactileLayout = DEXTOUCH_V1,
+    ) -> None:
+        super().__init__(layout.full_scale, "taxels")
+        self._layout = layout
         self._indices = record.cells
         self._tare_counts = record.tare_counts[self._indices]
         self._gain_counts_per_kpa = record.gain_counts_per_kpa[self._indices]
         sigma_counts = float(np.median(record.tare_sigma_counts[self._indices]))
         self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
-        self._refused = np.zeros(NUM_TAXELS, dtype=np.bool_) if refused is None else refused
+        none = np.zeros(layout.num_taxels, dtype=np.bool_)
+        self._refused = none if refused is None else refused
         # Least reading of each half second of the last 10 s, with its time.
         self._lows: deque[tuple[int, np.ndarray]] = deque()
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
-        return values[:, self._indices].astype(np.int64)
+        taxels = values[:, self._indices]
+        return taxels.astype(np.int64) if taxels.dtype.kind in "iu" else taxels.astype(np.float64)
 
     def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
         tare, moved_counts = self._tare_counts, MOVED_KPA * self._gain_counts_per_kpa
-        silent = self._find_silent(high == low, neighbour_share(high - low >= moved_counts))
+        silent = self._find_silent(
+            high == low, neighbour_share(high - low >= moved_counts, self._layout)
+        )
         at_top, saturated = low >= self._top, self._saturated()
         nothing = (tare >= MIN_TARE_COUNTS) & (high < NOTHING_SHARE * tare)
         loaded = self._recent[-1] > tare + moved_counts
@@ -216,7 +220,7 @@ class TaxelCheck(_PressureCheck):
             "taxels_saturated": saturated,
         }
         parts = {code: part for code, taxels in found.items() if (part := self._part(taxels))}
-        self._report(evaluation, found, NUM_TAXELS, parts)
+        self._report(evaluation, found, self._layout.num_taxels, parts)
         evaluation.suspicious |= bool((at_top & ~saturated).any())
         self._mark(
             evaluation,
@@ -229,14 +233,14 @@ class TaxelCheck(_PressureCheck):
         )
         self._judge_drift(evaluation)
 
-    def _drifting(self, now_ns: int, low: np.ndarray) -> Bool[np.ndarray, "320"]:
+    def _drifting(self, now_ns: int, low: np.ndarray) -> Bool[np.ndarray, " taxels"]:
         """Taxels whose own zero has moved; none before 10 s are known."""
         lows = self._lows
         lows.append((now_ns, low))
         while now_ns - lows[0][0] > DRIFT_NS:
             lows.popleft()
         if now_ns - lows[0][0] < DRIFT_NS - MAX_STEP_NS:
-            return np.zeros(NUM_TAXELS, dtype=np.bool_)
+            return np.zeros(self._layout.num_taxels, dtype=np.bool_)
         rows_kpa = (np.stack([row for _, row in lows]) - self._tare_counts) / (
             self._gain_counts_per_kpa
         )
@@ -245,7 +249,7 @@ class TaxelCheck(_PressureCheck):
         below_kpa = np.median(rows_kpa, axis=0) - np.median(rows_kpa)
         moved = (rest_kpa >= CONTACT_THRESHOLD_KPA) | (below_kpa <= -CONTACT_THRESHOLD_KPA)
         still = np.abs(rest_kpa) < CONTACT_THRESHOLD_KPA / 2
-        return moved & (neighbour_share(still) >= STRONG_SHARE)
+        return moved & (neighbour_share(still, self._layout) >= STRONG_SHARE)
 
     def _judge_drift(self, evaluation: Evaluation) -> None:
         """Common offset of the taxels at rest; none while much of the hand is touched."""
@@ -261,11 +265,12 @@ class TaxelCheck(_PressureCheck):
 
     def _part(self, taxels: np.ndarray) -> str | None:
         """Name of a pad or scan line that consists of such taxels only."""
-        tips, palm = split_pads(taxels)
-        if tips.all(axis=(1, 2)).any():
-            return "a whole fingertip"
-        if palm.all():
-            return "the whole palm"
+        for pad, start in zip(self._layout.pads, self._layout.starts, strict=True):
+            if taxels[start : start + pad.num_taxels].all():
+                return "the whole palm" if pad.part == "palm" else "a whole fingertip"
+        if self._layout is not DEXTOUCH_V1:
+            # How another glove is scanned is not known.
+            return None
         rows, columns = np.divmod(self._indices, _SCAN_COLUMNS)
         for word, lines in (("row", rows), ("column", columns)):
             empty = np.setdiff1d(lines, lines[~taxels])
@@ -277,10 +282,8 @@ class TaxelCheck(_PressureCheck):
 def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellCheck | None":
     """The check of the cells that a decoder reads; None where it tells of none.
 
-    Args:
-        decoder: of a device with one stream.
-        calibration: of the station; `<stream>_cells` (1 x 320) gives for each taxel the number of
-            its cell, -1 for none.
+    `<stream>_cells` (1 x taxels) of the calibration gives for each taxel the number of its cell, -1
+    for none. Without it the layout of the stream does, if there is one.
 
     Raises:
         InvalidInputError: the grid is not that of a sample, or the map names a cell that the glove
@@ -299,42 +302,45 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellChec
         )
     cells = mapped_cells(descriptor, calibration)
     used = None if cells is None else np.isin(np.arange(num_cells), cells[cells != NO_CELL])
-    return CellCheck(layout, used, cells)
+    return CellCheck(layout, used, cells, descriptor.layout)
 
 
 def refused_taxels(
     descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> Bool[np.ndarray, "320"] | None:
+) -> Bool[np.ndarray, " taxels"] | None:
     """Taxels of our own glove whose gain the calibration refused; None where it does not say."""
     states = np.array(calibration.get(f"{descriptor.name}_taxel_state", ())).ravel()
-    if states.shape != (NUM_RAW_TAXELS,) or descriptor.side is None:
+    layout = descriptor.tactile_layout
+    if states.shape != (layout.num_raw_cells,) or descriptor.side is None:
         return None
-    return states[raw_indices(side=descriptor.side)] > 0
+    return states[layout.raw_indices(descriptor.side)] > 0
 
 
 class CellCheck(_PressureCheck):
     """Checks the cells of another manufacturer's glove.
 
-    On a known grid a cell is silent when it does not change while its neighbours move: dead at
-    rest, stuck under load. Without one, a loaded cell is stuck when it does not change for 5 s
-    while three quarters of the loaded cells do. Cells that no taxel uses tell of their neighbours
-    and are not judged themselves.
+    On a known grid, or on the pads of a known layout, a cell is silent when it does not change
+    while its neighbours move: dead at rest, stuck under load. Without them, a loaded cell is stuck
+    when it does not change for 5 s while three quarters of the loaded cells do. Cells that no taxel
+    uses tell of their neighbours and are not judged themselves.
 
     Args:
         layout: full scale and grid of its cells.
         used: which of them measure a taxel; None where no map tells.
         taxel_cells: the cell of each taxel, -1 for none; None where no map tells.
+        pads: layout of the taxels; None where neighbours are those of the grid.
     """
 
     def __init__(
         self,
         layout: CellLayout,
         used: Bool[np.ndarray, " cells"] | None = None,
-        taxel_cells: Int64[np.ndarray, "320"] | None = None,
+        taxel_cells: Int64[np.ndarray, " taxels"] | None = None,
+        pads: TactileLayout | None = None,
     ) -> None:
         super().__init__(layout.full_scale, "cells")
         self._full_scale, self._grid, self.used = layout.full_scale, layout.grid, used
-        self._taxel_cells = taxel_cells
+        self._taxel_cells, self._pads = taxel_cells, pads
         self._lowest = self._highest = np.full(1, np.nan)
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
@@ -346,7 +352,7 @@ class CellCheck(_PressureCheck):
     def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
         exists, last = np.isfinite(self._lowest), self._recent[-1]
         margin = LOADED_SHARE * self._full_scale
-        if self._grid is None:
+        if self._grid is None and self._pads is None:
             exists &= self._highest > self._lowest
             loaded = last > self._lowest + margin
             dead, stuck = np.zeros_like(exists), self._stuck(loaded)
@@ -355,7 +361,7 @@ class CellCheck(_PressureCheck):
             rest = float(np.median(self._lowest[exists])) if exists.any() else 0.0
             loaded = last > rest + margin
             moved = (high - low >= MOVED_SHARE * self._full_scale) & exists
-            around = share_around(moved.reshape(self._grid), exists.reshape(self._grid)).ravel()
+            around = self._around(moved, exists)
             silent = self._find_silent(high == low, np.where(exists, around, 0.0))
             dead, stuck = silent & ~loaded, silent & loaded
         # This maker's NaN says that there is no cell: none may come and go.
@@ -380,6 +386,17 @@ class CellCheck(_PressureCheck):
             evaluation.findings.append(Finding("nan", "ERROR" if is_error else "WARN", text))
         evaluation.suspicious |= bool(((low >= self._top) & judged & ~saturated).any())
 
+    def _around(self, moved: np.ndarray, exists: np.ndarray) -> Float64[np.ndarray, " cells"]:
+        """Share of the neighbours that moved, of each cell."""
+        pads, cells = self._pads, self._taxel_cells
+        if pads is None or cells is None:
+            return share_around(moved.reshape(self._grid), exists.reshape(self._grid)).ravel()
+        there = cells != NO_CELL
+        around = np.zeros(len(moved))
+        shares = neighbour_share(moved[cells] & there, pads, exists[cells] & there)
+        around[cells[there]] = shares[there]
+        return around
+
     def _stuck(self, loaded: np.ndarray) -> np.ndarray:
         quiet, num_loaded = self._quiet(), int(loaded.sum())
         num_moving = int((loaded & ~quiet).sum())
@@ -387,8 +404,14 @@ class CellCheck(_PressureCheck):
         return loaded & quiet & others_move
 
 
-def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side) -> dict[str, int]:
-    """How many taxels are out by the least and greatest counts [360] of a whole take.
+def count_taxels(
+    low_counts: np.ndarray,
+    high_counts: np.ndarray,
+    *,
+    side: Side,
+    layout: TactileLayout = DEXTOUCH_V1,
+) -> dict[str, int]:
+    """How many taxels are out by the least and greatest counts [cells] of a whole take.
 
     Without a tare a taxel that reads 0 throughout is dead where the others rest above 0. One that
     never changed although its neighbours moved is dead, too, or stuck where it stayed more than
@@ -397,10 +420,10 @@ def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side)
     Returns:
         Numbers of `dead_taxels`, `stuck_taxels` and `saturated_taxels`.
     """
-    indices = raw_indices(side=side)
+    indices = layout.raw_indices(side)
     low, high = low_counts[indices].astype(np.int64), high_counts[indices].astype(np.int64)
-    around = neighbour_share(high - low >= MOVED_COUNTS)
-    saturated = low >= SATURATED_SHARE * FULL_SCALE_COUNTS
+    around = neighbour_share(high - low >= MOVED_COUNTS, layout)
+    saturated = low >= SATURATED_SHARE * layout.full_scale
     silent = (high == low) & (around >= STRONG_SHARE) & ~saturated
     zero = (high == 0) & (np.median(low) >= MIN_TARE_COUNTS)
     loaded = low > np.median(low) + MOVED_COUNTS

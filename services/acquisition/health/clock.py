@@ -144,7 +144,7 @@ class ClockCheck:
         return slope_ppm if is_borne_out else early_ppm
 
     def _early_skew_ppm(self) -> float:
-        """Slope of the offsets' lower edge that all parts of the window show, less its doubt."""
+        """Slope of the offsets' lower edge that all parts of the window show, minus its error."""
         offsets_ns, t_ns = self._offsets.values, self._offsets.t_ns
         if len(t_ns) < MIN_EARLY_SAMPLES or self._steps:
             return 0.0
@@ -156,9 +156,9 @@ class ClockCheck:
             return 0.0
         # Late arrivals raise an edge for a while; what the whole window does, each part does.
         above_ns = np.mean([np.mean(part - part.min()) for part in parts])
-        doubt_ppm = 4.0 * above_ns * 1e-3 / len(offsets_ns) / span_s
+        uncertainty_ppm = 4.0 * above_ns * 1e-3 / len(offsets_ns) / span_s
         slope_ppm = slopes_ppm[np.argmin(np.abs(slopes_ppm))]
-        return float(np.sign(slope_ppm) * max(0.0, abs(slope_ppm) - doubt_ppm))
+        return float(np.sign(slope_ppm) * max(0.0, abs(slope_ppm) - uncertainty_ppm))
 
     def _note(self, t_ns: int) -> None:
         if not self._steps or t_ns - self._steps[-1] >= SAME_STEP_NS:

@@ -109,14 +109,9 @@ class Finding(NamedTuple):
 class Evaluation:
     """One evaluation of a stream or of the station, to which each of its checks adds.
 
-    Attributes:
-        now_ns: time on the station's clock.
-        block: samples since the last evaluation; none of the station itself.
-        findings: what is wrong.
-        figures: numbers by metric name.
-        taxels: which taxels of a glove are out of order, in anatomical order, by their state.
-        suspicious: asks for another evaluation before the regular one, for faults that must last a
-            while before they count.
+    `block` has none of the station itself, `figures` are numbers by metric name, `taxels` those of
+    a glove that are out of order, in anatomical order, by state. `suspicious` requests another
+    evaluation before the regular one, for faults that must last a while before they count.
     """
 
     now_ns: int
@@ -136,11 +131,7 @@ class Evaluation:
     ) -> None:
         """Add a finding where a value is above the limits of its code.
 
-        Args:
-            code: what it is.
-            value: in the unit of the code's limits.
-            message: in words.
-            at_least: limits for WARN and ERROR where those of the code are smaller.
+        `at_least` are limits for WARN and ERROR where those of the code are smaller.
         """
         rule = CODES[code]
         if value > max(rule.warn, at_least[0]):
@@ -224,10 +215,8 @@ class Board:
     ) -> list[tuple[str, HealthLevel]]:
         """One evaluation; codes whose level changed, with the new level.
 
-        Args:
-            findings: at most one a code counts: the gravest.
-            now_ns: of the evaluation.
-            confirming: an evaluation between the regular ones. It may raise, never clear.
+        Of one code the gravest finding counts. `confirming` is an evaluation between the regular
+        ones, which may raise, never clear.
         """
         judged: dict[str, HealthLevel] = {}
         for finding in sorted(findings, key=lambda item: SEVERITY.index(item.level)):

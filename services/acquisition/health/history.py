@@ -71,13 +71,7 @@ class Rows(NamedTuple):
 
 
 class StreamMeter:
-    """Measures one stream from one row of the history to the next.
-
-    Args:
-        statistics: the present counts of its device's packets.
-        descriptor: of the stream.
-        capacity: of the buffer that the blocks come from, in samples.
-    """
+    """Measures one stream from one row of the history to the next."""
 
     def __init__(
         self,
@@ -107,7 +101,11 @@ class StreamMeter:
         """What was measured since the last row, by series; what is unknown is left out."""
         t_ns = np.concatenate([np.empty(0, dtype=np.int64), *self._blocks])
         row = {"level": float(level), "buffer_ratio": self._largest_block / self._capacity}
-        row |= self._loss()
+        statistics, counts = self._statistics(), self._counts
+        self._counts = statistics.packets, statistics.lost
+        num_packets, num_lost = statistics.packets - counts[0], max(0, statistics.lost - counts[1])
+        if offered := num_packets + num_lost:
+            row["loss_ratio"] = num_lost / offered
         last_ns = int(t_ns[-1]) if len(t_ns) else self._last_ns
         # A sample that is due counts in part, so that rates are not rounded to whole samples.
         phase = 0.0
@@ -138,14 +136,6 @@ class StreamMeter:
             found["interval_p95_s"] = float(np.percentile(ended_s, 95))
             found["interval_max_s"] = float(ended_s.max())
         return found
-
-    def _loss(self) -> dict[str, float]:
-        statistics = self._statistics()
-        packets, lost = statistics.packets, statistics.lost
-        num_packets, num_lost = packets - self._counts[0], max(0, lost - self._counts[1])
-        self._counts = packets, lost
-        offered = num_packets + num_lost
-        return {"loss_ratio": num_lost / offered} if offered else {}
 
 
 class HealthHistory:
@@ -182,12 +172,7 @@ class HealthHistory:
     def rows(
         self, streams: Sequence[str] = (), *, since_ns: int = 0, limit: int = NUM_ROWS
     ) -> Rows:
-        """The newest rows, oldest first.
-
-        Args:
-            streams: all of them if empty.
-            since_ns: earlier rows are left out.
-            limit: at most so many.
+        """The newest `limit` rows from `since_ns` on, oldest first; of all streams by default.
 
         Raises:
             UnknownNameError: no such stream.
@@ -222,11 +207,19 @@ class HealthHistory:
             return tuple(t for t in self._takes if t.stop_ns is None or t.stop_ns >= since_ns)
 
 
-def history_facts(
-    now_ns: int, takes: tuple[TakeSpan, ...], nominal_rate_hz: Mapping[str, float]
-) -> dict[str, object]:
-    """What a history tells besides its rows (`dextouch.schemas.HealthHistory`)."""
-    return {
+def encoded_history(
+    rows: Rows,
+    now_ns: int,
+    takes: tuple[TakeSpan, ...],
+    nominal_rate_hz: Mapping[str, float],
+    *,
+    packed: bool,
+) -> bytes:
+    """A history (`dextouch.schemas.HealthHistory`) as JSON, null where a value is unknown.
+
+    Packed, the arrays `t_ns`, `station` and `streams` stand beside the other fields.
+    """
+    facts: dict[str, object] = {
         "now_ns": now_ns,
         "now_unix_s": time.time(),
         "takes": [take.model_dump() for take in takes],
@@ -234,15 +227,8 @@ def history_facts(
         "station_series": list(STATION_SERIES),
         "stream_series": list(STREAM_SERIES),
     }
-
-
-def packed_history(facts: Mapping[str, object], rows: Rows) -> bytes:
-    """The facts as fields, and arrays `t_ns`, `station` and `streams` in the order of the facts."""
-    return pack(facts, {"t_ns": rows.t_ns, "station": rows.station, "streams": rows.values})
-
-
-def json_history(facts: Mapping[str, object], rows: Rows) -> bytes:
-    """The same as JSON, null where a value is unknown."""
+    if packed:
+        return pack(facts, {"t_ns": rows.t_ns, "station": rows.station, "streams": rows.values})
     streams = dict(zip(rows.streams, rows.values.tolist(), strict=True))
     body = {"t_ns": rows.t_ns.tolist(), "station": rows.station.tolist(), "streams": streams}
-    return to_json(dict(facts) | body, inf_nan_mode="null")
+    return to_json(facts | body, inf_nan_mode="null")

@@ -1,6 +1,7 @@
 """Prometheus metrics of a station's health, recorder, uploads and spool, made at each scrape."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, get_args
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -69,25 +70,21 @@ LEVELS = "0 OK, 1 WARN, 2 ERROR, 3 STALE."
 Rows = Sequence[tuple[Sequence[str], float | int]]
 
 
+@dataclass(eq=False)
 class HealthCollector(Collector):
     """Shows the health report under Prometheus names.
 
     A stream that is not heard keeps its age, level and counters and loses its figures.
     """
 
-    def __init__(
-        self,
-        report: Callable[[], StationHealth],
-        raised: Callable[[], Mapping[tuple[str, str], int]],
-    ) -> None:
-        self._report = report
-        self._raised = raised
-        # A counter must not shrink, as the loss does when an overtaken packet comes.
-        self._lost: dict[str, int] = {}
+    report: Callable[[], StationHealth]
+    raised: Callable[[], Mapping[tuple[str, str], int]]
+    # A counter must not shrink, as the loss does when an overtaken packet comes.
+    _lost: dict[str, int] = field(default_factory=dict)
 
     def collect(self) -> Iterator[Metric]:
         """All metrics of one report."""
-        health = self._report()
+        health = self.report()
         streams = [((s.stream, s.hand or "", s.device), s) for s in health.streams]
         devices = [((d.hand or "", d.device), d.model_dump()) for d in health.devices]
         for (_, name), counts in devices:
@@ -106,53 +103,44 @@ class HealthCollector(Collector):
         rows = [(labels, float(counts["connected"])) for labels, counts in devices]
         text = "1 while the device is open."
         yield _filled(gauge("dextouch_device_connected", text, labels=DEVICE_LABELS), rows)
-        for name, (field, text) in DEVICE_COUNTERS.items():
-            rows = [(labels, counts[field]) for labels, counts in devices]
+        for name, (event, text) in DEVICE_COUNTERS.items():
+            rows = [(labels, counts[event]) for labels, counts in devices]
             yield _filled(counter(f"dextouch_{name}", text, labels=DEVICE_LABELS), rows)
         for name, text in STATION_FIGURES.items():
             if name in health.figures:
                 yield gauge(f"dextouch_{name}", text, value=health.figures[name])
         text, labels = "Times a finding was raised.", ("stream", "code")
         events = counter("dextouch_health_findings", text, labels=labels)
-        yield _filled(events, sorted(self._raised().items()))
+        yield _filled(events, sorted(self.raised().items()))
 
     def describe(self) -> Iterator[Metric]:
         """Nothing ahead of time: registering asks for no report."""
         return iter(())
 
 
+@dataclass(eq=False)
 class RecorderCollector(Collector):
-    """Shows the recorder's state, uploads of takes, and how much of the disk takes occupy.
+    """Shows the recorder's state, uploads of takes, and how much of the disk takes occupy."""
 
-    Args:
-        status: of the recorder.
-        takes: number of saved takes by state of their upload.
-        retention: of the spool.
-    """
-
-    def __init__(
-        self,
-        status: Callable[[], RecorderStatus],
-        takes: Callable[[], Mapping[str, int]],
-        retention: SpoolRetention,
-    ) -> None:
-        self._status, self._takes, self._retention = status, takes, retention
+    status: Callable[[], RecorderStatus]
+    takes: Callable[[], Mapping[str, int]]
+    retention: SpoolRetention
 
     def collect(self) -> Iterator[Metric]:
         """All metrics of this moment."""
-        status, labels, gauge = self._status(), ("state",), GaugeMetricFamily
+        status, labels, gauge = self.status(), ("state",), GaugeMetricFamily
         text = "1 for the recorder's state, 0 for the others."
         rows: Rows = [((s,), float(s == status.state)) for s in get_args(RecorderState)]
         yield _filled(gauge("dextouch_recorder_state", text, labels=labels), rows)
         text = "Length of the current take; 0 without one."
         yield gauge("dextouch_take_seconds", text, status.duration_s or 0.0)
         text = "Takes in the spool: waiting to be uploaded, uploaded, or refused by the store."
-        rows = [((state,), number) for state, number in self._takes().items()]
+        rows = [((state,), number) for state, number in self.takes().items()]
         yield _filled(gauge("dextouch_upload_takes", text, labels=labels), rows)
         text = "Bytes of takes in the spool by what became of their upload."
-        rows = [((state,), num_bytes) for state, num_bytes in self._retention.use().items()]
+        rows = [((state,), num_bytes) for state, num_bytes in self.retention.use().items()]
         yield _filled(gauge("dextouch_spool_bytes", text, labels=labels), rows)
-        limits = self._retention.limits
+        limits = self.retention.limits
         text = "How long takes stay in the spool after the store acknowledged them."
         yield gauge("dextouch_spool_keep_seconds", text, limits.keep_uploaded_days * DAY_S)
         if limits.keep_uploaded_gb is not None:

@@ -4,15 +4,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 
-from dextouch.schemas import (
-    DeviceHealth,
-    HealthEvents,
-    HealthLevel,
-    Matrix,
-    StaleCode,
-    StationHealth,
-    StreamHealth,
-)
+from dextouch import schemas
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
@@ -74,7 +66,6 @@ class _Watched:
         self.latest = Evaluation(0)
 
     def evaluate(self, now_ns: int) -> Evaluation:
-        """What the checks find now."""
         evaluation = Evaluation(now_ns, self.take())
         for judge in self.judges:
             judge(evaluation)
@@ -104,14 +95,14 @@ class _WatchedStream(_Watched):
         )
         self.tared_unix_s: float | None = None
         # As the event log knows it.
-        self.stale: StaleCode | None = None
+        self.stale: schemas.StaleCode | None = None
 
     def take(self) -> Block:
         block = self.queue.take()
         self.meter.add(block)
         return block
 
-    def stale_code(self, now_ns: int) -> StaleCode | None:
+    def stale_code(self, now_ns: int) -> schemas.StaleCode | None:
         """Why the stream is stale, None when it is not.
 
         "unplugged" when the device is not open, "silent" when it is and nothing comes; a slow
@@ -124,8 +115,7 @@ class _WatchedStream(_Watched):
         last_ns = self.counters.last_t_host_ns
         return "silent" if last_ns is None or now_ns - last_ns > limit_ns else None
 
-    def health(self, now_ns: int) -> StreamHealth:
-        """The stream at this moment."""
+    def health(self, now_ns: int) -> schemas.StreamHealth:
         descriptor, driver = self._descriptor, self._supervisor.driver
         findings, figures = self.board.active(now_ns), self.latest.figures
         last_ns, stale = self.counters.last_t_host_ns, self.stale_code(now_ns)
@@ -138,7 +128,7 @@ class _WatchedStream(_Watched):
             findings = (raised_finding("late", "WARN", "late", lasted_ns=age_ns),)
         skew = figures.get("clock_skew_ratio")
         residual_s = figures.get("clock_residual_p95_seconds")
-        return StreamHealth(
+        return schemas.StreamHealth(
             stream=self.name,
             device=driver.name,
             hand=descriptor.side,
@@ -157,9 +147,10 @@ class _WatchedStream(_Watched):
             clock_residual_ms=None if residual_s is None else residual_s * 1e3,
             taxels={} if stale else self.latest.taxels,
             tare_age_s=None if self.tared_unix_s is None else time.time() - self.tared_unix_s,
+            layout=descriptor.layout,
         )
 
-    def _stale_words(self, stale: StaleCode, age_ns: int | None) -> str:
+    def _stale_words(self, stale: schemas.StaleCode, age_ns: int | None) -> str:
         if self._supervisor.last_error is not None:
             return self._supervisor.last_error
         if stale == "unplugged":
@@ -173,19 +164,9 @@ class HealthMonitor:
     New findings are evaluated again after 0.2 s, so that a fault is confirmed quickly. Silent
     streams are detected every 0.1 s for the event log, and immediately in every report.
 
-    Args:
-        supervisors: of the station's devices.
-        station: its name.
-        calibration: of the station.
-        clock: of the station.
-        paths: measured path delays, which are compared with the calibration.
-        follow: says of tracked hands whether the robot's can follow them.
-        simulated: whether the devices are mocks, of which nothing can be plugged or replaced.
-
-    Attributes:
-        queues: of each stream's samples, filled by the reader threads with what they have spooled.
-        history: a row of each regular evaluation.
-        nominal_rates_hz: of the streams.
+    `simulated` devices are mocks, of which nothing can be plugged or replaced. `queues` are filled
+    by the reader threads with what they have spooled; `history` has a row of each regular
+    evaluation.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first by name
@@ -193,7 +174,7 @@ class HealthMonitor:
         supervisors: Sequence[DeviceSupervisor],
         *,
         station: str,
-        calibration: Mapping[str, Matrix],
+        calibration: Mapping[str, schemas.Matrix],
         clock: StationClock,
         paths: PathWatch | None = None,
         follow: FollowWatch | None = None,
@@ -267,7 +248,7 @@ class HealthMonitor:
                 if waits and now_ns >= watched.latest.now_ns + CONFIRM_NS:
                     self._evaluate(watched, now_ns, confirming=True)
 
-    def report(self) -> StationHealth:
+    def report(self) -> schemas.StationHealth:
         """Current health of every stream and device."""
         now_ns = self._clock.now_ns()
         with self._lock:
@@ -275,7 +256,7 @@ class HealthMonitor:
             findings, figures = self._itself.board.active(now_ns), self._itself.latest.figures
         levels = [stream.level for stream in streams] + [finding.level for finding in findings]
         devices = tuple(_device_health(s, simulated=self._simulated) for s in self._supervisors)
-        return StationHealth(
+        return schemas.StationHealth(
             station=self._station,
             level=worst(levels, default="STALE"),
             causes=find_causes(streams, devices, findings, figures.get("host_cpu_10s_ratio", 0.0)),
@@ -285,7 +266,7 @@ class HealthMonitor:
             devices=devices,
         )
 
-    def _health(self, stream: _WatchedStream, now_ns: int) -> StreamHealth:
+    def _health(self, stream: _WatchedStream, now_ns: int) -> schemas.StreamHealth:
         """A stream at this moment, without advice about plugs and cables that a mock has not."""
         health = stream.health(now_ns)
         if self._follow is not None and (following := self._follow.live(stream.name, now_ns)):
@@ -295,9 +276,9 @@ class HealthMonitor:
         findings = [f.model_copy(update={"advice": SIMULATED_ADVICE}) for f in health.findings]
         return health.model_copy(update={"findings": tuple(findings)})
 
-    def events(self, since_ns: int = 0) -> HealthEvents:
+    def events(self, since_ns: int = 0) -> schemas.HealthEvents:
         """Changes of levels from a moment on the station's clock, oldest first."""
-        return HealthEvents(now_ns=self._clock.now_ns(), events=self._log.events(since_ns))
+        return schemas.HealthEvents(now_ns=self._clock.now_ns(), events=self._log.events(since_ns))
 
     def raised(self) -> dict[tuple[str, str], int]:
         """How often each (stream, code) was raised since the station's start."""
@@ -317,11 +298,10 @@ class HealthMonitor:
             self._log.add(now_ns, watched.name, code, level)
 
     def _remember(self, now_ns: int) -> None:
-        """Add this evaluation to the history."""
         figures = self._itself.latest.figures
         station = {name: figures[key] for name, key in STATION_FIGURES.items() if key in figures}
         streams: dict[str, dict[str, float]] = {}
-        levels: list[HealthLevel] = [f.level for f in self._itself.board.active(now_ns)]
+        levels: list[schemas.HealthLevel] = [f.level for f in self._itself.board.active(now_ns)]
         for name, stream in self._streams.items():
             level = stream.health(now_ns).level
             levels.append(level)
@@ -344,7 +324,7 @@ class HealthMonitor:
 
 
 def _watch(
-    supervisor: DeviceSupervisor, calibration: Mapping[str, Matrix], paths: PathWatch | None
+    supervisor: DeviceSupervisor, calibration: Mapping[str, schemas.Matrix], paths: PathWatch | None
 ) -> list[_WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
@@ -372,13 +352,13 @@ def _watch(
 
 
 def _value_judges(
-    driver: Driver, descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
+    driver: Driver, descriptor: StreamDescriptor, calibration: Mapping[str, schemas.Matrix]
 ) -> list[HealthCheck]:
     """Checks of sample values, by the kind of the stream."""
     if descriptor.kind == "tactile":
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
         cells = (
-            TaxelCheck(record, refused_taxels(descriptor, calibration))
+            TaxelCheck(record, refused_taxels(descriptor, calibration), descriptor.tactile_layout)
             if record
             else cell_judge(driver.decoder, calibration)
         )
@@ -394,13 +374,13 @@ def _value_judges(
     return [CameraCheck(driver)] if descriptor.kind == "image" else []
 
 
-def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> DeviceHealth:
+def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> schemas.DeviceHealth:
     """A device's counters, and what it shares with others."""
     driver, events = supervisor.driver, supervisor.events()
     sides = {descriptor.side for descriptor in driver.descriptors}
-    return DeviceHealth.model_validate(
+    return schemas.DeviceHealth.model_validate(
         {
-            **{name: events[name] for name in DeviceHealth.model_fields if name in events},
+            **{name: events[name] for name in schemas.DeviceHealth.model_fields if name in events},
             "device": driver.name,
             "hand": sides.pop() if len(sides) == 1 else None,
             "simulated": simulated,

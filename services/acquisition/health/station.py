@@ -12,8 +12,8 @@ import numpy as np
 
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
+from services.acquisition.glove_record import is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     CountWindow,
@@ -38,14 +38,7 @@ CLOCK_SET_SHOWN_NS = 60_000_000_000
 
 
 class DiskCheck:
-    """How long the spool's disk would last if everything that arrives now were recorded.
-
-    Args:
-        spool_root: folder of the takes.
-        supervisors: whose readers count payload bytes.
-        now_ns: by the station's clock; the measurement of what arrives begins here.
-        free_bytes: of the disk; asks the operating system if None.
-    """
+    """How long the spool's disk would last if everything that arrives now were recorded."""
 
     def __init__(
         self,
@@ -119,13 +112,7 @@ def tared_unix_s(descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
 
 
 class PathCheck:
-    """Compares a stream's measured path delay with the station's calibration.
-
-    Args:
-        stream: name of the stream.
-        paths: gives measured delays.
-        calibration: of the station; without a delay of the stream there is nothing to compare.
-    """
+    """Compares a stream's measured path delay with that of the station's calibration, if any."""
 
     def __init__(self, stream: str, paths: PathWatch, calibration: Mapping[str, Matrix]) -> None:
         self._stream = stream
@@ -175,9 +162,12 @@ def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:
     for descriptor in descriptors:
         if descriptor.name == "camera_head":
             needed.append("K_head")
-        if descriptor.kind == "tactile" and descriptor.unit == "counts":
-            needed += [f"{descriptor.name}_tare_counts", f"{descriptor.name}_gain_counts_per_kpa"]
-            if descriptor.shape != (NUM_RAW_TAXELS,):
+        has_layout = descriptor.layout is not None
+        if descriptor.kind == "tactile" and (descriptor.unit == "counts" or has_layout):
+            needed.append(f"{descriptor.name}_tare_counts")
+            if not (has_layout and descriptor.tactile_layout.nominal_kpa_per_unit is not None):
+                needed.append(f"{descriptor.name}_gain_counts_per_kpa")
+            if not (has_layout or is_ours(descriptor)):
                 needed.append(f"{descriptor.name}_cells")
     return needed
 
@@ -186,10 +176,6 @@ class HostCheck:
     """How late a periodic thread of the station wakes, which an overloaded computer delays.
 
     The 90th percentile of 10 s: a single stop of the process, such as a laptop's sleep, is none.
-
-    Args:
-        load: tasks that run or wait for a processor, and the number of processors.
-        cpu_times: of the processors since the start of the computer: used, and all.
     """
 
     def __init__(

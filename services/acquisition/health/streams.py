@@ -228,9 +228,7 @@ class PoseCheck:
 class PlausibilityCheck:
     """Judges whether the values of the last 5 s can be true, by the rules that alignment has.
 
-    Args:
-        descriptor: of the stream.
-        of_robot: whether a robot sends it, which may stand still exactly.
+    A robot may stand still exactly.
     """
 
     def __init__(self, descriptor: StreamDescriptor, *, of_robot: bool = False) -> None:

@@ -18,16 +18,12 @@ from services.acquisition.mocks.replay import (
     serial_mock,
 )
 
-# The name of earlier releases, for mocks of other packages; it goes with the next one.
-MockPlace = MockSlot
-
 __all__ = [
     "DeviceFaults",
     "FaultScript",
     "HidPort",
     "MockDevice",
     "MockPair",
-    "MockPlace",
     "MockPort",
     "MockSlot",
     "PacketEdits",

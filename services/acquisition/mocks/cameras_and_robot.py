@@ -7,38 +7,21 @@ import numpy as np
 
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.devices import camera, robot_state
-from services.acquisition.devices.station_camera import (
-    CapturedImage,
-    CaptureLink,
-    StationCamera,
-    StationCameraSettings,
-)
+from services.acquisition.devices import camera, robot_state, station_camera
 from services.acquisition.drivers.images import ImageEncoder, ImageEncoding
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.mocks import replay
 from services.acquisition.mocks.ports import ReportPort
-from services.acquisition.mocks.replay import (
-    MockDevice,
-    MockPair,
-    MockSlot,
-    PacketSource,
-    ReplayStream,
-)
 
 UNIT_HEADER = struct.Struct("<qHH")
 # With a virtual clock, time must not go on while an image is being encoded.
 LOCKSTEP_WAIT_S = 20.0
 
 
-class CameraSource(PacketSource):
-    """Packets of one camera.
+class CameraSource(replay.PacketSource):
+    """Packets of one camera, of a stream uint8 [n, h, w, 3]."""
 
-    Args:
-        stream: uint8 [n, h, w, 3].
-        encoding: of the images on the wire.
-    """
-
-    def __init__(self, stream: ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
+    def __init__(self, stream: replay.ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
         self.t_ns = stream.t_ns
         self._images = stream.values
         self._encoding: ImageEncoding = encoding
@@ -81,7 +64,7 @@ class VideoPort(ReportPort):
         self.transport = MockCapture(self, name)
 
 
-class MockCapture(CaptureLink[VideoPort]):
+class MockCapture(station_camera.CaptureLink[VideoPort]):
     """The host's end of a mock camera."""
 
     def __init__(self, port: VideoPort, name: str) -> None:
@@ -99,13 +82,13 @@ class MockCapture(CaptureLink[VideoPort]):
             raise DeviceError(f"{self.info}: unplugged while reading") from error
         return bool(self._unit)
 
-    def retrieve(self) -> CapturedImage | None:
+    def retrieve(self) -> station_camera.CapturedImage | None:
         """The image fetched."""
         t_driver_ns, height_px, width_px = UNIT_HEADER.unpack_from(self._unit)
         pixels = np.frombuffer(self._unit, dtype=np.uint8, offset=UNIT_HEADER.size)
         if pixels.size != height_px * width_px * 3:
             return None
-        return CapturedImage(pixels.reshape(height_px, width_px, 3), t_driver_ns)
+        return station_camera.CapturedImage(pixels.reshape(height_px, width_px, 3), t_driver_ns)
 
     def _connect(self) -> VideoPort:
         port = self._port
@@ -119,14 +102,10 @@ class MockCapture(CaptureLink[VideoPort]):
         handle.link.set_open(is_open=False)
 
 
-class VideoSource(PacketSource):
-    """Images with the stamps of the kernel.
+class VideoSource(replay.PacketSource):
+    """Images, uint8 [n, h, w, 3], with the stamps of the kernel."""
 
-    Args:
-        stream: uint8 [n, h, w, 3].
-    """
-
-    def __init__(self, stream: ReplayStream) -> None:
+    def __init__(self, stream: replay.ReplayStream) -> None:
         self.t_ns = stream.t_ns
         self._images = stream.values
 
@@ -136,7 +115,7 @@ class VideoSource(PacketSource):
         return [UNIT_HEADER.pack(t_device_ns, *image.shape[:2]) + image.tobytes()]
 
 
-class VideoDevice(MockDevice):
+class VideoDevice(replay.MockDevice):
     """A mock device whose clock is the host's, since the host's kernel stamps its images."""
 
     def play(
@@ -147,14 +126,8 @@ class VideoDevice(MockDevice):
         return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
 
 
-def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
-    """A mock camera that plays a stream of images, and its driver.
-
-    Args:
-        place: where it stands; its name is that of the stream.
-        settings: what the station knows of the camera besides its size and rate, such as its
-            `encoding`.
-    """
+def video_camera(place: replay.MockSlot, **settings: float | str) -> replay.MockPair:
+    """A mock camera that plays a stream of images, and its driver with other settings."""
     port, descriptor = VideoPort(place.name), place.stream.descriptor
     known = {
         "stream": place.name,
@@ -162,26 +135,23 @@ def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
         "height_px": descriptor.shape[0],
         "width_px": descriptor.shape[1],
     }
-    driver = StationCamera(
-        StationCameraSettings.model_validate({**known, **settings}),
+    driver = station_camera.StationCamera(
+        station_camera.StationCameraSettings.model_validate({**known, **settings}),
         link=port.transport,
         clock=place.clock,
         max_encode_wait_s=LOCKSTEP_WAIT_S,
     )
-    return MockPair(VideoDevice(place, VideoSource(place.stream), port), driver)
+    return replay.MockPair(VideoDevice(place, VideoSource(place.stream), port), driver)
 
 
-class RobotStateSource(PacketSource):
-    """Packets of one robot.
-
-    Args:
-        streams: the six of `STREAM_SIZES`, all with the same times.
+class RobotStateSource(replay.PacketSource):
+    """Packets of one robot, of the six streams of `STREAM_SIZES`, all with the same times.
 
     Raises:
         InvalidInputError: one is missing, or their times differ.
     """
 
-    def __init__(self, streams: Mapping[str, ReplayStream]) -> None:
+    def __init__(self, streams: Mapping[str, replay.ReplayStream]) -> None:
         missing = sorted(set(robot_state.STREAM_SIZES) - set(streams))
         if missing:
             raise InvalidInputError(f"robot state: streams {missing} are missing")

@@ -247,9 +247,7 @@ class PacketEdits(ABC):
 
     The last four methods take the bytes of one whole packet and give those of the changed one, its
     checksum right; they raise InvalidInputError for what packets of the family do not tell.
-
-    Args:
-        pinned: what a pinned raw cell of a glove shows; none of what has no cells.
+    `pinned` is what a pinned raw cell of a glove shows.
     """
 
     marks_nan = False

@@ -8,7 +8,8 @@ from jaxtyping import Float32, Float64
 
 from dextouch.errors import ShapeError
 from dextouch.schemas import Matrix, matrix_rows
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels, split_pads
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, Side, TactileLayout, split_pads
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import wuji_glove
 from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
@@ -54,6 +55,8 @@ OFFSET_COUNTS = 120.0
 GAIN_COUNTS_PER_KPA = 40.0
 OFFSET_SPREAD_COUNTS = 10.0
 GAIN_SPREAD = 0.05
+# Of a glove of another layout, whose counts may be few: 1 % of full scale.
+OFFSET_SHARE = 0.01
 COUNTS_PER_KPA = 40.0
 NUM_VALUES = 401
 FULL_SCALE = 4095.0
@@ -98,18 +101,33 @@ class GloveAnswers:
 class GloveCalibration:
     """counts = tare + gain · pressure, cell by cell in raw scan order."""
 
-    tare_counts: Float64[np.ndarray, "360"]
-    gain_counts_per_kpa: Float64[np.ndarray, "360"]
+    tare_counts: Float64[np.ndarray, " cells"]
+    gain_counts_per_kpa: Float64[np.ndarray, " cells"]
+    layout: TactileLayout = DEXTOUCH_V1
 
     @staticmethod
-    def seeded(side: Side, seed: int) -> "GloveCalibration":
+    def seeded(side: Side, seed: int, layout: TactileLayout = DEXTOUCH_V1) -> "GloveCalibration":
         """A glove as it comes from the factory: no two cells alike."""
         rng = device_rng(seed, f"calibration_{side}")
-        spread = rng.uniform(-1.0, 1.0, (2, NUM_RAW_TAXELS))
+        spread = rng.uniform(-1.0, 1.0, (2, layout.num_raw_cells))
+        offset, offset_spread, gain = OFFSET_COUNTS, OFFSET_SPREAD_COUNTS, GAIN_COUNTS_PER_KPA
+        if layout != DEXTOUCH_V1:
+            offset = OFFSET_SHARE * layout.full_scale
+            offset_spread = offset / 10
+            gain = layout.full_scale / layout.range_kpa
         return GloveCalibration(
-            OFFSET_COUNTS + OFFSET_SPREAD_COUNTS * spread[0],
-            GAIN_COUNTS_PER_KPA * (1.0 + GAIN_SPREAD * spread[1]),
+            offset + offset_spread * spread[0], gain * (1.0 + GAIN_SPREAD * spread[1]), layout
         )
+
+    @staticmethod
+    def nominal(side: Side, layout: TactileLayout) -> "GloveCalibration":
+        """A glove whose readings have the unit and scale of its layout, and no offset."""
+        kpa_per_unit = layout.nominal_kpa_per_unit
+        if kpa_per_unit is None:
+            kpa_per_unit = np.full(layout.num_taxels, layout.range_kpa / layout.full_scale)
+        gain = np.ones(layout.num_raw_cells)
+        gain[layout.raw_indices(side)] = 1.0 / kpa_per_unit
+        return GloveCalibration(np.zeros(layout.num_raw_cells), gain, layout)
 
     def matrices(self, side: Side) -> dict[str, Matrix]:
         """Calibration matrices of this glove."""
@@ -118,11 +136,15 @@ class GloveCalibration:
             f"tactile_{side}_gain_counts_per_kpa": matrix_rows(self.gain_counts_per_kpa[None]),
         }
 
+    def readings(self, taxels_kpa: np.ndarray, *, side: Side) -> Float64[np.ndarray, "... cells"]:
+        """Raw readings of pressures [..., taxels]; clipped at full scale."""
+        raw_kpa = self.layout.expand(np.asarray(taxels_kpa, dtype=np.float64), side=side)
+        readings = self.tare_counts + self.gain_counts_per_kpa * raw_kpa
+        return np.clip(readings, 0, self.layout.full_scale)
+
     def counts(self, taxels_kpa: np.ndarray, *, side: Side) -> np.ndarray:
-        """Raw counts (uint16 [..., 360]) of pressures [..., 320]; clipped at full scale."""
-        raw_kpa = expand_taxels(np.asarray(taxels_kpa, dtype=np.float64), side=side)
-        counts = np.rint(self.tare_counts + self.gain_counts_per_kpa * raw_kpa)
-        return np.clip(counts, 0, FULL_SCALE_COUNTS).astype("<u2")
+        """The same as whole counts (uint16)."""
+        return np.rint(self.readings(taxels_kpa, side=side)).astype("<u2")
 
 
 def mock_glove(
@@ -137,7 +159,8 @@ def mock_glove(
     """
     name, side = place.name, place.side
     unit_seed = place.seed if place.unit_seed is None else place.unit_seed
-    glove = calibration or GloveCalibration.seeded(side, unit_seed)
+    layout = place.stream.descriptor.layout
+    glove = calibration or GloveCalibration.seeded(side, unit_seed, layout or DEXTOUCH_V1)
     told: Side = worn_side or side
     source = TactileGloveSource(place.stream, side=told, calibration=glove, faults=place.faults)
     # The device is made of its port, and tells its time to what answers there.
@@ -146,7 +169,9 @@ def mock_glove(
     )
     port = PtyPort(name, answer=answers.answer)
     device = MockDevice(place, source, port)
-    driver = TactileGlove(side, transport=port.transport, clock=place.clock, serial_number=name)
+    driver = TactileGlove(
+        side, transport=port.transport, clock=place.clock, serial_number=name, layout=layout
+    )
     return MockPair(device, driver, glove.matrices(side))
 
 
@@ -154,7 +179,7 @@ class TactileGloveSource(PacketSource):
     """Packets of one glove.
 
     Args:
-        stream: float32 [n, 320] in kPa.
+        stream: float32 [n, taxels] in kPa.
         side: which hand.
         calibration: of this glove.
         faults: whose dead and drifted raw cells are planted.
@@ -170,9 +195,10 @@ class TactileGloveSource(PacketSource):
         calibration: GloveCalibration,
         faults: DeviceFaults | None = None,
     ) -> None:
-        if stream.descriptor.shape != (NUM_TAXELS,):
+        num_taxels = calibration.layout.num_taxels
+        if stream.descriptor.shape != (num_taxels,):
             raise ShapeError(
-                f"{stream.descriptor.name}: got {stream.descriptor.shape}, expected ({NUM_TAXELS},)"
+                f"{stream.descriptor.name}: got {stream.descriptor.shape}, expected ({num_taxels},)"
             )
         self.t_ns = stream.t_ns
         self._side = side
@@ -203,15 +229,35 @@ def _device_time_ns(device: MockDevice, clock: StationClock) -> int:
 
 
 def mock_justfloat_glove(place: MockSlot) -> MockPair:
-    """A glove that sends bare float32s at the rate of the stream."""
-    source = JustFloatGloveSource(place.stream, dead_taxels=place.faults.dead_taxels)
+    """A glove that sends bare float32s at the rate of the stream, in the unit of its layout."""
+    source = JustFloatGloveSource(
+        place.stream, side=place.side, dead_taxels=place.faults.dead_taxels
+    )
+    layout = place.stream.descriptor.layout
     decoder = JustFloatGloveDecoder(
         place.side,
-        num_values=NUM_VALUES,
-        full_scale=FULL_SCALE,
+        num_values=NUM_VALUES if layout is None else layout.num_raw_cells,
+        full_scale=FULL_SCALE if layout is None else layout.full_scale,
         rate_hz=place.stream.descriptor.nominal_rate_hz,
+        layout=layout,
     )
-    return serial_mock(place, source=source, decoder=decoder)
+    return serial_mock(
+        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+    )
+
+
+def _nominal_zero(descriptor: StreamDescriptor) -> dict[str, Matrix]:
+    """Tare of a glove of a known layout, whose mock rests at zero; its gain follows from the unit.
+
+    Where the unit does not say it, the gain is that of `GloveCalibration.nominal`.
+    """
+    layout, side = descriptor.layout, descriptor.side
+    if layout is None or side is None:
+        return {}
+    known = GloveCalibration.nominal(side, layout).matrices(side)
+    if layout.nominal_kpa_per_unit is not None:
+        del known[f"tactile_{side}_gain_counts_per_kpa"]
+    return known
 
 
 class JustFloatPacketEdits(PacketEdits):
@@ -229,17 +275,27 @@ class JustFloatPacketEdits(PacketEdits):
 class JustFloatGloveSource(PacketSource):
     """Packets of one glove: the taxels' counts, then zeros in the slots that mean nothing.
 
+    With a layout they are readings in its unit and in the order of its raw cells.
+
     Args:
-        stream: float32 [n, 320] in kPa.
+        stream: float32 [n, taxels] in kPa.
+        side: which hand; only needed with a layout.
         dead_taxels: places in the packet that read zero.
     """
 
     edits = JustFloatPacketEdits({"stuck": 1_000.0, "saturated": FULL_SCALE})
 
-    def __init__(self, stream: ReplayStream, *, dead_taxels: Sequence[int] = ()) -> None:
+    def __init__(
+        self, stream: ReplayStream, *, side: Side = "left", dead_taxels: Sequence[int] = ()
+    ) -> None:
+        self.t_ns, layout = stream.t_ns, stream.descriptor.layout
+        if layout is not None:
+            glove = GloveCalibration.nominal(side, layout)
+            self._values = glove.readings(stream.values, side=side).astype("<f4")
+            self._values[:, list(dead_taxels)] = 0.0
+            return
         # No device sends the negative zero that rounding leaves of noise.
         counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, FULL_SCALE) + 0.0
-        self.t_ns = stream.t_ns
         self._values = np.zeros((len(counts), NUM_VALUES), dtype="<f4")
         self._values[:, :NUM_TAXELS] = counts
         self._values[:, list(dead_taxels)] = 0.0
@@ -261,7 +317,10 @@ def mock_wuji_glove(place: MockSlot) -> MockPair:
         side=place.side,
         dead_taxels=place.faults.dead_taxels,
     )
-    return serial_mock(place, source=source, decoder=wuji_glove.WujiGloveDecoder(place.side))
+    decoder = wuji_glove.WujiGloveDecoder(place.side, layout=place.stream.descriptor.layout)
+    return serial_mock(
+        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+    )
 
 
 class WujiPacketEdits(PacketEdits):
@@ -288,7 +347,7 @@ class WujiGloveSource(PacketSource):
     """Packets of one glove.
 
     Args:
-        stream: float32 [n, 320] in kPa.
+        stream: float32 [n, taxels] in kPa.
         side: which hand.
         dead_taxels: cells of the grid, row by row, that read zero.
     """
@@ -300,7 +359,15 @@ class WujiGloveSource(PacketSource):
     ) -> None:
         self.t_ns = stream.t_ns
         self._hand = {name: number for number, name in wuji_glove.HANDS.items()}[side]
-        self._cells = grid_of(np.clip(stream.values / FULL_SCALE_KPA, 0.0, 1.0).astype(np.float32))
+        layout = stream.descriptor.layout
+        if layout is None:
+            shares = np.clip(stream.values / FULL_SCALE_KPA, 0.0, 1.0).astype(np.float32)
+            self._cells = grid_of(shares)
+        else:
+            glove = GloveCalibration.nominal(side, layout)
+            there = layout.expand(np.ones(layout.num_taxels, dtype=np.bool_), side=side)
+            readings = glove.readings(stream.values, side=side)
+            self._cells = np.where(there, readings, np.nan).astype("<f4")
         self._cells.reshape(len(self._cells), -1)[:, list(dead_taxels)] = 0.0
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
@@ -309,7 +376,7 @@ class WujiGloveSource(PacketSource):
         return [encode_wuji(self._hand, sequence, t_device_ns // wuji_glove.TICK_NS, cells)]
 
 
-def grid_of(taxels: Float32[np.ndarray, "n 320"]) -> Float32[np.ndarray, "n 24 32"]:
+def grid_of(taxels: Float32[np.ndarray, "n taxels"]) -> Float32[np.ndarray, "n 24 32"]:
     """Fingertips in the top rows, the palm below, NaN where the glove has no cell."""
     grid = np.full((len(taxels), *wuji_glove.GRID), np.nan, dtype="<f4")
     fingertips, palm = split_pads(taxels.reshape(-1, NUM_TAXELS))

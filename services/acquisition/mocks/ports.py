@@ -13,13 +13,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports import (
-    HandleTransport,
-    HidTransport,
-    SerialTransport,
-    SocketTransport,
-    Transport,
-)
+from services.acquisition import transports
 
 # A host that is merely busy loses nothing, as behind a real device with buffers of its own.
 SEND_TIMEOUT_S = 20.0
@@ -76,22 +70,18 @@ class Link:
                 raise DeviceError(f"mock device: the host {text} for {SEND_TIMEOUT_S:.0f} s")
 
 
-class WatchedTransport(HandleTransport[Transport]):
+class WatchedTransport(transports.HandleTransport[transports.Transport]):
     """The host's transport, telling the mock how far the host is.
 
     What a read returned counts as processed when the reader comes back for more: by then it has
     been stamped, decoded and recorded.
 
-    Args:
-        transport: the host's end.
-        link: of the mock.
-        on_open: called when the host has opened the device.
-        on_write: takes how many bytes the host has just written, in the host's thread.
+    `on_write` takes how many bytes the host has just written, in the host's thread.
     """
 
     def __init__(
         self,
-        transport: Transport,
+        transport: transports.Transport,
         link: Link,
         *,
         on_open: Callable[[], None] | None = None,
@@ -104,7 +94,7 @@ class WatchedTransport(HandleTransport[Transport]):
         self._on_write = on_write
         self._pending = 0
 
-    def _connect(self) -> Transport:
+    def _connect(self) -> transports.Transport:
         self._transport.open()
         self.info = self._transport.info
         self._pending = 0
@@ -113,34 +103,28 @@ class WatchedTransport(HandleTransport[Transport]):
             self._on_open()
         return self._transport
 
-    def _receive(self, handle: Transport) -> bytes:
+    def _receive(self, handle: transports.Transport) -> bytes:
         self._link.add_consumed(self._pending)
         self._pending = 0
         data = handle.read()
         self._pending = len(data)
         return data
 
-    def _send(self, handle: Transport, data: bytes) -> None:
+    def _send(self, handle: transports.Transport, data: bytes) -> None:
         handle.write(data)
         if self._on_write is not None:
             self._on_write(len(data))
 
-    def _release(self, handle: Transport) -> None:
+    def _release(self, handle: transports.Transport) -> None:
         handle.close()
         self._link.set_open(is_open=False)
 
 
 class MockPort(ABC):
-    """The device's end of a link.
-
-    Attributes:
-        link: how far the host is.
-        transport: the host's end.
-        has_bit_errors: whether no checksum below ours guards the line.
-    """
+    """The device's end of a link, with the host's end as `transport`."""
 
     has_bit_errors: ClassVar[bool] = False
-    transport: Transport
+    transport: transports.Transport
 
     def __init__(self) -> None:
         self.link = Link()
@@ -161,9 +145,7 @@ class MockPort(ABC):
 class PtyPort(MockPort):
     """A serial device: a pseudo terminal with a new name at every plugging.
 
-    Args:
-        name: of the device; also its serial number.
-        answer: what the device says to the bytes that the host writes.
+    The name is also its serial number.
     """
 
     has_bit_errors = True
@@ -176,7 +158,7 @@ class PtyPort(MockPort):
         self._slave: int | None = None
         self._sending = threading.Lock()
         self.transport = WatchedTransport(
-            SerialTransport(self._find, serial_number=name),
+            transports.SerialTransport(self._find, serial_number=name),
             self.link,
             on_write=None if answer is None else self._hear,
         )
@@ -289,10 +271,6 @@ class HidPort(ReportPort):
 
     `read` gives [] when idle and OSError when unplugged; a ring keeps 63 reports and silently
     loses the newest; `write` counts one byte more than it was given.
-
-    Args:
-        name: of the device; also its serial number.
-        answer: what the device says to a report of the host.
     """
 
     max_reports = 63
@@ -300,7 +278,7 @@ class HidPort(ReportPort):
     def __init__(self, name: str, answer: Answer | None = None) -> None:
         super().__init__()
         self._answer = answer
-        transport = HidTransport(self.open, address=f"mock:{name}", serial_number=name)
+        transport = transports.HidTransport(self.open, address=f"mock:{name}", serial_number=name)
         self.transport = WatchedTransport(transport, self.link)
 
     def open(self) -> "HidPort":
@@ -331,7 +309,7 @@ class SocketPort(MockPort):
         super().__init__()
         self._plugged = False
         self._device_end: socket.socket | None = None
-        transport = SocketTransport(self._connect, address=f"mock:{name}")
+        transport = transports.SocketTransport(self._connect, address=f"mock:{name}")
         self.transport = WatchedTransport(transport, self.link, on_open=on_open)
 
     def plug(self) -> None:

@@ -71,9 +71,7 @@ class ReplayStream:
 class PacketSource(ABC):
     """What one device says: packets made from replay streams.
 
-    Attributes:
-        t_ns: when each sample is taken.
-        edits: faults inside its packets; by default those of our documented devices.
+    `t_ns` is when each sample is taken; `edits` are by default those of our documented devices.
     """
 
     t_ns: Int64[np.ndarray, " n"]
@@ -94,8 +92,8 @@ class MockSlot:
 
     Attributes:
         name: of the device, such as `glove_left`.
-        stream: what it plays; of a glove the pressures, float32 [n, 320] in kPa in anatomical order
-            (`dextouch.tactile.layout`); `at_rate` resamples them to the rate of a glove.
+        stream: what it plays; of a glove the pressures, float32 [n, taxels] in kPa in anatomical
+            order of the layout of its descriptor; `at_rate` resamples them to the rate of a glove.
         faults: what disturbs the device. Its source sees to `dead_taxels`, raw cells that read 0.
         seed: of everything random.
         clock: of the station.
@@ -158,16 +156,11 @@ class MockDevice:
     def play(
         self, clock: StationClock, waiter: Waiter, *, start_host_ns: int, offset_ns: int = 0
     ) -> bool:
-        """Play the whole source once; the ledger is that of the last play.
+        """Play the whole source once, unless the waiter is cancelled (False).
 
-        Args:
-            clock: a virtual one makes the device wait for the host after each packet.
-            waiter: of the calling thread.
-            start_host_ns: when the device's first take started; its clock counts from there.
-            offset_ns: from there to the start of this play.
-
-        Returns:
-            False when the waiter was cancelled.
+        Its clock counts from `start_host_ns`, when the device's first take started; this play
+        begins `offset_ns` later. With a virtual clock the device waits for the host after each
+        packet. The ledger is that of the last play.
         """
         lockstep = isinstance(clock, VirtualClock)
         self._start_host_ns = start_host_ns
@@ -264,7 +257,6 @@ class MockDevice:
         return fate, flips
 
     def _send_held(self) -> None:
-        """Send the packet that another one has overtaken."""
         held, self._held = self._held, None
         if held is not None:
             self._put_on_line(held[1], Fate.LATE)

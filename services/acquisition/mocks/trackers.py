@@ -32,16 +32,9 @@ from services.acquisition.drivers.sdk_link import (
     BridgeHello,
     FrameConvention,
 )
+from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import DeviceFaults, Fate
 from services.acquisition.mocks.ports import HidPort, SocketPort
-from services.acquisition.mocks.replay import (
-    MockDevice,
-    MockPair,
-    MockSlot,
-    PacketSource,
-    ReplayStream,
-    device_rng,
-)
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
@@ -63,13 +56,8 @@ DRIFT_M_PER_S = 0.5
 JUMP_M = (1.0, 0.0, 0.0)
 
 
-class BridgeSource(PacketSource):
-    """What one bridge process says.
-
-    Attributes:
-        magic: of its packets.
-        frame: its coordinates.
-    """
+class BridgeSource(replay.PacketSource):
+    """What one bridge process says."""
 
     magic: bytes
     frame: FrameConvention
@@ -119,10 +107,12 @@ class BridgePort(SocketPort):
         return host_end
 
 
-def bridged_pair(place: MockSlot, source: BridgeSource, decoder: BridgeDecoder) -> MockPair:
+def bridged_pair(
+    place: replay.MockSlot, source: BridgeSource, decoder: BridgeDecoder
+) -> replay.MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
     port, clock = BridgePort(place.name, source.hello), place.clock
-    device = MockDevice(place, source, port)
+    device = replay.MockDevice(place, source, port)
 
     def sign_of_life(sequence: int) -> bytes:
         return encode_packet(source.magic, Packet(VERSION, SOURCES["none"], sequence, 0, b""))
@@ -136,22 +126,15 @@ def bridged_pair(place: MockSlot, source: BridgeSource, decoder: BridgeDecoder) 
             name="bridge-life",
         )
     driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
-    return MockPair(device, driver)
+    return replay.MockPair(device, driver)
 
 
-class TrackedFingers(PacketSource):
-    """What a finger tracker sees of a hand: points with noise, and nodes that are hidden.
-
-    Args:
-        stream: [n, 25, 3] in m, wrist frame.
-        side: which hand.
-        rng: of the device's node order and of the noise.
-        faults: position noise, and when the thumb is not seen.
-    """
+class TrackedFingers(replay.PacketSource):
+    """What a finger tracker sees of a hand [n, 25, 3] (m, wrist frame): noise, hidden nodes."""
 
     def __init__(
         self,
-        stream: ReplayStream,
+        stream: replay.ReplayStream,
         *,
         side: Side,
         rng: np.random.Generator,
@@ -237,9 +220,9 @@ class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
         return 100.0 * points_m @ self.frame.ours_from_theirs()
 
 
-def mock_finger_tracker(place: MockSlot) -> MockPair:
+def mock_finger_tracker(place: replay.MockSlot) -> replay.MockPair:
     """A finger tracker of one hand; the stream of its place is [n, 25, 3] in m, wrist frame."""
-    rng = device_rng(place.seed, f"noise_{place.name}")
+    rng = replay.device_rng(place.seed, f"noise_{place.name}")
     if place.link == "bridge":
         bridge = BridgeFingerTrackerSource(
             place.stream, side=place.side, rng=rng, faults=place.faults
@@ -250,20 +233,17 @@ def mock_finger_tracker(place: MockSlot) -> MockPair:
     driver = finger_tracker.FingerTracker(
         place.name, place.side, transport=port.transport, clock=place.clock
     )
-    return MockPair(MockDevice(place, source, port), driver)
+    return replay.MockPair(replay.MockDevice(place, source, port), driver)
 
 
-class TrackedPoses(PacketSource):
-    """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
+class TrackedPoses(replay.PacketSource):
+    """What a tracker says of a body: poses [n, 7] with noise and tracking faults, and their truth.
 
-    Args:
-        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis; occlusions and jumps.
-        rng: of the noise.
+    Poses are float64 x y z (m) qw qx qy qz in the world frame; noise is per axis.
     """
 
     def __init__(
-        self, stream: ReplayStream, *, faults: DeviceFaults, rng: np.random.Generator
+        self, stream: replay.ReplayStream, *, faults: DeviceFaults, rng: np.random.Generator
     ) -> None:
         self.t_ns = stream.t_ns
         self.source = pose_tracker.source_of(stream.descriptor.name)
@@ -344,15 +324,15 @@ class BridgePoseSource(TrackedPoses, BridgeSource):
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
-def mock_pose_tracker(place: MockSlot) -> MockPair:
+def mock_pose_tracker(place: replay.MockSlot) -> replay.MockPair:
     """A pose tracker; the stream of its place is [n, 7], x y z (m) qw qx qy qz in the world."""
     stream, faults = place.stream, place.faults
     where = stream.descriptor.name
-    rng = device_rng(place.seed, f"noise_{place.name}")
+    rng = replay.device_rng(place.seed, f"noise_{place.name}")
     if place.link == "bridge":
         bridge = BridgePoseSource(stream, faults=faults, rng=rng)
         return bridged_pair(place, bridge, pose_tracker.BridgePoseTrackerDecoder(where))
     source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(place.name)
     decoder = pose_tracker.PoseTrackerDecoder(where)
     driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return MockPair(MockDevice(place, source, port), driver)
+    return replay.MockPair(replay.MockDevice(place, source, port), driver)

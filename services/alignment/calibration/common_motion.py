@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.interpolate import CubicSpline
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DexTouchError, InvalidInputError
@@ -137,12 +138,11 @@ def turning_of_images(
 
 def _small_gray(image: np.ndarray) -> tuple[UInt8[np.ndarray, "h w"], float]:
     """A gray image of at most `_MAX_WIDTH_PX`, and its width over that of the image."""
-    is_gray = image.shape[-1] == 1
-    gray = image[..., 0] if is_gray else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gray = image[..., 0] if image.shape[-1] == 1 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, _MAX_WIDTH_PX / gray.shape[1])
-    if scale == 1.0:
-        return gray, scale
-    return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
+    if scale < 1.0:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return gray, scale
 
 
 def _turn_between(
@@ -188,7 +188,7 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])
-    first_ns = int(a.t_ns[0])
+    first_ns = a.t_ns[:1]
     t_a, mine = checked_signal("times: stream a", a.t_ns, a.velocity_rad_s, first_ns)
     t_b, other = checked_signal("times: stream b", b.t_ns, b.velocity_rad_s, first_ns)
     step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
@@ -229,20 +229,12 @@ def _check_constant(
     by_offset: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"], per_number: float
 ) -> None:
     """Refuse an offset that is another one in some part of the take."""
-    parts = [
-        (moved, rest)
-        for moved, rest in zip(
-            np.array_split(by_offset, _NUM_PARTS), np.array_split(left, _NUM_PARTS), strict=True
-        )
-    ]
-    energies = np.array([float(np.square(moved).sum()) for moved, _ in parts])
-    offs_s = np.array([float((moved * rest).sum()) for moved, rest in parts]) / energies
-    noise = np.array(
-        [
-            float(np.square(rest - off * moved).mean())
-            for (moved, rest), off in zip(parts, offs_s, strict=True)
-        ]
-    )
+    energies, offs_s, noise = np.empty((3, _NUM_PARTS))
+    parts = (np.array_split(one, _NUM_PARTS) for one in (by_offset, left))
+    for part, (moved, rest) in enumerate(zip(*parts, strict=True)):
+        energies[part] = np.square(moved).sum()
+        offs_s[part] = (moved * rest).sum() / energies[part]
+        noise[part] = np.square(rest - offs_s[part] * moved).mean()
     # Where an offset has changed, a line no longer describes it, and its part has larger errors.
     sigmas_s = SIGMA_FACTOR * np.sqrt(np.median(noise) * per_number / energies)
     sigmas_s = np.maximum(sigmas_s, _LEAST_SIGMA_S)
@@ -304,38 +296,28 @@ def _adjusted_ns(
     names: Sequence[str], pairs: Sequence[PairOffset], reference: str
 ) -> tuple[dict[str, float], float]:
     """Delays that fit all offsets best, weighted by their sigmas, and what these miss by (RMS)."""
-    design, offsets, weights = np.zeros((len(pairs), len(names))), [], []
-    for row, pair in enumerate(pairs):
-        # b is later than a by as much as must be subtracted from its times.
-        design[row, names.index(pair.b)], design[row, names.index(pair.a)] = 1.0, -1.0
-        offsets.append(-pair.offset.offset_ns)
-        weights.append(1.0 / pair.offset.sigma_ns)
-    free = [index for index, name in enumerate(names) if name != reference]
-    scale = np.array(weights)
-    found, *_ = np.linalg.lstsq(
-        design[:, free] * scale[:, None], np.array(offsets, dtype=np.float64) * scale, rcond=None
-    )
-    delays = dict.fromkeys(names, 0.0) | {
-        names[index]: float(value) for index, value in zip(free, found, strict=True)
-    }
-    spare = len(pairs) - len(free)
-    if not spare:
-        return delays, 0.0
-    left_ns = design[:, free] @ found - np.array(offsets)
-    return delays, float(np.sqrt(np.square(left_ns).sum() / len(pairs)))
+    free = [name for name in names if name != reference]
+    # b is later than a by as much as must be subtracted from its times.
+    signs = [[float(name == pair.b) - (name == pair.a) for name in free] for pair in pairs]
+    design = np.array(signs)
+    offsets_ns = -np.array([pair.offset.offset_ns for pair in pairs], dtype=np.float64)
+    scale = 1.0 / np.array([pair.offset.sigma_ns for pair in pairs])
+    found, *_ = np.linalg.lstsq(design * scale[:, None], offsets_ns * scale, rcond=None)
+    delays_ns = {reference: 0.0, **dict(zip(free, found.tolist(), strict=True))}
+    if len(pairs) == len(free):
+        return delays_ns, 0.0
+    return delays_ns, float(np.sqrt(np.square(design @ found - offsets_ns).mean()))
 
 
 def _chain_sigmas_ns(
     names: Sequence[str], pairs: Sequence[PairOffset], reference: str
 ) -> dict[str, float]:
     """Standard deviation of each delay by the chain of pairs with the smallest one."""
-    variances = dict.fromkeys(names, np.inf) | {reference: 0.0}
-    for _ in names:
-        for pair in pairs:
-            step = float(pair.offset.sigma_ns) ** 2
-            for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
-                variances[one] = min(variances[one], variances[other] + step)
-    return {name: float(np.sqrt(value)) for name, value in variances.items()}
+    steps = np.zeros((len(names), len(names)))
+    for pair in pairs:
+        steps[names.index(pair.a), names.index(pair.b)] = float(pair.offset.sigma_ns) ** 2
+    (variances,) = dijkstra(steps, directed=False, indices=[names.index(reference)])
+    return dict(zip(names, np.sqrt(variances).tolist(), strict=True))
 
 
 def _check_loops(names: Sequence[str], pairs: Sequence[PairOffset]) -> float:

@@ -51,6 +51,9 @@ ROBOT_SIGMA = (3e-4, 2e-4)
 MIN_SECOND_SPREAD_M = 0.05
 # A board whose size differs by more sigmas from the entered one is refused.
 NUM_SCALE_SIGMAS = 3.0
+# Views that add a smaller share to what is known of the board's size say nothing of it: four or
+# five may add less than rounding.
+MIN_SCALE_INFORMATION = 1e-3
 # Poses of a board come from a solver; few steps bring them to the minimum of the pixels.
 POLISH_ROUNDS = 5
 
@@ -229,7 +232,10 @@ def _check_scale(bundle: Bundle, expected_sigma: float, names: tuple[str, str]) 
     """Refuse views that say, without what was expected, that the board is of another size."""
     variance = bundle.covariance[12, 12]
     # Information of the views alone; what was expected is a Gaussian about one.
-    own_variance = 1 / max(1 / variance - 1 / expected_sigma**2, np.finfo(float).tiny)
+    information = 1 / variance - 1 / expected_sigma**2
+    if information < MIN_SCALE_INFORMATION / expected_sigma**2:
+        return
+    own_variance = 1 / information
     log_scale = np.log(bundle.scale) * own_variance / variance
     if abs(log_scale) > NUM_SCALE_SIGMAS * np.hypot(np.sqrt(own_variance), expected_sigma):
         raise wrong_scale(TASK, names, float(np.exp(log_scale)), float(np.sqrt(own_variance)))

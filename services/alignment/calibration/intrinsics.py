@@ -253,7 +253,7 @@ def _places(found: FoundBoards) -> list[_Place]:
     groups: list[list[int]] = []
     for index in range(len(found.photos)):
         for group in groups:
-            if _apart_px(found, group[0], index) < limit_px:
+            if _distance_px(found, group[0], index) < limit_px:
                 group.append(index)
                 break
         else:
@@ -267,14 +267,14 @@ def _places(found: FoundBoards) -> list[_Place]:
     return places
 
 
-def _apart_px(found: FoundBoards, first: int, second: int) -> float:
+def _distance_px(found: FoundBoards, first: int, second: int) -> float:
     """Distance between the corners that both photos show, RMS; infinite where these are few."""
     is_same = (found.points_board[first][:, None] == found.points_board[second]).all(axis=-1)
     rows, columns = np.nonzero(is_same)
     if len(rows) < MIN_CORNERS:
         return float("inf")
-    apart_px = found.pixels_px[first][rows] - found.pixels_px[second][columns]
-    return float(np.sqrt(np.square(apart_px).sum(axis=1).mean()))
+    distances_px = found.pixels_px[first][rows] - found.pixels_px[second][columns]
+    return float(np.sqrt(np.square(distances_px).sum(axis=1).mean()))
 
 
 def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
@@ -354,13 +354,13 @@ def edge_width_px(
         About 2.5 sigma of the blur; infinity where no two corners are neighbours.
     """
     grid = np.asarray(points_board, dtype=np.float64)[:, :2]
-    apart = grid[None] - grid[:, None]
-    length = np.linalg.norm(apart, axis=-1)
+    separation_m = grid[None] - grid[:, None]
+    length = np.linalg.norm(separation_m, axis=-1)
     square_m = length[length > 0].min()
     ends = np.asarray(pixels, dtype=np.float64)
     widths = []
     for step_m in square_m * np.eye(2):
-        first, second = np.nonzero(np.abs(apart - step_m).max(axis=-1) < 0.01 * square_m)
+        first, second = np.nonzero(np.abs(separation_m - step_m).max(axis=-1) < 0.01 * square_m)
         if len(first):
             widths.append(np.median(_widths_px(photo, ends[first], ends[second])))
     return float(max(widths, default=np.inf))

@@ -16,7 +16,7 @@ from numpy.polynomial import chebyshev
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.structure import Structure, structure
+from services.alignment.calibration.places import Structure, structure
 
 # Radial functions show an equidistant lens, of which k1 k2 k3 leave waves along the radius.
 NUM_RADIAL = 10
@@ -112,10 +112,12 @@ def fit_lens(
         ]
         camera = _calibrated(bent, pixels, size_px, camera)
         design = _design(bent, pixels, bends, camera, size_px)
-    return _judged(camera, design, np.concatenate(bends) @ bend, [len(one) for one in points])
+    return _with_statistics(
+        camera, design, np.concatenate(bends) @ bend, [len(one) for one in points]
+    )
 
 
-def _judged(
+def _with_statistics(
     camera: _Camera, design: _Design, heights_m: np.ndarray, num_corners: list[int]
 ) -> LensFit:
     """The fit with its covariance and the structure of its residuals."""
@@ -241,10 +243,9 @@ def _design(
         Q, _ = np.linalg.qr(J[:, :6])
         rows.append(columns - Q @ (Q.T @ columns))
     stacked = np.concatenate(rows)
-    ends = (10, 13, stacked.shape[1] - NUM_DRIFTING)
-    return _Design(
-        stacked[:, 0], stacked[:, 1:10], *np.split(stacked[:, 10:], [3, ends[2] - 10], axis=1)
-    )
+    ends = [1, 10, 13, stacked.shape[1] - NUM_DRIFTING]
+    residuals, *others = np.split(stacked, ends, axis=1)
+    return _Design(residuals[:, 0], *others)
 
 
 def _fields(places: np.ndarray) -> np.ndarray:

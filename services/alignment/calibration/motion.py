@@ -133,10 +133,10 @@ def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
         return
     is_seen = spread_rad[0] >= MIN_SECOND_SPREAD_RAD
     names = missing_axes(axes[1:] if is_seen else axes)
-    told = "/".join(f"{value:.1f}" for value in np.rad2deg(spread_rad))
+    spread = "/".join(f"{value:.1f}" for value in np.rad2deg(spread_rad))
     seen = f" (all turns are about {np.round(axes[0], 2).tolist()})" if is_seen else ""
     raise DegenerateMotionError(
-        f"{task}: turns of the {body} spread {told} degrees along three axes{seen}, expected the "
+        f"{task}: turns of the {body} spread {spread} degrees along three axes{seen}, expected the "
         f"second at least {np.rad2deg(MIN_SECOND_SPREAD_RAD):.0f}; also turn the {body} by 30 "
         f"degrees and more about its {' and '.join(names)} axis",
         spread_deg=[float(value) for value in np.rad2deg(spread_rad)],
@@ -176,7 +176,7 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
             rms = _rms(errors)
             if rms[0] > MAX_ROTATION_RMS_RAD or rms[1] > MAX_TRANSLATION_RMS_M:
                 raise InvalidInputError(
-                    f"{series.task}: the views contradict each other by {_told(errors)} RMS, "
+                    f"{series.task}: the views contradict each other by {_rms_text(errors)} RMS, "
                     f"expected at most {np.rad2deg(MAX_ROTATION_RMS_RAD):.0f} degrees and "
                     f"{MAX_TRANSLATION_RMS_M * 1e3:.0f} mm; check that both series were taken at "
                     "the same times and the target did not move"
@@ -265,8 +265,9 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
     length_m, name, again = min(fits, key=lambda fit: fit[0])
     raise InvalidInputError(
         f"{series.task}: {name} is probably inverted: the views contradict each other by "
-        f"{_told(errors)} RMS as given and by {_told(again)} when {name} is turned round (the "
-        f"mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of {name}",
+        f"{_rms_text(errors)} RMS as given and by {_rms_text(again)} when {name} is turned round "
+        f"(the mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of "
+        f"{name}",
         inverted=name,
     )
 
@@ -307,18 +308,16 @@ def _rms(errors: np.ndarray) -> Float64[np.ndarray, "2"]:
     return np.sqrt(np.square(errors).mean(axis=0))
 
 
-def _told(errors: np.ndarray) -> str:
+def _rms_text(errors: np.ndarray) -> str:
     rms = _rms(errors)
     return f"{np.rad2deg(rms[0]):.2f} degrees and {rms[1] * 1e3:.1f} mm"
 
 
 def hat(vectors: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
     """Skew-symmetric (cross product) matrices of vectors [..., 3]."""
-    x, y, z = np.moveaxis(np.asarray(vectors, dtype=np.float64), -1, 0)
-    crossed = np.zeros((*x.shape, 3, 3))
-    crossed[..., 0, 1], crossed[..., 0, 2], crossed[..., 1, 2] = -z, y, -x
-    crossed[..., 1, 0], crossed[..., 2, 0], crossed[..., 2, 1] = z, -y, x
-    return crossed
+    # The columns are vector × unit vector.
+    columns = np.cross(np.asarray(vectors, dtype=np.float64)[..., None, :], np.eye(3))
+    return np.swapaxes(columns, -1, -2)
 
 
 def adjoint(T_a_b: np.ndarray) -> Float64[np.ndarray, "*batch 6 6"]:

@@ -4,10 +4,17 @@ A tracker errs by the same amount as long as it stands still, so that fifteen vi
 tell hardly more of it than one. They are averaged to one before anything is estimated. Residuals
 that follow the order of the places tell of a mount that slipped, a target or a frame that moved,
 and poses of other times.
+
+`structure` tests residuals of any fit. Independent errors leave as much in any direction of the
+residuals as in any other; a model that does not fit leaves more in those of a few smooth functions,
+of the place in an image for instance.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.special import fdtrc
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
@@ -18,8 +25,11 @@ from services.alignment.calibration.motion import (
     nearest_pose,
     twist,
 )
-from services.alignment.calibration.structure import Structure, structure
 
+# Directions of which the fitted unknowns leave less than this say nothing of their own.
+MIN_INDEPENDENCE = 1e-4
+# Fitted unknowns may be nearly the same, of which a fit makes use to the last digit.
+MIN_INDEPENDENCE_OF_FITTED = 1e-10
 # Views belong to one place where both series moved less. Ten times and more the noise of a tracker,
 # and what a hand sways that holds a camera; the mean of such poses is exact to 0.1 mm.
 MAX_SAME_PLACE_RAD, MAX_SAME_PLACE_M = np.deg2rad(2.0), 0.01
@@ -33,11 +43,11 @@ MIN_CORRELATION_SIGMAS = 2.0
 MIN_SIDE = 3
 
 
-def place_labels(series: Series) -> Int64[np.ndarray, " n"]:
+def place_labels(series: Series, *, min_places: int = MIN_VIEWS) -> Int64[np.ndarray, " n"]:
     """Number of the place of each view, in the order in which they were first visited.
 
     Raises:
-        InvalidInputError: fewer than four places.
+        InvalidInputError: fewer than `min_places` places.
     """
     labels = np.full(len(series.Ts_world_body), -1)
     num_places = 0
@@ -52,10 +62,10 @@ def place_labels(series: Series) -> Int64[np.ndarray, " n"]:
                 )
             labels[is_near & (labels < 0)] = num_places
             num_places += 1
-    if num_places < MIN_VIEWS:
+    if num_places < min_places:
         raise InvalidInputError(
             f"{series.task}: {len(labels)} views are of {num_places} places, expected at least "
-            f"{MIN_VIEWS}, better 20: views within {np.rad2deg(MAX_SAME_PLACE_RAD):.0f} degrees "
+            f"{min_places}, better 20: views within {np.rad2deg(MAX_SAME_PLACE_RAD):.0f} degrees "
             f"and {MAX_SAME_PLACE_M * 1e3:.0f} mm of each other count once"
         )
     return labels
@@ -123,6 +133,67 @@ def excess_over_time(
     trends = (times * J[:, :, :12]).reshape(6 * num_places, -1)
     found = structure(left, fitted, np.column_stack([trends, late]))
     return max(found.ratio, _num_together(left), 1.0)
+
+
+class Structure(NamedTuple):
+    """How much of the residuals some functions explain.
+
+    Attributes:
+        ratio: mean square of what they explain over that of the rest, both by degree of freedom;
+            about 1 for independent errors (an F statistic).
+        p_value: how probable so large a ratio is for independent Gaussian errors.
+        explained: sum of squares that they explain.
+        rest: mean square of what they do not, by each of its `freedom` degrees of freedom.
+        coefficients: of the functions, by least squares.
+        remaining: residuals that they do not explain.
+    """
+
+    ratio: float
+    p_value: float
+    explained: float
+    rest: float
+    freedom: int
+    coefficients: Float64[np.ndarray, " m"]
+    remaining: Float64[np.ndarray, " n"]
+
+
+def structure(
+    residuals: Float64[np.ndarray, " n"],
+    fitted: Float64[np.ndarray, "n p"],
+    functions: Float64[np.ndarray, "n m"],
+    *,
+    num_others: int = 0,
+    num_together: float = 1.0,
+) -> Structure:
+    """Test whether functions explain residuals of a fit better than chance.
+
+    Args:
+        residuals: of one size of error each (whitened).
+        fitted: how the residuals change with the unknowns that were fitted.
+        functions: what the residuals might follow.
+        num_others: unknowns that were fitted, too, and of which nothing is left in all three.
+        num_together: how many errors in turn are alike, and count as one.
+    """
+    U, s, _ = np.linalg.svd(fitted / _lengths(fitted), full_matrices=False)
+    Q = U[:, s > MIN_INDEPENDENCE_OF_FITTED]
+    lengths = _lengths(functions)
+    own = functions / lengths
+    own, left = own - Q @ (Q.T @ own), residuals - Q @ (Q.T @ residuals)
+    U, s, Vt = np.linalg.svd(own, full_matrices=False)
+    U, s, Vt = (part[s > MIN_INDEPENDENCE] for part in (U.T, s, Vt))
+    along = U @ left
+    explained, num = float(along @ along), len(s)
+    freedom = max(len(residuals) - num_others - Q.shape[1] - num, 1)
+    rest = max(float(left @ left) - explained, np.finfo(float).tiny) / freedom
+    ratio = explained / max(num, 1) / rest / num_together
+    p_value = float(fdtrc(max(num, 1), freedom / num_together, ratio))
+    return Structure(
+        ratio, p_value, explained, rest, freedom, (Vt.T @ (along / s)) / lengths, left - U.T @ along
+    )
+
+
+def _lengths(columns: np.ndarray) -> np.ndarray:
+    return np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
 
 
 def _change(left: np.ndarray, fitted: np.ndarray, functions: np.ndarray) -> Structure:

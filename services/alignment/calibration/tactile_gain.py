@@ -10,15 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, UnknownNameError
-from dextouch.tactile.layout import (
-    FINGERS,
-    NUM_RAW_TAXELS,
-    NUM_TAXELS,
-    NUM_TIP_TAXELS,
-    expand_taxels,
-    raw_indices,
-    select_taxels,
-)
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.alignment.calibration.tactile_tare import (
     DEAD,
     FULL_SCALE_COUNTS,
@@ -36,6 +28,7 @@ from services.alignment.calibration.tactile_tare import (
     checked_counts,
     classify_taxels,
     kind_of_silence,
+    reading_step,
     steady_level,
 )
 
@@ -60,10 +53,6 @@ MAX_CREEP = 0.1
 MAX_CREEPING = 0.25
 # More faulty taxels than this, and the glove needs a repair, not a calibration.
 MAX_FAULTY = 0.25
-PADS = (*FINGERS, "palm")
-_PADS = [slice(start, start + 16) for start in range(0, NUM_TIP_TAXELS, 16)] + [
-    slice(NUM_TIP_TAXELS, NUM_TAXELS)
-]
 
 
 @dataclass(frozen=True)
@@ -73,7 +62,7 @@ class TaxelPress:
     Args:
         pressure_kpa: above 0; force / area for a weight.
         sigma_kpa: one standard deviation of it, 0 or more.
-        counts: [T ≥ 60, 360] raw readings during the press.
+        counts: [T ≥ 60, cells] raw readings during the press.
         taxels: which taxels (anatomical order) were pressed.
 
     Raises:
@@ -84,7 +73,7 @@ class TaxelPress:
     pressure_kpa: float
     sigma_kpa: float
     counts: np.ndarray
-    taxels: Bool[np.ndarray, "320"]
+    taxels: Bool[np.ndarray, " taxels"]
 
     def __post_init__(self) -> None:
         if not np.isfinite([self.pressure_kpa, self.sigma_kpa]).all():
@@ -98,7 +87,7 @@ class TaxelPress:
 
 @dataclass(frozen=True)
 class TaxelGain:
-    """Gain of each of the 320 taxels in counts per kPa, anatomical order.
+    """Gain of each taxel in counts per kPa, anatomical order.
 
     Attributes:
         gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
@@ -107,13 +96,13 @@ class TaxelGain:
             drift from press to press where the presses show one. A single pressure shows no bend;
             then it includes the largest that is tolerated.
         state: index into `tactile_tare.STATES`.
-        residual_kpa: [press, 320] what each press is off the line, 0 where not used.
+        residual_kpa: [press, taxels] what each press is off the line, 0 where not used.
     """
 
-    gain_counts_per_kpa: Float64[np.ndarray, "320"]
-    sigma_counts_per_kpa: Float64[np.ndarray, "320"]
-    state: UInt8[np.ndarray, "320"]
-    residual_kpa: Float64[np.ndarray, "press 320"]
+    gain_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    sigma_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    state: UInt8[np.ndarray, " taxels"]
+    residual_kpa: Float64[np.ndarray, "press taxels"]
 
 
 @dataclass(frozen=True)
@@ -123,28 +112,29 @@ class GloveCalibration:
     tare: TaxelTare
     gain: TaxelGain | None
 
-    def matrices(self) -> dict[str, Float64[np.ndarray, "1 360"]]:
-        """Matrices by their names in recordings; all in scan order.
+    def matrices(self) -> dict[str, Float64[np.ndarray, "1 cells"]]:
+        """Matrices by their names in recordings, in scan order and in the unit of the readings.
 
         A taxel whose gain was refused gets the median gain of its pad, so that counts of a faulty
         taxel stay finite; `…_state` says which ones (index into `tactile_tare.STATES`). Cells
         without a taxel get the median of all.
         """
-        side = self.tare.side
+        side, step = self.tare.side, reading_step(self.tare.layout)
         found = {
-            f"tactile_{side}_tare_counts": self.tare.level.mean_counts,
-            f"tactile_{side}_tare_sigma_counts": self.tare.level.sigma_counts,
-            f"tactile_{side}_noise_counts": self.tare.level.noise_counts,
+            f"tactile_{side}_tare_counts": step * self.tare.level.mean_counts,
+            f"tactile_{side}_tare_sigma_counts": step * self.tare.level.sigma_counts,
+            f"tactile_{side}_noise_counts": step * self.tare.level.noise_counts,
         }
         if self.gain is not None:
-            filled = filled_gain(self.gain)
-            raw = np.full(NUM_RAW_TAXELS, np.median(filled))
-            raw[raw_indices(side=side)] = filled
-            sigma = expand_taxels(self.gain.sigma_counts_per_kpa, side=side)
-            state = expand_taxels(self.gain.state, side=side)
+            layout = self.tare.layout
+            filled = filled_gain(self.gain, layout)
+            raw = np.full(layout.num_raw_cells, np.median(filled))
+            raw[layout.raw_indices(side)] = filled
+            sigma = layout.expand(self.gain.sigma_counts_per_kpa, side=side)
+            state = layout.expand(self.gain.state, side=side)
             found |= {
-                f"tactile_{side}_gain_counts_per_kpa": raw,
-                f"tactile_{side}_gain_sigma_counts_per_kpa": sigma,
+                f"tactile_{side}_gain_counts_per_kpa": step * raw,
+                f"tactile_{side}_gain_sigma_counts_per_kpa": step * sigma,
                 f"tactile_{side}_taxel_state": state.astype(np.float64),
             }
         return {name: np.asarray(row, dtype=np.float64)[None] for name, row in found.items()}
@@ -173,18 +163,21 @@ def calibrate_glove(
         return GloveCalibration(tare, None)
     found = GloveCalibration(tare, fit_gain(tare, presses, full_scale_counts=full_scale_counts))
     counted = found.num_by_state()
-    if 1 - counted.get("ok", 0) / NUM_TAXELS > MAX_FAULTY:
+    num_taxels = tare.layout.num_taxels
+    if 1 - counted.get("ok", 0) / num_taxels > MAX_FAULTY:
         told = ", ".join(f"{number} {name}" for name, number in counted.items())
         raise InvalidInputError(
-            f"glove {tare.side}: of 320 taxels {told}; expected at most {MAX_FAULTY:.0%} not ok. "
-            "Unproven: press them too. Imprecise: press harder, at least 5 kPa. Saturated: press "
-            "less. Nonlinear: let each press settle. Dead or stuck: repair the glove",
+            f"glove {tare.side}: of {num_taxels} taxels {told}; expected at most {MAX_FAULTY:.0%} "
+            "not ok. Unproven: press them too. Imprecise: press harder, at least 5 kPa. Saturated: "
+            "press less. Nonlinear: let each press settle. Dead or stuck: repair the glove",
             num_by_state=counted,
         )
     return found
 
 
-def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, "320"]:
+def filled_gain(
+    gain: TaxelGain, layout: TactileLayout = DEXTOUCH_V1
+) -> Float64[np.ndarray, " taxels"]:
     """Gains in which refused taxels have the median of their pad, or of the glove.
 
     Raises:
@@ -195,27 +188,33 @@ def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, "320"]:
         raise InvalidInputError("glove: the gain of no taxel is known")
     filled = gain.gain_counts_per_kpa.copy()
     usual_of_all = np.median(gain.gain_counts_per_kpa[known])
-    for pad in _PADS:
+    for pad in _slices(layout).values():
         mine = known[pad]
         usual = np.median(gain.gain_counts_per_kpa[pad][mine]) if mine.any() else usual_of_all
         filled[pad] = np.where(mine, filled[pad], usual)
     return filled
 
 
-def pad_taxels(names: str) -> Bool[np.ndarray, "320"]:
+def _slices(layout: TactileLayout) -> dict[str, slice]:
+    """Taxels of each pad, by its part of the hand."""
+    starts = zip(layout.pads, layout.starts, strict=True)
+    return {pad.part: slice(start, start + pad.num_taxels) for pad, start in starts}
+
+
+def pad_taxels(names: str, layout: TactileLayout = DEXTOUCH_V1) -> Bool[np.ndarray, " taxels"]:
     """Which taxels belong to pads, named with + between them, such as `thumb+index`, or `all`.
 
     Raises:
         UnknownNameError: no such pad.
     """
-    taxels = np.zeros(NUM_TAXELS, dtype=np.bool_)
+    taxels, slices = np.zeros(layout.num_taxels, dtype=np.bool_), _slices(layout)
     for name in names.split("+"):
         if name == "all":
             taxels[:] = True
-        elif name in PADS:
-            taxels[_PADS[PADS.index(name)]] = True
+        elif name in slices:
+            taxels[slices[name]] = True
         else:
-            raise UnknownNameError("pad", name, [*PADS, "all"])
+            raise UnknownNameError("pad", name, [*slices, "all"])
     return taxels
 
 
@@ -243,7 +242,7 @@ def fit_gain(
     takes = [press.counts for press in presses]
     state = classify_taxels(takes, tare, full_scale_counts=full_scale_counts)
     silent = _silent_under_pressure(points) & (state != SATURATED)
-    state[silent] = kind_of_silence(takes, tare.side)[silent]
+    state[silent] = kind_of_silence(takes, tare)[silent]
     pressed = points.used[:-1].any(axis=0)
     state[points.saturated[:-1].any(axis=0) & ~pressed] = SATURATED
     state[~pressed & (state == OK)] = UNPROVEN
@@ -266,10 +265,10 @@ class _Points:
 
     pressure_kpa: Float64[np.ndarray, "k 1"]
     sigma_kpa: Float64[np.ndarray, "k 1"]
-    counts: Float64[np.ndarray, "k 320"]
-    sigma_counts: Float64[np.ndarray, "k 320"]
-    used: Bool[np.ndarray, "k 320"]
-    saturated: Bool[np.ndarray, "k 320"]
+    counts: Float64[np.ndarray, "k taxels"]
+    sigma_counts: Float64[np.ndarray, "k taxels"]
+    used: Bool[np.ndarray, "k taxels"]
+    saturated: Bool[np.ndarray, "k taxels"]
 
 
 def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: float) -> _Points:
@@ -278,17 +277,18 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
 
     def of_taxels(level: Level) -> list[np.ndarray]:
         rows = level.mean_counts, level.sigma_counts
-        return [select_taxels(row, side=tare.side) for row in rows]
+        return [tare.select(row) for row in rows]
 
     for index, press in enumerate(presses):
-        raw = checked_counts(press.counts, what=f"press {index} ({press.pressure_kpa:g} kPa)")
+        what = f"press {index} ({press.pressure_kpa:g} kPa)"
+        raw = checked_counts(press.counts, what=what, layout=tare.layout)
         level = steady_level(raw)
         _check_steady(raw, level, press, tare)
-        at_stop = select_taxels((raw >= limit).mean(axis=0), side=tare.side)
+        at_stop = tare.select((raw >= limit).mean(axis=0))
         is_full = press.taxels & (at_stop > MAX_SATURATED_READINGS)
         used = press.taxels & ~is_full
         rows.append(([press.pressure_kpa], [press.sigma_kpa], *of_taxels(level), used, is_full))
-    everywhere = np.ones(NUM_TAXELS, dtype=np.bool_)
+    everywhere = np.ones(tare.layout.num_taxels, dtype=np.bool_)
     rows.append(([0.0], [0.0], *of_taxels(tare.level), everywhere, ~everywhere))
     return _Points(*map(np.array, zip(*rows, strict=True)))
 
@@ -300,7 +300,7 @@ def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelT
     response = np.abs(level.mean_counts - tare.level.mean_counts)
     allowed = np.maximum(MAX_CREEP * response, MIN_MOVE_COUNTS)
     unsteady = (creep > allowed) | (level.clipped > MAX_CREEPING)
-    share = float(select_taxels(unsteady, side=tare.side)[press.taxels].mean())
+    share = float(tare.select(unsteady)[press.taxels].mean())
     if share > MAX_CREEPING:
         raise InvalidInputError(
             f"press of {press.pressure_kpa:g} kPa: {share:.0%} of its taxels changed while it "
@@ -312,14 +312,14 @@ def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelT
 def _creep(press: TaxelPress, tare: TaxelTare) -> float:
     """Change of the response from the first half of a press to the second, as a share of it."""
     first, second = (
-        select_taxels(np.median(part, axis=0) - tare.level.mean_counts, side=tare.side)
+        tare.select(np.median(part, axis=0) - tare.level.mean_counts)
         for part in np.array_split(np.asarray(press.counts, dtype=np.float64), 2)
     )
     answering = press.taxels & (first > MIN_MOVE_COUNTS)
     return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
 
 
-def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, "320"]:
+def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, " taxels"]:
     """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
 
     Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
@@ -332,7 +332,7 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
     has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
     told = used.any(axis=1)
     if not told.any():
-        return np.zeros(NUM_TAXELS)
+        return np.zeros(len(gain))
     P = points.pressure_kpa[:-1][told, 0]
     response_kpa = (points.counts[:-1] - points.counts[-1]) / np.where(gain > 0, gain, 1.0)
     seen_kpa = np.array(
@@ -389,7 +389,7 @@ def _check_direction(points: _Points) -> None:
         )
 
 
-def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, "320"]:
+def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
     """Taxels without response in every press to which the others respond."""
     response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
     usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
@@ -404,7 +404,7 @@ def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
     The pressure's sigma enters through the gain, hence the rounds (York 1966, uncorrelated).
     """
-    P, gain = points.pressure_kpa, np.zeros(NUM_TAXELS)
+    P, gain = points.pressure_kpa, np.zeros(points.counts.shape[1])
     for _ in range(ROUNDS):
         variance = points.sigma_counts**2 + (gain * points.sigma_kpa) ** 2
         weight = np.where(points.used, 1 / np.maximum(variance, 1e-12), 0.0)
@@ -412,7 +412,7 @@ def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
         mean_P, mean_c = ((weight * values).sum(axis=0) / total for values in (P, points.counts))
         spread = (weight * (P - mean_P) ** 2).sum(axis=0)
         slope = (weight * (P - mean_P) * (points.counts - mean_c)).sum(axis=0)
-        gain = np.divide(slope, spread, out=np.zeros(NUM_TAXELS), where=spread > 0)
+        gain = np.divide(slope, spread, out=np.zeros(len(spread)), where=spread > 0)
     zero = mean_c - gain * mean_P
     chi2 = (weight * (points.counts - zero - gain * P) ** 2).sum(axis=0)
     excess = chi2 / np.maximum(points.used.sum(axis=0) - 2, 1)
@@ -422,7 +422,7 @@ def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def _judge_lines(
     points: _Points, line: tuple[np.ndarray, np.ndarray, np.ndarray], state: np.ndarray
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     gain, sigma, excess = line
     good = state == OK
     P, num = points.pressure_kpa, points.used.sum(axis=0)

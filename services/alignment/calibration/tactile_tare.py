@@ -7,22 +7,14 @@ nothing around it moved it stays `unproven`.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.tactile.layout import (
-    NUM_FINGERTIPS,
-    NUM_RAW_TAXELS,
-    NUM_TAXELS,
-    PALM_SHAPE,
-    TIP_SHAPE,
-    Side,
-    raw_indices,
-    select_taxels,
-)
+from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 # One second of a 60 Hz glove; with less, drift cannot be separated from the zero.
 MIN_SAMPLES = 60
@@ -97,15 +89,15 @@ class Level:
     `noise_counts` the standard deviation of one reading; `clipped` the share of excluded readings.
     """
 
-    mean_counts: Float64[np.ndarray, "360"]
-    sigma_counts: Float64[np.ndarray, "360"]
-    noise_counts: Float64[np.ndarray, "360"]
-    clipped: Float64[np.ndarray, "360"]
+    mean_counts: Float64[np.ndarray, " cells"]
+    sigma_counts: Float64[np.ndarray, " cells"]
+    noise_counts: Float64[np.ndarray, " cells"]
+    clipped: Float64[np.ndarray, " cells"]
 
 
 @dataclass(frozen=True)
 class TaxelTare:
-    """The zero of each of the 360 raw cells of one glove: their level without load.
+    """The zero of each of the raw cells of one glove: their level without load.
 
     `restless` taxels (anatomical order) moved during the take of so many samples; few are
     tolerated.
@@ -113,34 +105,42 @@ class TaxelTare:
 
     side: Side
     level: Level
-    restless: Bool[np.ndarray, "320"]
+    restless: Bool[np.ndarray, " taxels"]
     num_samples: int
+    layout: TactileLayout = DEXTOUCH_V1
+
+    def select(self, raw: np.ndarray) -> np.ndarray:
+        """Taxels, in anatomical order, of raw readings [..., cells]."""
+        return self.layout.select(raw, side=self.side)
 
 
-def measure_tare(rest_counts: np.ndarray, *, side: Side) -> TaxelTare:
+def measure_tare(
+    rest_counts: np.ndarray, *, side: Side, layout: TactileLayout = DEXTOUCH_V1
+) -> TaxelTare:
     """Zero of every cell from a take without contact.
 
     Args:
-        rest_counts: [T ≥ 60, 360] raw counts in scan order.
+        rest_counts: [T ≥ 60, cells] raw counts in scan order.
         side: of the glove.
+        layout: of the glove.
 
     Raises:
         InvalidInputError: too short, or the glove was touched or still settling.
-        ShapeError, NonFiniteError: no [T, 360], or NaN.
+        ShapeError, NonFiniteError: no [T, cells], or NaN.
     """
-    counts = checked_counts(rest_counts, what=f"rest take of the {side} glove")
+    counts = checked_counts(rest_counts, what=f"rest take of the {side} glove", layout=layout)
     level = steady_level(counts)
-    restless = select_taxels(_restless(counts, level), side=side)
+    restless = layout.select(_restless(counts, level), side=side)
     if restless.mean() > MAX_RESTLESS:
         raise InvalidInputError(
-            f"rest take of the {side} glove: {int(restless.sum())} of 320 taxels moved during the "
-            f"take, expected at most {MAX_RESTLESS:.0%}; lay the glove down untouched, wait a "
-            "minute and record again"
+            f"rest take of the {side} glove: {int(restless.sum())} of {layout.num_taxels} taxels "
+            f"moved during the take, expected at most {MAX_RESTLESS:.0%}; lay the glove down "
+            "untouched, wait a minute and record again"
         )
-    return TaxelTare(side, level, restless, len(counts))
+    return TaxelTare(side, level, restless, len(counts), layout)
 
 
-def steady_level(counts: Float64[np.ndarray, "time 360"]) -> Level:
+def steady_level(counts: Float64[np.ndarray, "time cells"]) -> Level:
     """Robust level, its sigma, and noise of each cell's readings; knocks are excluded."""
     median = np.median(counts, axis=0)
     spread = 1.4826 * np.median(np.abs(counts - median), axis=0)
@@ -167,17 +167,19 @@ def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
     return np.sqrt(terms.sum(axis=-1))
 
 
-def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "time 360"]:
+def checked_counts(
+    counts: np.ndarray, *, what: str, layout: TactileLayout = DEXTOUCH_V1
+) -> Float64[np.ndarray, "time cells"]:
     """Counts as float64.
 
     Raises:
-        ShapeError: not [T, 360].
+        ShapeError: not [T, cells].
         NonFiniteError: NaN or infinity.
         InvalidInputError: too few readings.
     """
     raw = np.asarray(counts, dtype=np.float64)
-    if raw.ndim != 2 or raw.shape[1] != NUM_RAW_TAXELS:
-        raise ShapeError(f"{what}: got {raw.shape}, expected [T, {NUM_RAW_TAXELS}]")
+    if raw.ndim != 2 or raw.shape[1] != layout.num_raw_cells:
+        raise ShapeError(f"{what}: got {raw.shape}, expected [T, {layout.num_raw_cells}]")
     if not np.isfinite(raw).all():
         raise NonFiniteError(f"{what}: holds NaN or infinity; record it again")
     if len(raw) < MIN_SAMPLES:
@@ -189,40 +191,39 @@ def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "tim
 
 def classify_taxels(
     takes: Sequence[np.ndarray], tare: TaxelTare, *, full_scale_counts: float = FULL_SCALE_COUNTS
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
 
-    The takes are raw counts [T, 360] each; the rest take may be among them.
+    The takes are raw counts [T, cells] each; the rest take may be among them.
     """
-    side, level = tare.side, tare.level
-    evidence, silent, moves = (np.zeros(NUM_TAXELS, dtype=np.int64) for _ in range(3))
-    zero = select_taxels(level.mean_counts, side=side)
-    noise = select_taxels(level.noise_counts, side=side)
+    level, num_taxels = tare.level, tare.layout.num_taxels
+    evidence, silent, moves = (np.zeros(num_taxels, dtype=np.int64) for _ in range(3))
+    zero, noise = tare.select(level.mean_counts), tare.select(level.noise_counts)
     needed = np.maximum(MIN_MOVE_SIGMAS * noise, MIN_MOVE_COUNTS)
     for take in takes:
         # In pieces, since eight neighbours of every reading would not fit in memory.
         for start in range(0, len(take), BLOCK):
             block = np.asarray(take[start : start + BLOCK], dtype=np.float64)
-            moved = np.abs(select_taxels(block, side=side) - zero)
-            around = _least_neighbour(moved)
+            moved = np.abs(tare.select(block) - zero)
+            around = _least_neighbour(moved, tare.layout)
             told = around >= needed
             evidence += told.sum(axis=0)
             silent += (told & (moved < SILENT_RATIO * around)).sum(axis=0)
             moves += (moved >= needed).sum(axis=0)
     is_silent = (evidence >= MIN_EVIDENCE) & (silent >= MIN_SILENT * evidence)
     is_silent &= moves < MIN_OWN_MOVES
-    states = np.full(NUM_TAXELS, UNPROVEN, dtype=np.uint8)
+    states = np.full(num_taxels, UNPROVEN, dtype=np.uint8)
     states[(moves >= MIN_OWN_MOVES) | ((evidence >= MIN_EVIDENCE) & ~is_silent)] = OK
-    states[is_silent] = kind_of_silence(takes, side)[is_silent]
-    usual = select_taxels(np.min([np.median(take, axis=0) for take in takes], axis=0), side=side)
+    states[is_silent] = kind_of_silence(takes, tare)[is_silent]
+    usual = tare.select(np.min([np.median(take, axis=0) for take in takes], axis=0))
     states[usual >= SATURATED_RATIO * full_scale_counts] = SATURATED
     return states
 
 
-def kind_of_silence(takes: Sequence[np.ndarray], side: Side) -> UInt8[np.ndarray, "320"]:
+def kind_of_silence(takes: Sequence[np.ndarray], tare: TaxelTare) -> UInt8[np.ndarray, " taxels"]:
     """`STUCK` for taxels that keep one value other than zero in all takes, else `DEAD`."""
     lowest, highest = (
-        select_taxels(most([most(take, axis=0) for take in takes], axis=0), side=side)
+        tare.select(most([most(take, axis=0) for take in takes], axis=0))
         for most in (np.min, np.max)
     )
     return np.where((lowest == highest) & (lowest != 0), STUCK, DEAD).astype(np.uint8)
@@ -242,7 +243,9 @@ def _slow_noise_factor(counts: np.ndarray, noise: np.ndarray) -> float:
     return max(1.0, float(np.sqrt(np.median(ratio))))
 
 
-def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.ndarray, "360"]:
+def _restless(
+    counts: Float64[np.ndarray, "time cells"], level: Level
+) -> Bool[np.ndarray, " cells"]:
     half = len(counts) // 2
     shift = np.abs(np.median(counts[:half], axis=0) - np.median(counts[half:], axis=0))
     # Differences of neighbours in time: a step between the halves does not widen them.
@@ -252,26 +255,26 @@ def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.
     return (shift > allowed) | (level.clipped > MAX_CLIPPED)
 
 
-def _neighbours() -> Int64[np.ndarray, "320 8"]:
+@cache
+def _neighbours(layout: TactileLayout) -> Int64[np.ndarray, "taxels 8"]:
     """Taxels around each taxel on its own pad, anatomical order; −1 where there is none."""
     tables, first = [], 0
-    for shape in [TIP_SHAPE] * NUM_FINGERTIPS + [PALM_SHAPE]:
-        cells = first + np.arange(shape[0] * shape[1]).reshape(shape)
+    for pad in layout.pads:
+        cells = first + np.arange(pad.num_taxels).reshape(pad.shape)
         around = sliding_window_view(np.pad(cells, 1, constant_values=-1), (3, 3)).reshape(-1, 9)
         tables.append(np.delete(around, 4, axis=1))
         first += cells.size
     return np.concatenate(tables)
 
 
-_NEIGHBOURS = _neighbours()
-_NUM_NEIGHBOURS = (_NEIGHBOURS >= 0).sum(axis=1)
-
-
-def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarray, "time 320"]:
+def _least_neighbour(
+    moved: Float64[np.ndarray, "time taxels"], layout: TactileLayout
+) -> Float64[np.ndarray, "time taxels"]:
     """Smallest change of the neighbours, excluding the quarter that changed least."""
-    around = np.where(_NEIGHBOURS >= 0, moved[:, _NEIGHBOURS], np.inf)
+    neighbours = _neighbours(layout)
+    around = np.where(neighbours >= 0, moved[:, neighbours], np.inf)
     around.sort(axis=2)
-    rank = np.floor(STILL_NEIGHBOURS * _NUM_NEIGHBOURS).astype(np.int64)
+    rank = np.floor(STILL_NEIGHBOURS * (neighbours >= 0).sum(axis=1)).astype(np.int64)
     return np.take_along_axis(around, rank[None, :, None], axis=2)[..., 0]
 
 
@@ -286,6 +289,7 @@ class TactileCalibration:
         tare_counts: of each taxel, in the unit in which the glove sends its readings.
         gain_counts_per_kpa: of each taxel, above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.
+        step: smallest difference of two readings, in their unit.
 
     Raises:
         InvalidInputError: a gain that is not positive, or not one taxel that is measured.
@@ -293,16 +297,17 @@ class TactileCalibration:
 
     side: Side
     num_cells: int
-    cells: Int64[np.ndarray, "320"]
-    tare_counts: Float64[np.ndarray, "320"]
-    gain_counts_per_kpa: Float64[np.ndarray, "320"]
-    state: UInt8[np.ndarray, "320"]
+    cells: Int64[np.ndarray, " taxels"]
+    tare_counts: Float64[np.ndarray, " taxels"]
+    gain_counts_per_kpa: Float64[np.ndarray, " taxels"]
+    state: UInt8[np.ndarray, " taxels"]
+    step: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.state == OK).any():
             raise InvalidInputError(
-                f"tactile calibration {self.side}: refuses all 320 taxels; calibrate the glove "
-                "again, or leave its stream out"
+                f"tactile calibration {self.side}: refuses all {len(self.state)} taxels; calibrate "
+                "the glove again, or leave its stream out"
             )
         if not (self.gain_counts_per_kpa > 0).all():
             raise InvalidInputError(
@@ -316,47 +321,49 @@ class TactileCalibration:
         record: Record,
         side: Side,
         *,
-        num_cells: int = NUM_RAW_TAXELS,
+        num_cells: int | None = None,
         stream: str | None = None,
+        layout: TactileLayout | None = None,
     ) -> "TactileCalibration":
         """From a recording's calibration matrices.
 
         Args:
-            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells); if there
-                are any `…_taxel_state` (1 × cells) and `…_cells` (1 × 320), which a glove of
-                another number of cells must have.
+            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells), the latter
+                unless the unit of the layout says it; if there are any `…_taxel_state` (1 × cells)
+                and `…_cells` (1 × taxels), which a glove that names no layout must have unless it
+                sends 360 numbers.
             side: of the glove.
-            num_cells: numbers that the glove sends in each sample.
+            num_cells: numbers that the glove sends in each sample; None: those of the layout.
             stream: of a further glove of this side, whose matrices begin with its name.
+            layout: that the stream names; None of `dextouch_v1`.
 
         Raises:
             InvalidInputError: a matrix of this side is missing, has the wrong shape or invalid
                 values.
             NonFiniteError: NaN or infinity.
         """
-        glove = stream or f"tactile_{side}"
-        tare, gain = (
-            _row(record, f"{glove}_{name}", num_cells)
-            for name in ("tare_counts", "gain_counts_per_kpa")
-        )
-        cells = _cells(record, side, num_cells, glove)
-        state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
+        glove, about = stream or f"tactile_{side}", layout or DEXTOUCH_V1
+        num_cells = about.num_raw_cells if num_cells is None else num_cells
+        tare = _row(record, f"{glove}_tare_counts", num_cells)
+        cells = _cells(record, side, num_cells, glove, layout)
+        gain = _gain(record, f"{glove}_gain_counts_per_kpa", num_cells, cells, layout)
+        state = np.full(len(cells), ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        if num_cells == NUM_RAW_TAXELS and (state == OK).any():
+        if layout is None and num_cells == about.num_raw_cells and (state == OK).any():
             _check_full_scale(gain[cells[state == OK]], f"{glove}_gain_counts_per_kpa")
         gain = np.where(state == OK, gain[cells], 1.0)
-        return cls(side, num_cells, cells, tare[cells], gain, state)
+        return cls(side, num_cells, cells, tare[cells], gain, state, reading_step(about))
 
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
-    ) -> Float32[np.ndarray, "time 320"]:
+    ) -> Float32[np.ndarray, "time taxels"]:
         """Pressures in anatomical order; zero below the tare, NaN where the reading is.
 
         Args:
             counts: [T, cells] raw readings of the glove.
-            refused: uint8 [320] of `unusable_taxels`, taxels that are set to zero; by default those
-                that the calibration refuses.
+            refused: uint8 [taxels] of `unusable_taxels`, taxels that are set to zero; by default
+                those that the calibration refuses.
 
         Raises:
             ShapeError: not [T, cells].
@@ -366,7 +373,7 @@ class TactileCalibration:
         taxels[:, (self.state if refused is None else refused) != OK] = 0.0
         return taxels.astype(np.float32)
 
-    def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time 320"]:
+    def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time taxels"]:
         """Readings [T, cells] by taxel; where there is no cell, those of any other.
 
         Raises:
@@ -382,7 +389,7 @@ class TactileCalibration:
 
 def unusable_taxels(
     calibration: TactileCalibration, pieces: Iterable[np.ndarray]
-) -> UInt8[np.ndarray, "320"]:
+) -> UInt8[np.ndarray, " taxels"]:
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     In addition to those that the glove's calibration refuses: cells that are constant but not at
@@ -428,16 +435,18 @@ class _TaxelTake:
     def __init__(self, calibration: TactileCalibration) -> None:
         self._glove = calibration
         # Gloves of few bits round their tare and their readings to whole counts.
-        self._margin = np.maximum(DEAD_OFFSET_KPA * calibration.gain_counts_per_kpa, MARGIN_COUNTS)
-        self.num_samples = 0
-        self._last = np.full(NUM_TAXELS, np.nan)
-        self._low = np.full(NUM_TAXELS, np.inf)
+        self._margin = np.maximum(
+            DEAD_OFFSET_KPA * calibration.gain_counts_per_kpa, MARGIN_COUNTS * calibration.step
+        )
+        self.num_samples, num_taxels = 0, len(calibration.cells)
+        self._last = np.full(num_taxels, np.nan)
+        self._low = np.full(num_taxels, np.inf)
         self._high = -self._low
         self._num_windows = 0
-        zeros = np.zeros((6, NUM_TAXELS))
+        zeros = np.zeros((6, num_taxels))
         self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros
 
-    def add(self, counts: Float64[np.ndarray, "time 320"]) -> None:
+    def add(self, counts: Float64[np.ndarray, "time taxels"]) -> None:
         """The next readings."""
         if not len(counts):
             return
@@ -455,7 +464,7 @@ class _TaxelTake:
         self._last = counts[-1]
         self.num_samples += len(counts)
 
-    def _note_equal(self, equal: Bool[np.ndarray, "time 320"]) -> None:
+    def _note_equal(self, equal: Bool[np.ndarray, "time taxels"]) -> None:
         """Count equal readings in a row: the longest row that ended, and the one that has not."""
         at = np.arange(len(equal))[:, None]
         # Of each reading the last one before or at it that was new; before this block if negative.
@@ -466,7 +475,7 @@ class _TaxelTake:
         np.maximum.at(self._longest, columns, ended)
         self._kept = runs[-1]
 
-    def _note_random(self, offsets: Float64[np.ndarray, "time 320"]) -> None:
+    def _note_random(self, offsets: Float64[np.ndarray, "time taxels"]) -> None:
         """Count taxels whose readings have nothing to do with those before, nor with others'."""
         if len(offsets) < MIN_SAMPLES_TO_JUDGE:
             return
@@ -483,7 +492,7 @@ class _TaxelTake:
         # What taps returns to rest, and what vibrates moves its neighbours alike.
         found &= (np.abs(offsets) < self._margin).mean(axis=0) < MAX_RESTING_SHARE
         common2 = float((steps.mean(axis=1) ** 2).mean())
-        self._random += found & (common2 < MAX_COMMON_RATIO * steps2.mean() / NUM_TAXELS)
+        self._random += found & (common2 < MAX_COMMON_RATIO * steps2.mean() / steps2.size)
         self._num_windows += 1
 
     def check_pressures(self) -> None:
@@ -498,7 +507,7 @@ class _TaxelTake:
                 fault="unit",
             )
 
-    def faults(self) -> dict[int, Bool[np.ndarray, "320"]]:
+    def faults(self) -> dict[int, Bool[np.ndarray, " taxels"]]:
         """Taxels by reason; of several reasons the first one counts."""
         n, offset = self.num_samples, self._last - self._glove.tare_counts
         silent = (self._low == self._high) & (np.abs(offset) > self._margin)
@@ -512,7 +521,7 @@ class _TaxelTake:
             STUCK: silent,
         }
 
-    def _ended(self) -> Bool[np.ndarray, "320"]:
+    def _ended(self) -> Bool[np.ndarray, " taxels"]:
         """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.
 
         A stream that is frozen as a whole, and readings at full scale, are none of these.
@@ -524,6 +533,26 @@ class _TaxelTake:
         quiet = (self._kept >= least) & (rested >= MIN_REST_SAMPLES)
         ended = (below | quiet) & (self._last < np.nanmax(self._high))
         return ended & (ended.mean() <= MAX_WRONG_TAXELS)
+
+
+def reading_step(layout: TactileLayout) -> float:
+    """Smallest difference of two readings: one count, of other units a part in 65535 of full scale.
+
+    What floats resolve is not known; 16 bits are what the converters of such gloves have.
+    """
+    return 1.0 if layout.unit == "counts" else layout.full_scale / FULL_SCALE_COUNTS
+
+
+def _gain(
+    record: Record, name: str, num_cells: int, cells: np.ndarray, layout: TactileLayout | None
+) -> Float64[np.ndarray, " cells"]:
+    """Gain of each cell: that of the calibration, or else the one that the layout's unit says."""
+    kpa_per_unit = None if layout is None else layout.nominal_kpa_per_unit
+    if name in record or kpa_per_unit is None:
+        return _row(record, name, num_cells)
+    gain = np.ones(num_cells)
+    gain[cells[cells != NO_CELL]] = 1.0 / kpa_per_unit[cells != NO_CELL]
+    return gain
 
 
 def _check_full_scale(gain_counts_per_kpa: np.ndarray, name: str) -> None:
@@ -553,18 +582,21 @@ def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
     return matrix[0]
 
 
-def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.ndarray, "320"]:
-    """The cell map of the calibration, or the default of our own gloves."""
-    name = f"{glove}_cells"
+def _cells(
+    record: Record, side: Side, num_cells: int, glove: str, layout: TactileLayout | None
+) -> Int64[np.ndarray, " taxels"]:
+    """The cell map of the calibration, or that of the glove's layout."""
+    name, about = f"{glove}_cells", layout or DEXTOUCH_V1
     if name not in record:
-        if num_cells == NUM_RAW_TAXELS:
-            return raw_indices(side=side)
+        if num_cells == about.num_raw_cells:
+            return about.raw_indices(side)
         raise InvalidInputError(
             f"calibration: the {side} glove sends {num_cells} numbers a sample, so it is not ours, "
-            f"and {name!r} is missing: expected 1 x {NUM_TAXELS}, for each taxel in anatomical "
-            f"order the raw cell 0 … {num_cells - 1} that measures it, -1 for none"
+            f"and {name!r} is missing: expected 1 x {about.num_taxels}, for each taxel in "
+            f"anatomical order the raw cell 0 … {num_cells - 1} that measures it, -1 for none; or "
+            "name the layout of the glove in the settings of the station (layout)"
         )
-    cells = _row(record, name, NUM_TAXELS)
+    cells = _row(record, name, about.num_taxels)
     used = cells[cells != NO_CELL]
     wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
     if wrong.any():

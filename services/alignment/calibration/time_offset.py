@@ -63,8 +63,8 @@ def estimate_time_offset(
         InvalidInputError: stamps out of order, or less than two seconds in common.
         ShapeError, NonFiniteError: signals that do not fit or hold NaN.
     """
-    t_a, a = checked_signal("time offset: stream a", t_a_ns, signal_a, int(t_a_ns[0]))
-    t_b, b = checked_signal("time offset: stream b", t_b_ns, signal_b, int(t_a_ns[0]))
+    t_a, a = checked_signal("time offset: stream a", t_a_ns, signal_a, t_a_ns[:1])
+    t_b, b = checked_signal("time offset: stream b", t_b_ns, signal_b, t_a_ns[:1])
     for name, t_s in (("a", t_a), ("b", t_b)):
         if t_s[-1] - t_s[0] < MIN_OVERLAP_S:
             raise InvalidInputError(
@@ -77,7 +77,7 @@ def estimate_time_offset(
     grid_a, smooth_a = low_passed(t_a, a, step_s)
     grid_b, smooth_b = low_passed(t_b, b, step_s)
     spline_b = CubicSpline(grid_b, smooth_b)
-    coarse_s = _coarse(grid_a, smooth_a, (grid_b, smooth_b), step_s)
+    coarse_s = _coarse(grid_a, smooth_a, grid_b, smooth_b, step_s)
     offset_s, sigma_s = _refined(grid_a, smooth_a, spline_b, coarse_s)
     if abs(offset_s - coarse_s) > 0.1 or sigma_s > MAX_SIGMA_S:
         raise DegenerateMotionError(
@@ -109,7 +109,7 @@ def estimate_tap_offset(
         InvalidInputError: stamps out of order.
         ShapeError, NonFiniteError: values that do not fit or hold NaN.
     """
-    start_ns = int(t_pressure_ns[0])
+    start_ns = t_pressure_ns[:1]
     pressure, height = np.asarray(pressure_kpa)[..., None], np.asarray(height_m)[..., None]
     t_a, pressure = checked_signal("tap offset: pressure", t_pressure_ns, pressure, start_ns)
     t_b, height = checked_signal("tap offset: height", t_height_ns, height, start_ns)
@@ -132,9 +132,9 @@ def estimate_tap_offset(
 
 
 def checked_signal(
-    what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: int
+    what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """Times of a signal in seconds after a reference, and its values [n] or [n, k] as [n, k].
+    """Times of a signal in seconds after a reference [1], and its values [n] or [n, k] as [n, k].
 
     Raises:
         InvalidInputError: fewer than two stamps, or stamps out of order.
@@ -150,7 +150,9 @@ def checked_signal(
     if not np.isfinite(values).all():
         raise NonFiniteError(f"{what} holds NaN or infinity")
     if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
-        raise InvalidInputError(f"{what}: stamps do not increase")
+        raise InvalidInputError(
+            f"{what}: got {len(t_ns)} stamps, expected at least two that increase; record it again"
+        )
     return (t_ns - reference_ns) * 1e-9, values
 
 
@@ -168,10 +170,9 @@ def low_passed(
 
 
 def _coarse(
-    grid_a: np.ndarray, a: np.ndarray, stream_b: tuple[np.ndarray, np.ndarray], step_s: float
+    grid_a: np.ndarray, a: np.ndarray, grid_b: np.ndarray, b: np.ndarray, step_s: float
 ) -> float:
     """The offset of highest correlation on the grid, if it is the only high one."""
-    grid_b, b = stream_b
     num = round(MAX_OFFSET_S / step_s)
     offsets = step_s * np.arange(-num, num + 1)
     scores = np.array([_correlation(grid_a, a, grid_b + offset, b) for offset in offsets])
@@ -243,8 +244,7 @@ def _onsets(t_s: np.ndarray, pressure_kpa: np.ndarray) -> tuple[list[float], flo
     touching = pressure_kpa > TOUCH_KPA
     starts = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
     onsets: list[float] = []
-    for start in starts.tolist():
-        onset = float(t_s[start] + t_s[start - 1]) / 2
+    for onset in ((t_s[starts] + t_s[starts - 1]) / 2).tolist():
         if not onsets or onset - onsets[-1] >= MIN_REST_S:
             onsets.append(onset)
     return onsets, float(np.median(np.diff(t_s)))

@@ -1,7 +1,11 @@
 """Retargeting of tracked human hands and wrists to the robot's joints and poses."""
 
-from services.alignment.retargeting.hand_profile import HandProfile
-from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetResult, warm_up
+from services.alignment.retargeting.hand_retargeter import (
+    HandProfile,
+    HandRetargeter,
+    RetargetResult,
+    warm_up,
+)
 from services.alignment.retargeting.solver.arrays import RetargetOptions, RetargetStatus
 
 __all__ = [

@@ -137,10 +137,10 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> fl
     low, high = SIZE_RANGE
     if not low <= size <= high:
         units = [name for name, factor in UNITS.items() if low <= size / factor <= high]
-        told = f"these look like {units[0]}" if units else "no unit that we know makes it a hand"
+        hint = f"these look like {units[0]}" if units else "no unit that we know makes it a hand"
         raise InvalidInputError(
             f"{where}: got a hand {size:.3g} times as large as an adult's mean hand, expected "
-            f"{low} … {high}: {told}; send metres",
+            f"{low} … {high}: {hint}; send metres",
             fault="unit",
             found=units[0] if units else None,
         )

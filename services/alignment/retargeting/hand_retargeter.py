@@ -1,5 +1,11 @@
-"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand."""
+"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand, by its profile.
 
+Tracked points wobble by millimetres; bones do not. Bone lengths and the places of the knuckles in
+the wrist frame are therefore measured once a person, from calibration samples or from a whole
+recording, and later samples are checked against them and solved with them.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,20 +14,295 @@ from jaxtyping import Bool, Float64, UInt8
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NUM_KEYPOINTS, mean_hand_m, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from services.alignment.retargeting.hand_checks import checked_keypoints
-from services.alignment.retargeting.hand_profile import HandProfile, measure_profile, person_arrays
+from services.alignment.retargeting.hand_checks import checked_keypoints, thinned
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
+    MAX_JOINTS,
     NOMINAL_PERIOD_S,
+    PERSON,
     SCRATCH,
     Memory,
     Output,
     RetargetOptions,
     hand_arrays,
     joint_places,
+    zero_points_m,
 )
 from services.alignment.retargeting.solver.smoothing import smoothed
 from services.alignment.retargeting.solver.solve import retarget_samples
+
+NUM_FINGERS = 5
+# Proximal phalanx of an index finger: that of the mean hand (39.7 mm) at the sizes that are
+# accepted (0.55 … 1.5, SIZE_RANGE of hand_checks), and a tenth for fingers of other proportions and
+# the tracker's noise. Outside, the unit is wrong: the nearest is inches, a factor of 39.
+INDEX_PROXIMAL_RANGE_M = (0.0190, 0.0668)
+BONE_RANGE_M = (0.003, 0.150)
+_INDEX_FINGER = CHAINS.index("index")
+NUM_COLUMNS = 9
+# A person's knuckles turn in place (0), the robot's travel with its flexion axes (1).
+RIGID_TRAVEL = 0.5
+
+_NODES = np.array([solver_indices(chain) for chain in CHAINS])
+# Samples that are looked at, spread over the recording: 240 know a bone to a tenth of the noise.
+NUM_SAMPLES = 240
+# Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
+LEAST_SIGMA_M = 1e-4
+# A knuckle's spread is the difference of two variances, each known to some 8 % from 240 samples:
+# less than this share of the tracker's noise is indistinguishable from none.
+LEAST_SIGMA_SHARE = 0.3
+# Standard deviations within which 95 of 100 points of a normal distribution in space lie.
+CHI_95 = 2.7955
+LEAST_KNUCKLE_SIGMA_M = 1e-5
+# A robot's knuckle that moved less than this (RMS, metres) does not determine its travel.
+LEAST_TRAVEL_M = 1e-3
+UNKNOWN_FREEDOM = 1e6
+# Of a robot's finger; shorter is none.
+LEAST_BONE_M = 1e-6
+# A bone that differs from the person's by more than all of these is an error of the tracker: a part
+# of its length, a distance, and so many standard deviations of the tracker's noise.
+BONE_TOLERANCE = 0.3
+BONE_TOLERANCE_M = 0.008
+BONE_SIGMAS = 5.0
+# So is a knuckle that lies so many standard deviations from its place in the wrist frame, but no
+# nearer and no further than this; neighbours are 16 mm or more apart.
+KNUCKLE_SIGMAS = 3.5
+KNUCKLE_TOLERANCE_M = (0.012, 0.015)
+# Samples that lie seconds apart: no pinches, no pull.
+EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
+
+
+@dataclass(frozen=True)
+class HandProfile:
+    """Constant geometry of one person's hand, thumb … little, in wrist axes.
+
+    Attributes:
+        bone_m: MCP–PIP, PIP–DIP, DIP–tip (of the thumb CMC–MCP, MCP–IP, IP–tip).
+        knuckle_m: the MCP (of the thumb: the CMC) in the wrist frame.
+        travel: how much of the travel that the robot's knuckle makes with flexion the tracked one
+            makes: 0 for people, whose knuckles turn in place, 1 for the robot hand itself.
+        knuckle_sigma_m: standard deviation per axis of a knuckle's residual motion.
+        point_sigma_m: standard deviation, an axis, of the tracker's noise.
+    """
+
+    bone_m: Float64[np.ndarray, "5 3"]
+    knuckle_m: Float64[np.ndarray, "5 3"]
+    travel: Float64[np.ndarray, "5"]
+    knuckle_sigma_m: Float64[np.ndarray, "5"]
+    point_sigma_m: float
+
+    def __post_init__(self) -> None:
+        rows = self.to_rows()
+        if not np.isfinite(rows).all() or (rows[:, 7:] < 0).any():
+            raise InvalidInputError("hand profile: expected finite numbers, no negative sigma")
+        check_bone_unit(float(self.bone_m[_INDEX_FINGER, 0]), where="hand profile")
+        low, high = BONE_RANGE_M
+        if not ((self.bone_m >= low) & (self.bone_m <= high)).all():
+            raise InvalidInputError(
+                f"hand profile: bones {np.round(self.bone_m, 4).tolist()}, "
+                f"expected {low} … {high} m"
+            )
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether this is the robot's own hand (or a copy), with exact bones and knuckles.
+
+        People's tracked bones and knuckles shift by millimetres with the posture; to hold them
+        fixed would bend fingers that are straight.
+        """
+        return bool(np.median(self.travel) >= RIGID_TRAVEL)
+
+    def to_rows(self) -> Float64[np.ndarray, "5 9"]:
+        """As a matrix for a recording's calibration.
+
+        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m), the tracker's
+        noise (m; the same in every row).
+        """
+        noise_m = np.full(NUM_FINGERS, self.point_sigma_m)
+        columns = self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m, noise_m
+        return np.column_stack(columns).astype(np.float64)
+
+    @classmethod
+    def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":
+        """From the matrix of `to_rows`.
+
+        Raises:
+            ShapeError: not [5, 9].
+            InvalidInputError: not finite, or not a valid hand.
+        """
+        table = np.asarray(rows, dtype=np.float64)
+        if table.shape != (NUM_FINGERS, NUM_COLUMNS):
+            raise ShapeError(f"hand profile: got shape {table.shape}, expected [5, {NUM_COLUMNS}]")
+        return cls(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7], float(table[0, 8]))
+
+
+def profile_name(side: str) -> str:
+    """Name of the matrix in a recording's calibration."""
+    return f"hand_profile_{side}"
+
+
+def calibrated_profile(
+    calibration: Mapping[str, Sequence[Sequence[float]]], side: str
+) -> HandProfile | None:
+    """The hand profile of a recording's calibration; None if it has none.
+
+    Raises:
+        ShapeError, InvalidInputError: it is not a valid hand.
+    """
+    rows = calibration.get(profile_name(side))
+    return None if rows is None else HandProfile.from_rows(rows)
+
+
+def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
+    """Refuse an index finger's proximal bone that is not 19.0–66.8 mm long.
+
+    Raises:
+        InvalidInputError: most likely millimetres, or nodes in another order.
+    """
+    low, high = INDEX_PROXIMAL_RANGE_M
+    if not low <= index_proximal_m <= high:
+        looks = low * 1e3 <= index_proximal_m <= high * 1e3
+        hint = "these look like millimetres" if looks else "check nodes"
+        raise InvalidInputError(
+            f"{where}: the index finger's proximal bone measures {index_proximal_m:.4g}, expected "
+            f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.NODES",
+            got=index_proximal_m,
+        )
+
+
+def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
+    """Record `PERSON` for the fingers that the robot hand has.
+
+    Without a profile, bones and knuckles of each sample are used.
+    """
+    record = np.zeros(1, dtype=PERSON)
+    person, num, own_m = record[0], len(hand.fingers), robot_bone_m(hand)
+    if profile is None:
+        person["bone_m"][:num], person["bone_scale"][:] = own_m, 1.0
+        person["knuckle_m"][:num], person["travel"][:] = zero_points_m(hand)[:, 0], 1.0
+        person["freedom"][:], person["noise_m2"] = UNKNOWN_FREEDOM, -1.0
+        return record
+    rows = [CHAINS.index(finger.chain) for finger in hand.fingers]
+    bone_m, knuckle_sigma_m = profile.bone_m[rows].copy(), profile.knuckle_sigma_m[rows]
+    for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
+        # Two bones of the person in a row are one of the robot's.
+        bone_m[finger, bone + 1] += bone_m[finger, bone]
+        bone_m[finger, bone] = 0.0
+    person["is_known"], person["is_rigid"] = True, profile.is_rigid
+    person["bone_m"][:num] = bone_m
+    person["bone_scale"][:num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
+    person["knuckle_m"][:num] = profile.knuckle_m[rows]
+    person["travel"][:num] = profile.travel[rows]
+    person["freedom"][:num] = UNKNOWN_FREEDOM
+    if profile.is_rigid:
+        sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
+        person["freedom"][:num] = (knuckle_sigma_m / sigma_m) ** 2
+    else:
+        person["noise_m2"] = 3.0 * profile.point_sigma_m**2
+    noise_m = BONE_SIGMAS * np.sqrt(2) * profile.point_sigma_m
+    least_m = max(BONE_TOLERANCE_M, noise_m)
+    person["bone_tolerance_m"][:num] = np.maximum(BONE_TOLERANCE * bone_m, least_m)
+    spread_m = KNUCKLE_SIGMAS * np.hypot(knuckle_sigma_m, profile.point_sigma_m)
+    person["knuckle_tolerance_m"][:num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
+    return record
+
+
+def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
+    """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
+    return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
+
+
+def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
+    """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
+
+    Args:
+        keypoints_m: [T, 25, 3] any samples of the hand; those with whole fingers count.
+        hand: the robot hand of the same side, whose axes define how far fingers are bent.
+
+    Raises:
+        ShapeError: wrong shape.
+        InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
+            order).
+    """
+    # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
+    points_m = checked_keypoints(keypoints_m)[:, _NODES]
+    whole = np.isfinite(points_m).all(axis=(-1, -2))
+    _check_seen(whole, hand.side)
+    points_m[~whole] = np.nan
+    lengths = np.linalg.norm(np.diff(points_m, axis=2), axis=-1)
+    check_bone_unit(float(np.nanmedian(lengths[:, _INDEX_FINGER, 0])), where="keypoints")
+    low, high = BONE_RANGE_M
+    lengths[~((lengths >= low) & (lengths <= high)).all(axis=-1)] = np.nan
+    _check_seen(np.isfinite(lengths).all(axis=-1), hand.side)
+    bone_m = np.nanmedian(lengths, axis=0)
+    spread_m = 1.4826 * np.nanmedian(np.abs(lengths - bone_m), axis=0)
+    # The length of a bone has the noise of two points along it.
+    point_sigma_m = float(np.median(spread_m) / np.sqrt(2))
+    rows = thinned(np.flatnonzero(whole.any(axis=1)), NUM_SAMPLES)
+    moved_m = _knuckle_motion(points_m[rows], hand)
+    usable = whole[rows] & np.isfinite(moved_m).all(axis=-1)
+    knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
+    for finger in range(NUM_FINGERS):
+        kept = usable[:, finger]
+        seen_m, with_it_m = points_m[rows][kept, finger, 0], moved_m[kept, finger]
+        if not kept.any():
+            # Seen in few samples, of which none may be among the rows.
+            seen_m = points_m[whole[:, finger], finger, 0]
+            with_it_m = np.full_like(seen_m, np.nan)
+        knuckle_m[finger], travel[finger], left_m = _fit_knuckle(seen_m, with_it_m)
+        least_m = max(LEAST_KNUCKLE_SIGMA_M, LEAST_SIGMA_SHARE * point_sigma_m)
+        sigma_m[finger] = max(np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0)), least_m)
+    return HandProfile(bone_m, knuckle_m, travel, sigma_m, point_sigma_m)
+
+
+def _check_seen(whole: np.ndarray, side: str) -> None:
+    never = [name for name, seen in zip(CHAINS, whole.T, strict=True) if not seen.any()]
+    if never:
+        raise InvalidInputError(
+            f"keypoints of the {side} hand: no step shows all nodes of {', '.join(never)} with "
+            f"bones of {BONE_RANGE_M[0]} … {BONE_RANGE_M[1]} m; expected every finger at least once"
+        )
+
+
+def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray, "n 5 3"]:
+    """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
+    own, num = hand_arrays(hand), len(points_m)
+    rows = [CHAINS.index(finger.chain) for finger in hand.fingers]
+    keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
+    keypoints[:, _NODES] = points_m
+    output, person = Output.of(num, len(rows)), person_arrays(None, hand)
+    retarget_samples(
+        (own, person, EVERY_SAMPLE_ALONE.tuning(), np.zeros(1, dtype=SCRATCH)),
+        (keypoints, np.full(num, np.inf)),
+        Memory.starting_at(np.zeros((len(rows), MAX_JOINTS))),
+        output,
+    )
+    is_joint = joint_places(hand)
+    knuckles = hand.chain_points_m(output.joints_rad[:, is_joint])[:, :, 0]
+    moved_own_m = knuckles - own["knuckle_m"][0, : len(rows)]
+    moved_own_m[output.finger_status >= IMPLAUSIBLE] = np.nan
+    moved_m = np.full((num, NUM_FINGERS, 3), np.nan)
+    moved_m[:, rows] = moved_own_m
+    return moved_m
+
+
+def _fit_knuckle(
+    seen_m: np.ndarray, moved_m: np.ndarray
+) -> tuple[Float64[np.ndarray, "3"], float, float]:
+    """Position, travel and residual (standard deviation per axis) of one knuckle."""
+    if not np.isfinite(moved_m).all():
+        moved_m = np.zeros_like(seen_m)
+    centred = moved_m - moved_m.mean(axis=0)
+    energy = float((centred**2).sum())
+    travel = 0.0
+    if energy > len(seen_m) * LEAST_TRAVEL_M**2:
+        travel = float((centred * (seen_m - np.median(seen_m, axis=0))).sum() / energy)
+        travel = min(max(travel, 0.0), 1.0)
+    places = seen_m - travel * moved_m
+    place = np.median(places, axis=0)
+    # By the worst twentieth, not the middle: people's knuckles are off most in a fist.
+    off_m = np.linalg.norm(places - place, axis=1)
+    left_m = float(np.percentile(off_m, 95)) / CHI_95
+    return place, travel, left_m
 
 
 @dataclass(frozen=True)

@@ -248,7 +248,7 @@ def hand_axes_check(
     if off_rad > MAX_OFF_RAD:
         axis = np.round(vector_from_rotation(R_wrist_palm) / off_rad, 2).tolist()
         fingers = np.round(-R_wrist_palm[:, 2], 2).tolist()
-        told = (
+        advice = (
             f"record the flat hand and run dextouch station calibrate wrist --side {side}, which "
             f"makes the calibration {calibration_name(side)!r}"
             if T_keypoints_wrist is None
@@ -258,7 +258,7 @@ def hand_axes_check(
         raise InvalidInputError(
             f"{where}: got keypoints that are turned by {np.rad2deg(off_rad):.0f} degrees about "
             f"{axis} from the wrist's axes (the palm points along {fingers}, expected [0, 0, -1] "
-            f"within {np.rad2deg(MAX_OFF_RAD):.0f} degrees); {told}",
+            f"within {np.rad2deg(MAX_OFF_RAD):.0f} degrees); {advice}",
             fault="axes",
             off_deg=float(np.rad2deg(off_rad)),
         )

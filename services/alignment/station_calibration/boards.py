@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,8 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from dextouch.command_line import progress
 from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.geometry import apply, invert, transform
-from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
+from dextouch.geometry import apply, transform
+from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.intrinsics import (
     DICTIONARIES,
     CharucoBoard,
@@ -49,8 +48,6 @@ RIM = 0.15
 EDGES = ("left", "upper", "right", "lower")
 MIN_TILT_RAD = np.deg2rad(15.0)
 MIN_SIZE_RATIO = 1.5
-ENOUGH_HAND_EYE_VIEWS = 20
-ENOUGH_TURN_RAD = np.deg2rad(15.0)
 REGIONS = np.array(
     [[f"{y} {x}" for x in ("left", "centre", "right")] for y in ("upper", "middle", "lower")]
 )
@@ -224,6 +221,19 @@ def is_ambiguous(board: Board) -> bool:
     return isinstance(board, Chessboard) and (board.columns - board.rows) % 2 == 0
 
 
+def check_unambiguous(board: Board, text: str) -> None:
+    """Refuse a board, described as `text`, whose pose is ambiguous.
+
+    Raises:
+        InvalidInputError: it looks the same after half a turn.
+    """
+    if is_ambiguous(board):
+        raise InvalidInputError(
+            f"board {text!r} looks the same after half a turn; use one with an odd and an "
+            "even number of inner corners, or a ChArUco board"
+        )
+
+
 def board_pose(view: BoardView, lens: Lens) -> Float64[np.ndarray, "4 4"]:
     """T_camera_board of one view, by least squares on its corners."""
     import cv2
@@ -280,21 +290,6 @@ class Coverage:
     views_by_region: Int64[np.ndarray, "3 3"]
     tilts_rad: Float64[np.ndarray, "n 2"]
     focal_sigma: float
-    todo: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class TurnCoverage:
-    """Rotations of a tracker about the axes of its own frame, over all pairs of views.
-
-    Attributes:
-        turns_rad: [pairs, 3] rotation vectors of the pairs' relative motions.
-        spread_rad: [3] RMS about x, y, z.
-        todo: advice; empty if the coverage is sufficient.
-    """
-
-    turns_rad: Float64[np.ndarray, "pairs 3"]
-    spread_rad: Float64[np.ndarray, "3"]
     todo: tuple[str, ...]
 
 
@@ -389,21 +384,3 @@ def _poses(tilts_rad: np.ndarray, sizes: np.ndarray) -> list[str]:
         where = "nearer to" if sizes.max() < 0.6 else "farther from"
         todo.append(f"hold the board {where} the camera")
     return todo
-
-
-def turn_coverage(Ts_world_tracker: np.ndarray) -> TurnCoverage:
-    """Rotation coverage of tracker poses [n ≥ 2, 4, 4]."""
-    num_views = len(Ts_world_tracker)
-    pairs = np.array(list(combinations(range(num_views), 2)))
-    relative = invert(Ts_world_tracker[pairs[:, 1]]) @ Ts_world_tracker[pairs[:, 0]]
-    turns_rad = vector_from_rotation(relative[:, :3, :3])
-    spread_rad = np.sqrt((turns_rad**2).mean(axis=0))
-    todo = [
-        f"turn the tracker by 30 degrees and more about its {axis} axis (spread so far "
-        f"{np.rad2deg(spread):.0f} degrees)"
-        for axis, spread in zip("xyz", spread_rad, strict=True)
-        if spread < ENOUGH_TURN_RAD
-    ]
-    if num_views < ENOUGH_HAND_EYE_VIEWS:
-        todo.append(f"take {ENOUGH_HAND_EYE_VIEWS - num_views} more photos with poses")
-    return TurnCoverage(turns_rad, spread_rad, tuple(todo))

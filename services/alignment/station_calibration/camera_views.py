@@ -7,7 +7,6 @@ import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from html import escape
 from itertools import count
 from pathlib import Path
@@ -16,8 +15,7 @@ import numpy as np
 
 from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
-from dextouch.tactile import hand_canvas
-from dextouch.tactile.layout import Side, select_taxels
+from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
 from services.alignment.calibration.tactile_tare import STATES
@@ -28,7 +26,6 @@ from services.alignment.station_calibration.boards import (
     Coverage,
     Lens,
     Photos,
-    TurnCoverage,
     camera_coverage,
     decode_photo,
     find_board,
@@ -349,34 +346,35 @@ def residual_picture(
     )
 
 
-def turns_picture(coverage: TurnCoverage, names: Sequence[str], off_mm: np.ndarray | None) -> str:
-    """Picture of tracker rotations, and the error of each view."""
+def turns_picture(
+    turns_rad: np.ndarray, todo: Sequence[str], names: Sequence[str], off_mm: np.ndarray | None
+) -> str:
+    """Picture of camera rotations [pairs, 3], and the error of each view."""
     parts = []
+    axes = ("tilt up and down", "turn left and right", "roll")
     for index, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
-        title = f"turns about {'xyz'[a]} (right) and {'xyz'[b]} (down)"
-        parts.append(
-            _at(16 + 220 * index, 60, _polar(coverage.turns_rad[:, (a, b)], 90, 90, title))
-        )
-    todo = coverage.todo or ("Nothing: the turns show the mount.",)
+        title = f"{axes[a]} (right), {axes[b]} (down)"
+        parts.append(_at(16 + 220 * index, 60, _polar(turns_rad[:, (a, b)], 90, 90, title)))
+    todo = todo or ("Nothing: the turns show the mount.",)
     parts.append(_at(16, 280, _advice(todo)))
     top = 320 + _ROW * len(todo)
     if off_mm is not None:
         parts.append(_text(16, top, "How far each view puts the board from its mean", bold=True))
         parts.append(_at(16, top + 10, _bars(off_mm, names, "mm", 640)))
         top += 10 + _ROW * len(names)
-    return _page(700, top + 20, f"Turns of the tracker, {len(names)} views", parts)
+    return _page(700, top + 20, f"Turns of the camera, {len(names)} views", parts)
 
 
 def glove_picture(found: GloveCalibration) -> str:
     """Maps of tare, noise, gain and state of all taxels in hand layout."""
     side, level = found.tare.side, found.tare.level
-    select = partial(select_taxels, side=side)
+    layout, select = found.tare.layout, found.tare.select
     maps = {
         "tare, counts": select(level.mean_counts),
         "noise of a reading, counts": select(level.noise_counts),
     }
     if found.gain is not None:
-        maps["gain, counts a kPa"] = filled_gain(found.gain)
+        maps["gain, counts a kPa"] = filled_gain(found.gain, layout)
     parts = []
     for index, (title, values) in enumerate(maps.items()):
         # A saturated taxel must not compress the colour range of the others.
@@ -384,12 +382,12 @@ def glove_picture(found: GloveCalibration) -> str:
         level_of = np.clip((values - low) / max(high - low, 1e-12), 0, 1)
         fills = [f"hsl({220 - 180 * v:.0f} 70% {35 + 30 * v:.0f}%)" for v in level_of]
         words = f"{title}: mostly {low:.3g} … {high:.3g}"
-        parts.append(_at(16 + 260 * index, 60, _taxels(values, fills, side, words)))
+        parts.append(_at(16 + 260 * index, 60, _taxels(values, fills, (side, layout), words)))
     if found.gain is not None:
         numbers = found.num_by_state()
         fills = [_STATE_COLOURS[STATES[int(state)]] for state in found.gain.state]
         words = ", ".join(f"{n} {name}" for name, n in numbers.items())
-        parts.append(_at(16 + 260 * 3, 60, _taxels(found.gain.state, fills, side, words)))
+        parts.append(_at(16 + 260 * 3, 60, _taxels(found.gain.state, fills, (side, layout), words)))
         for index, name in enumerate(numbers):
             y = 330 + 16 * index
             parts.append(_box(796, y, 10, 10, _STATE_COLOURS[name]))
@@ -397,9 +395,12 @@ def glove_picture(found: GloveCalibration) -> str:
     return _page(16 + 260 * 4, 450, f"Glove {side}, seen from the palm", parts)
 
 
-def _taxels(values: np.ndarray, fills: Sequence[str], side: Side, title: str) -> list[str]:
+def _taxels(
+    values: np.ndarray, fills: Sequence[str], hand: tuple[Side, TactileLayout], title: str
+) -> list[str]:
     """Boxes of all taxels in hand layout, with their values as hover texts."""
-    canvas = hand_canvas(np.arange(len(values), dtype=np.float32), side=side)
+    side, layout = hand
+    canvas = layout.hand_canvas(np.arange(len(values), dtype=np.float32), side=side)
     parts = [_text(0, -6, title)]
     for row, column in np.argwhere(~np.isnan(canvas)):
         taxel = int(canvas[row, column])

@@ -5,24 +5,23 @@ Takes are named ones, or those that a running station records now.
 
 import argparse
 import csv
-import json
 import math
 import re
-import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from dextouch.clients import HttpLink, Reply
+from dextouch.clients import HttpLink
 from dextouch.command_line import progress
-from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.streams import SampleBatch
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.streams import TAXEL_UNIT
+from dextouch.tactile.layout import TactileLayout
 from services.alignment.calibration.tactile_gain import (
     TaxelGain,
     TaxelPress,
@@ -30,7 +29,13 @@ from services.alignment.calibration.tactile_gain import (
     fit_gain,
     pad_taxels,
 )
-from services.alignment.calibration.tactile_tare import OK, STATES, TaxelTare, measure_tare
+from services.alignment.calibration.tactile_tare import (
+    OK,
+    STATES,
+    TaxelTare,
+    measure_tare,
+    reading_step,
+)
 from services.alignment.station_calibration.camera_views import glove_picture
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
@@ -39,11 +44,15 @@ from services.alignment.station_calibration.record import (
     write_entry,
     write_picture,
 )
+from services.alignment.station_calibration.takes import (
+    Ask,
+    Question,
+    TakeRecorder,
+    ask_at_terminal,
+)
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
-# Timeout of an upload.
-UPLOAD_S = 120.0
+REST_S, PRESS_S = 10.0, 5.0
 TASK = "calibrate-glove"
 COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads")
 EXPECTED = (
@@ -51,14 +60,18 @@ EXPECTED = (
     "pads, start_s, stop_s"
 )
 PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
-NEXT = "Next pressure (Enter alone: no more; drop: forget the last): "
+NEXT = Question(
+    "Next pressure",
+    "Use this pressure",
+    takes_text=True,
+    choices=(("No more pressures", ""), ("Drop the last one", "drop")),
+)
 # Groups are named as the columns of the list of presses.
 _PRESS = re.compile(
     r"(?:(?P<pressure_kpa>[0-9.]+)(?: ?kpa)?"
     r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
 )
 
-Found = TypeVar("Found")
 Say = Callable[[str], None]
 
 
@@ -140,23 +153,45 @@ def parse_press(words: str, relative_sigma: float) -> PressRow:
     return row.known_to(relative_sigma)
 
 
-def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
-    """Raw counts of one glove from a spool folder, or from a recording of the store."""
+class GloveTake(NamedTuple):
+    """Raw readings of one glove in counts (of other units: in steps of `reading_step`)."""
+
+    t_host_ns: Int64[np.ndarray, " time"]
+    counts: Float64[np.ndarray, "time cells"]
+    layout: TactileLayout
+
+
+def read_take(take: str, options: argparse.Namespace) -> GloveTake:
+    """Raw readings of one glove from a spool folder, or from a recording of the store."""
     taken = read_stream(take, f"tactile_{options.side}", options.store)
-    if taken.descriptor.unit != "counts":
+    about = taken.descriptor
+    if about.unit != "counts" and (about.layout is None or about.unit == TAXEL_UNIT):
         raise InvalidInputError(
-            f"take {take!r}: {taken.descriptor.name} is in {taken.descriptor.unit}, expected raw "
-            "counts"
+            f"take {take!r}: {about.name} is in {about.unit}, expected raw counts, or a glove "
+            "whose settings name its layout"
         )
-    return taken.batch
+    counts = np.asarray(taken.batch.values) / reading_step(about.tactile_layout)
+    return GloveTake(taken.batch.t_host_ns, counts, about.tactile_layout)
 
 
 def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     """The readings of one press."""
-    batch = read_take(row.take, options)
-    t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
-    counts = batch.values[(t_s >= row.start_s) & (t_s < row.stop_s)]
-    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, pad_taxels(row.pads))
+    taken = read_take(row.take, options)
+    t_s = (taken.t_host_ns - taken.t_host_ns[:1]) * 1e-9
+    counts = taken.counts[(t_s >= row.start_s) & (t_s < row.stop_s)]
+    taxels = pad_taxels(row.pads, taken.layout)
+    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, taxels)
+
+
+def tare_of(take: str, options: argparse.Namespace) -> TaxelTare:
+    """The tare of a rest take."""
+    taken = read_take(take, options)
+    return measure_tare(taken.counts, side=options.side, layout=taken.layout)
+
+
+def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> float:
+    """The largest count: that of the options, or of the layout if that is less."""
+    return min(options.full_scale, layout.full_scale / reading_step(layout))
 
 
 class Guide:
@@ -166,22 +201,20 @@ class Guide:
 
     Args:
         options: of the command.
-        request: sends a request to the station, as `HttpLink.request`.
+        recorder: records the takes.
         ask: puts a question to the operator.
         say: tells the operator something.
-        wait: sleeps.
     """
 
     def __init__(
         self,
         options: argparse.Namespace,
-        request: Callable[..., Reply],
+        recorder: TakeRecorder,
         *,
-        ask: Callable[[str], str] = input,
+        ask: Ask = ask_at_terminal,
         say: Say = print,
-        wait: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._options, self._request, self._ask, self._wait = options, request, ask, wait
+        self._options, self._recorder, self._ask = options, recorder, ask
         self.say = say
         started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
         self._names = (f"{started}-{number}" for number in count(1))
@@ -191,15 +224,17 @@ class Guide:
         side = self._options.side
         while True:
             self._answer(
-                f"Lay the {side} glove down, untouched, and let it rest for a minute. "
-                f"Enter records {REST_S:g} s: "
+                Question(
+                    f"Lay the {side} glove down, untouched, and let it rest for a minute.",
+                    f"Record {REST_S:g} s",
+                )
             )
             try:
-                return self.record(
+                return self._recorder.record(
                     next(self._names),
                     f"{side} glove at rest, untouched",
                     REST_S,
-                    lambda take: measure_tare(read_take(take, self._options).values, side=side),
+                    lambda take: tare_of(take, self._options),
                 )
             except InvalidInputError as error:
                 self.say(f"Once more: {error.message}")
@@ -231,30 +266,33 @@ class Guide:
     def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
         """Record a press that determines a gain on its own."""
         target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
-        self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
+        self._answer(Question(f"Put {target} and hold still.", f"Record {PRESS_S:g} s"))
 
         def check(take: str) -> tuple[PressRow, TaxelPress]:
             row = wanted.model_copy(update={"take": take})
             press = press_of(row, self._options)
-            fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+            fit_gain(tare, [press], full_scale_counts=self._full_scale(tare))
             return row, press
 
-        return self.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
+        return self._recorder.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
 
     def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
         try:
             found = calibrate_glove(
-                tare, presses, full_scale_counts=self._options.full_scale
+                tare, presses, full_scale_counts=self._full_scale(tare)
             ).num_by_state()
         except InvalidInputError as error:
             return f"{len(presses)} presses, not enough yet: {error.message}"
         others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
         return (
-            f"{len(presses)} presses: {found['ok']} of 320 taxels known"
+            f"{len(presses)} presses: {found['ok']} of {tare.layout.num_taxels} taxels known"
             f"{f' ({others})' if others else ''}; more pressures show bends"
         )
 
-    def _answer(self, question: str) -> str:
+    def _full_scale(self, tare: TaxelTare) -> float:
+        return full_scale_counts(tare.layout, self._options)
+
+    def _answer(self, question: Question) -> str:
         try:
             return self._ask(question)
         except EOFError as error:
@@ -262,65 +300,6 @@ class Guide:
                 "calibrate glove --url: nobody answers; run it at a terminal, or name takes with "
                 "--rest and --presses"
             ) from error
-
-    def record(
-        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
-    ) -> tuple[str, Found]:
-        """Record a valid take; interrupted and invalid ones are discarded.
-
-        Args:
-            name: id of the take.
-            words: description for the operator, also the take's instruction.
-            seconds: duration.
-            check: raises an error for an invalid take. If takes are only in the store, it runs
-                after the take is saved.
-
-        Returns:
-            The take's folder in the spool, or its id in the store; and the result of the check.
-
-        Raises:
-            ConflictError: the recorder is busy with another take; save or discard that.
-        """
-        self._act("arm", {"task": TASK, "instruction": words})
-        self._act("record", {"recording_id": name})
-        take, found = str((self._options.spool / name).resolve()), None
-        with ExitStack() as undo:
-            undo.callback(self._act, "discard", {"recording_id": name})
-            num_ticks = round(seconds / TICK_S)
-            for _ in progress(range(num_ticks), words, num_ticks):
-                self._wait(TICK_S)
-            self._act("stop", {"recording_id": name})
-            if Path(take).is_dir():
-                found = check(take)
-            undo.pop_all()
-        # Other devices may be absent; the presence of the glove shows in its readings.
-        self._act("save", {"recording_id": name, "accept_incomplete": True})
-        if found is None:
-            take = self._await_upload(name)
-            found = check(take)
-        return take, found
-
-    def _act(self, action: str, body: dict[str, object]) -> None:
-        self._request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
-
-    def _await_upload(self, name: str) -> str:
-        """Wait for the upload and return the take's id in the store."""
-        if self._options.store is None:
-            raise NotFoundError(
-                f"take {name!r}: not in {self._options.spool.resolve()}; name the station's spool "
-                "with --spool, or on another machine its store with --store URL"
-            )
-        num_tries = round(UPLOAD_S)
-        for _ in progress(range(num_tries), "waiting for the upload", num_tries):
-            uploads = json.loads(self._request("GET", "/v1/uploads").body)
-            for take in uploads:
-                if take["recording_id"] == name and take["uploaded"]:
-                    return str(take.get("stored_as") or name)
-            self._wait(1.0)
-        raise NotFoundError(
-            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
-            "uploads, then calibrate with --rest and --presses"
-        )
 
 
 def record_takes(
@@ -331,7 +310,10 @@ def record_takes(
     The list of presses is stored in the folder, so that the calibration can be repeated from the
     same takes.
     """
-    guide = guide or Guide(options, HttpLink(options.url, api_key=options.key).request)
+    if guide is None:
+        link = HttpLink(options.url, api_key=options.key)
+        recorder = TakeRecorder(link.request, TASK, spool=options.spool, store=options.store)
+        guide = Guide(options, recorder)
     rest, tare = guide.rest()
     rows = guide.presses(tare)
     again = f"dextouch station calibrate glove --side {options.side} --rest {rest}"
@@ -353,9 +335,11 @@ def calibrate(
     """
     side = options.side
     rest, rows = _takes(options, guide)
-    tare = measure_tare(read_take(rest, options).values, side=side)
+    tare = tare_of(rest, options)
     presses = [press_of(row, options) for row in progress(rows, "reading presses", len(rows))]
-    found = calibrate_glove(tare, presses, full_scale_counts=options.full_scale)
+    found = calibrate_glove(
+        tare, presses, full_scale_counts=full_scale_counts(tare.layout, options)
+    )
     picture = write_picture(options.to, f"glove_{side}.svg", glove_picture(found))
     facts: dict[str, object] = {"side": side, "rest_take": rest, **_tare_facts(tare, say)}
     if found.gain is not None:

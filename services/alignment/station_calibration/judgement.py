@@ -9,6 +9,7 @@ import numpy as np
 
 from dextouch.episodes.spool import read_attributes
 from dextouch.schemas import Matrix
+from services.alignment.calibration.mount_guide import WANTED_ROTATION_RAD, WANTED_TRANSLATION_M
 from services.alignment.station_calibration.record import read_matrices
 
 # Learners need these, and alignment those of the recorded gloves.
@@ -20,7 +21,8 @@ MAX_FOCAL_SIGMA = 0.003
 MAX_GAIN_SIGMA = 0.05
 MAX_TAXEL_FAULTS = {"WARN": 0.01, "ERROR": 0.05}
 # Degrees and millimetres.
-MOUNT_LIMITS, BASE_LIMITS = (0.06, 0.8), (0.2, 2.0)
+MOUNT_LIMITS = (float(np.rad2deg(WANTED_ROTATION_RAD)), WANTED_TRANSLATION_M * 1e3)
+BASE_LIMITS = (0.2, 2.0)
 # Column of a hand profile that holds the sigma of the knuckles, in metres.
 PROFILE_SIGMA = 7
 # Matrices of a glove that are metadata, or that are added by an episode.
@@ -117,7 +119,7 @@ def _where_from(name: str) -> str:
     if name.endswith("_latency_ns"):
         return (
             "measured by the station where the device answers time requests, a camera's is its "
-            "settings' latency_ms; else: dextouch station calibrate latency"
+            "settings' latency_ms; else: dextouch station calibrate time"
         )
     if name.startswith("T_tracker_") and "_wrist_" in name:
         return "not of this command: measure where the wrist sits on its tracker"
@@ -166,6 +168,8 @@ def _gain_sigma(gain: np.ndarray, sigma: np.ndarray, num_faulty: int) -> Sigma:
     relative = float(np.median(sigma[known] / gain[known]))
     wrong = f"gain known to {relative:.1%}, expected {MAX_GAIN_SIGMA:.0%}; press harder"
     problems = [("WARN", wrong)] * (relative > MAX_GAIN_SIGMA)
-    levels = [level for level, share in MAX_TAXEL_FAULTS.items() if num_faulty / 320 > share]
-    problems += [(level, f"{num_faulty} of 320 taxels faulty") for level in levels[-1:]]
+    # Faulty taxels, and cells without one, have the sigma 0.
+    num_taxels = int(known.sum()) + num_faulty
+    levels = [level for level, share in MAX_TAXEL_FAULTS.items() if num_faulty / num_taxels > share]
+    problems += [(level, f"{num_faulty} of {num_taxels} taxels faulty") for level in levels[-1:]]
     return f"gain {relative:.2%}", problems

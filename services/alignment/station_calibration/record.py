@@ -36,6 +36,8 @@ from services.alignment.synchronization.stream_clock import time_stream
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"
 PICTURES = "pictures"
+# Quaternion norm below which a pose counts as lost, since trackers then send zeros.
+MIN_NORM = 0.5
 # Tracker of each camera, by the stream names of recordings.
 TRACKERS: Final = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
 
@@ -189,6 +191,22 @@ class TakeStream:
         latency_ns = round(self.number(f"{self.descriptor.name}_latency_ns"))
         timing = time_stream(self.batch, self.descriptor, latency_ns=latency_ns)
         return timing.t_host_ns, self.batch.values[timing.kept]
+
+    def poses(self) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
+        """Times and poses of valid tracking.
+
+        Raises:
+            InvalidInputError: fewer than two.
+        """
+        t_ns, values = self.timed()
+        poses = values.astype(np.float64)
+        seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
+        if np.count_nonzero(seen) < 2:
+            raise InvalidInputError(
+                f"take {self.take!r}: {self.descriptor.name} has {np.count_nonzero(seen)} valid "
+                "poses, expected two seconds of them; was the tracker visible?"
+            )
+        return t_ns[seen], poses[seen]
 
 
 def read_stream(take: str, name: str, store: str | None) -> TakeStream:

@@ -13,25 +13,28 @@ from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
 from dextouch.serving import RequireScope
-from services.alignment.retargeting.hand_profile import profile_name
+from services.alignment.retargeting.hand_retargeter import profile_name
 from services.alignment.station_calibration.judgement import Finding, entry_of, judge
+from services.alignment.station_calibration.mount_session import num_kept_places
 from services.alignment.station_calibration.record import (
     DETAILS_FILE,
     MATRICES_FILE,
     TRACKERS,
     read_matrices,
 )
+from services.alignment.station_calibration.run_status import Answer, RunRequest, RunStatus
 from services.alignment.station_calibration.runs import (
-    Answer,
+    EVERYTHING,
+    SIDES,
     CalibrationRuns,
-    RunRequest,
-    RunStatus,
     StationLocation,
 )
 
 SCOPE = "calibrate"
-ItemState = Literal["good", "due", "missing", "optional"]
+ItemState = Literal["good", "due", "missing", "optional", "simulated"]
 COMMAND: Final = "dextouch station calibrate"
+# Row of the delays of all trackers and cameras, before any of them is measured.
+PATH_DELAYS: Final = "path_delays"
 # Pattern of a name; title, next step and kind of guided run.
 KINDS: Final = (
     (
@@ -55,9 +58,8 @@ KINDS: Final = (
     (
         r"T_tracker_[a-z]+_camera_([a-z0-9_]+)",
         "Camera {0} on its tracker",
-        "Take 20 photos of a fixed board with the tracker's poses, then: {command} hand-eye "
-        "--camera {0} --photos FOLDER --poses poses.csv --board BOARD {to}",
-        "",
+        "After the lens: fix the board, and hold the camera still at places all around it.",
+        "mount",
     ),
     (
         r"hand_profile_(left|right)",
@@ -81,10 +83,15 @@ KINDS: Final = (
     (
         r"([a-z0-9_]+)_latency_ns",
         "Latency of {0}",
-        "Shake trackers and cameras together for ten seconds, then: {command} time --take TAKE "
-        "{to}; gloves: tap a table, then: {command} latency --stream {0} --reference STREAM "
-        "--take TAKE {to}",
-        "",
+        "Turn trackers and cameras together for ten seconds; gloves: tap a table, then: {command} "
+        "latency --stream {0} --reference STREAM --take TAKE {to}",
+        "time",
+    ),
+    (
+        PATH_DELAYS,
+        "Path delays",
+        "Turn all trackers and cameras together for ten seconds.",
+        "time",
     ),
 )
 # Fact of an entry that is its residual: how it is written, and what it tells.
@@ -113,10 +120,29 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
         """What is calibrated, how well and for how long, and the next step for each."""
         return await run_in_threadpool(overview, runs.place)
 
+    @router.post("/practice/start")
+    async def start_practice() -> CalibrationOverview:
+        """Start simulated devices and boards to practise with; 409 at a station of real ones."""
+        await run_in_threadpool(runs.switch_practice, is_on=True)
+        return await run_in_threadpool(overview, runs.place)
+
+    @router.post("/practice/stop")
+    async def stop_practice() -> CalibrationOverview:
+        """Stop the practice devices; their calibration is kept."""
+        await run_in_threadpool(runs.switch_practice, is_on=False)
+        return await run_in_threadpool(overview, runs.place)
+
     @router.post("/runs", status_code=status.HTTP_202_ACCEPTED)
     async def start(request: RunRequest) -> RunStatus:
         """Begin a guided run; 409 while another one is on."""
         return await run_in_threadpool(runs.start, request)
+
+    _add_run(router, runs)
+    return router
+
+
+def _add_run(router: APIRouter, runs: CalibrationRuns) -> None:
+    """Routes of the run that is on."""
 
     @router.get("/run")
     async def run() -> RunStatus | None:
@@ -138,17 +164,25 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
         """Answer the question of the run."""
         return runs.present().answer(answer.text)
 
+    @router.post("/run/take")
+    async def take() -> RunStatus:
+        """Keep the present place of a mount's run as soon as the camera is still."""
+        return runs.present().order("take")
+
+    @router.post("/run/drop")
+    async def drop() -> RunStatus:
+        """Forget the last place of a mount's run."""
+        return runs.present().order("drop")
+
     @router.post("/run/finish")
     async def finish() -> RunStatus:
-        """Calibrate a camera with the views so far."""
+        """Calibrate a camera or its mount with the views so far."""
         return runs.present().finish()
 
     @router.post("/run/cancel")
     async def cancel() -> RunStatus:
-        """End the run without a result."""
+        """End the run without a result; the places of a mount are kept."""
         return await run_in_threadpool(runs.present().cancel)
-
-    return router
 
 
 class CalibrationItem(FrozenModel):
@@ -156,7 +190,8 @@ class CalibrationItem(FrozenModel):
 
     `sigma` and `residual` are in words, empty where unknown; `meaning` says what a residual tells.
     `views_by_region` counts views of the board in each ninth of the image. `run` starts the guided
-    run, where there is one; `step` says what to do otherwise.
+    run, where there is one; `step` says what to do otherwise. `num_kept_places` are of a mount's
+    run that was ended, and can be resumed.
     """
 
     name: str
@@ -169,14 +204,21 @@ class CalibrationItem(FrozenModel):
     reasons: tuple[str, ...] = ()
     step: str
     run: RunRequest | None = None
+    num_kept_places: int = 0
     views_by_region: tuple[tuple[int, ...], ...] = ()
 
 
 class CalibrationOverview(FrozenModel):
-    """Everything that is or should be calibrated at a station; `note` says what is unknown."""
+    """Everything that is or should be calibrated at a station; `note` says what is unknown.
+
+    Of a station with `is_simulated` devices nothing has to be calibrated. While its `practice`
+    devices are on, the calibration is theirs.
+    """
 
     folder: str
     items: tuple[CalibrationItem, ...]
+    is_simulated: bool = False
+    practice: Literal["unavailable", "off", "on"] = "unavailable"
     note: str = ""
 
 
@@ -184,8 +226,9 @@ def overview(place: StationLocation) -> CalibrationOverview:
     """The calibration folder, and what the station's streams need besides."""
     note = ""
     streams: tuple[str, ...] = ()
+    is_simulated = False
     try:
-        place, streams = place.visited()
+        place, streams, is_simulated = place.visited()
     except DexTouchError as error:
         note = f"The station's devices are unknown: {error.message}"
     has_file = (place.folder / MATRICES_FILE).is_file()
@@ -193,9 +236,37 @@ def overview(place: StationLocation) -> CalibrationOverview:
     known = {finding.name: finding for finding in judge(matrices)}
     details = _details(place.folder)
     wanted = _wanted(streams)
+    if not any(name.endswith("_latency_ns") for name in known) and _can_turn(streams):
+        wanted.append(PATH_DELAYS)
     names = [*wanted, *(name for name in known if name not in wanted)]
-    items = tuple(_item(name, known.get(name), details, place) for name in names)
-    return CalibrationOverview(folder=str(place.folder), items=items, note=note)
+    items = [_item(name, known.get(name), details, place) for name in names]
+    if is_simulated:
+        items = [_simulated(item, is_practised=place.practice == "on") for item in items]
+    return CalibrationOverview(
+        folder=str(place.folder),
+        items=tuple(items),
+        is_simulated=is_simulated,
+        practice=place.practice,
+        note=note,
+    )
+
+
+def _can_turn(streams: Sequence[str]) -> bool:
+    """Whether two trackers or more can be shaken together."""
+    return sum(name in TRACKERS for name in streams) > 1
+
+
+def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:
+    """Simulated devices need no calibration, and only those to practise with show a board."""
+    changes: dict[str, object] = {"state": "simulated"} if item.state == "missing" else {}
+    if not is_practised:
+        changes |= {"run": None, "step": ""}
+    elif item.name.endswith("_gain_counts_per_kpa"):
+        changes |= {
+            "run": None,
+            "step": "Practice gloves lie untouched: they show no gain.",
+        }
+    return item.model_copy(update=changes)
 
 
 def _wanted(streams: Sequence[str]) -> list[str]:
@@ -221,7 +292,8 @@ def _group(name: str) -> str:
 def _item(
     name: str, finding: Finding | None, details: Mapping[str, object], place: StationLocation
 ) -> CalibrationItem:
-    state: ItemState = "optional" if name.startswith("hand_profile_") else "missing"
+    is_optional = name.startswith("hand_profile_") or name == PATH_DELAYS
+    state: ItemState = "optional" if is_optional else "missing"
     if finding is not None:
         state = "good" if finding.level == "OK" else "due"
     title, step, run = _words(name, place)
@@ -240,6 +312,9 @@ def _item(
         reasons=finding.reasons if finding else (),
         step=step,
         run=run,
+        num_kept_places=(
+            num_kept_places(place.mount_photos(run.subject)) if run and run.kind == "mount" else 0
+        ),
         views_by_region=tuple(map(tuple, regions)) if isinstance(regions, list) else (),
     )
 
@@ -250,9 +325,11 @@ def _words(name: str, place: StationLocation) -> tuple[str, str, RunRequest | No
         if matched := re.fullmatch(pattern, name):
             subject = matched[1] if matched.groups() else ""
             words = step.format(subject, command=COMMAND, to=f"--to {place.folder}")
+            subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(kind, tuple(TRACKERS))
+            of = EVERYTHING if kind == "time" else subject
             run = None
-            if kind == "glove" or (kind == "camera" and subject in TRACKERS):
-                run = RunRequest.model_validate({"kind": kind, "subject": subject})
+            if kind and of in subjects:
+                run = RunRequest.model_validate({"kind": kind, "subject": of})
             return title.format(subject.replace("_", " ")), words, run
     return name, f"See {COMMAND} --help", None
 

@@ -4,100 +4,76 @@ import argparse
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import structlog
-from pydantic import AwareDatetime, Field
 
-from dextouch.clients import HttpLink
+from dextouch.clients import HttpLink, Reply
+from dextouch.data_folder import practice_spool
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
-from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import StationHealth
+from dextouch.schemas import PracticeStatus, StationHealth
 from services.alignment.calibration.tactile_tare import FULL_SCALE_COUNTS
 from services.alignment.station_calibration import glove
 from services.alignment.station_calibration.boards import (
     ENOUGH_VIEWS,
     MAX_FOCAL_SIGMA,
     BoardView,
+    check_unambiguous,
     parse_board,
 )
 from services.alignment.station_calibration.camera_views import (
     Session,
     calibrate_photos,
+    read_lens,
     station_arrivals,
 )
 from services.alignment.station_calibration.glove import Guide
+from services.alignment.station_calibration.mount import calibrate_mount
+from services.alignment.station_calibration.mount_session import (
+    POSES_FILE,
+    MountSession,
+    station_sightings,
+)
+from services.alignment.station_calibration.record import TRACKERS
+from services.alignment.station_calibration.run_status import (
+    ENDED,
+    CameraRunView,
+    Choice,
+    Countdown,
+    GaugeView,
+    MountRunView,
+    Order,
+    Outline,
+    RunRequest,
+    RunStatus,
+)
+from services.alignment.station_calibration.takes import TICK_S, Question, TakeRecorder
+from services.alignment.station_calibration.times import measure_times
 
 logger = structlog.get_logger(__name__)
 
 MAX_LINES = 40
 PRESSURE_SIGMA = 0.02
 PRACTICE = "practice"
+# Task of the take of a shake, its duration, and the time to take everything in hand before it.
+TIME_TASK, SHAKE_S, LEAD_S = "calibrate-time", 10.0, 3.0
+SIDES, EVERYTHING = ("left", "right"), "all"
 
-RunState = Literal["running", "asking", "done", "failed", "cancelled"]
-ENDED: frozenset[RunState] = frozenset({"done", "failed", "cancelled"})
-Outline = tuple[tuple[float, float], ...]
-
-
-class RunRequest(FrozenModel):
-    """A guided run: intrinsics of a camera with a board, or tare and gain of a glove."""
-
-    kind: Literal["camera", "glove"]
-    subject: Literal["head", "wrist_left", "wrist_right", "left", "right"]
-    board: FreeText = Field(default="", max_length=64)
-
-
-class Answer(FrozenModel):
-    """What the operator answers to the question of a run."""
-
-    text: FreeText = Field(max_length=200)
-
-
-class CameraRunView(FrozenModel):
-    """Live view of a camera run: the newest image and what was seen in it, in its pixels.
-
-    `corners_px` are those of the newest image, `outlines_px` those of the boards that were kept.
-    `focal_sigma` is the standard deviation of the focal length that the views give, as a share of
-    it, None where they give none; the run goes on until it is `focal_sigma_wanted`.
-    """
-
-    image_index: int
-    width_px: int
-    height_px: int
-    corners_px: Outline = ()
-    outlines_px: tuple[Outline, ...] = ()
-    views_by_region: tuple[tuple[int, ...], ...] = ()
-    num_views: int = 0
-    num_wanted: int
-    focal_sigma: float | None = None
-    focal_sigma_wanted: float
-    todo: tuple[str, ...] = ()
-    hint: str = ""
-
-
-class RunStatus(FrozenModel):
-    """State of a guided run; `lines` is what it said, `question` what it waits for.
-
-    `facts` are the results as in `calibration_details.json`.
-    """
-
-    run_id: str
-    request: RunRequest
-    state: RunState
-    started_at: AwareDatetime
-    question: str = ""
-    lines: tuple[str, ...] = ()
-    busy_s: float = 0.0
-    camera: CameraRunView | None = None
-    facts: dict[str, object] = Field(default_factory=dict)
-    problem: str = ""
+# Below the address of a station, that of its practice devices.
+PRACTICE_PATH = "/practice"
+_NO_QUESTION: dict[str, object] = {
+    "question": "",
+    "action": "",
+    "takes_text": False,
+    "choices": (),
+    "countdown": None,
+}
 
 
 class _CancelledError(Exception):
@@ -106,13 +82,17 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class StationLocation:
-    """Where the station answers, where its takes are, and the folder of its calibration."""
+    """Where the station answers, where its takes are, and the folder of its calibration.
+
+    `practice` is the state of its practice devices.
+    """
 
     url: str | None
     key: str | None
     folder: Path
     spool: Path
     store_url: str
+    practice: Literal["unavailable", "off", "on"] = "unavailable"
 
     def link(self) -> HttpLink:
         """A connection to the station.
@@ -127,18 +107,47 @@ class StationLocation:
             )
         return HttpLink(self.url, api_key=self.key)
 
-    def visited(self) -> tuple["StationLocation", tuple[str, ...]]:
-        """The place with the folder of its devices, and the names of the station's streams.
+    def visited(self) -> "VisitedStation":
+        """The place with the folder of its devices, and the station's streams.
 
         Simulated devices have the folder `practice`, so that nobody records with their calibration.
+        While practice devices run, the place is theirs.
         """
         with closing(self.link()) as link:
-            reply = link.request("GET", "/v1/health")
+            reply = link.request("GET", "/v1/practice")
+            practice = PracticeStatus.model_validate_json(reply.body, extra="ignore").state
+            place, below = replace(self, practice=practice), ""
+            if practice == "on":
+                below = PRACTICE_PATH
+                place = replace(place, url=f"{self.url}{below}", spool=practice_spool(self.spool))
+            reply = link.request("GET", f"{below}/v1/health")
         health = StationHealth.model_validate_json(reply.body, extra="ignore")
         streams = tuple(stream.stream for stream in health.streams)
-        if any(device.simulated for device in health.devices):
-            return replace(self, folder=self.folder / PRACTICE), streams
-        return self, streams
+        is_simulated = any(device.simulated for device in health.devices)
+        if is_simulated:
+            place = replace(place, folder=self.folder / PRACTICE)
+        return VisitedStation(place, streams, is_simulated)
+
+    def mount_photos(self, camera: str) -> Path:
+        """Folder of the places of a mount's run that is on, or was ended without a result."""
+        return self.folder / "photos" / f"mount-{camera}"
+
+    def switch_practice(self, *, is_on: bool) -> None:
+        """Start or stop the practice devices of the station.
+
+        Raises:
+            ConflictError: the station has real devices.
+        """
+        with closing(self.link()) as link:
+            link.request("POST", f"/v1/practice/{'start' if is_on else 'stop'}")
+
+
+class VisitedStation(NamedTuple):
+    """A station that answered: its place, the names of its streams, and whether it is simulated."""
+
+    place: StationLocation
+    streams: tuple[str, ...]
+    is_simulated: bool
 
 
 class GuidedRun:
@@ -146,11 +155,12 @@ class GuidedRun:
 
     Args:
         request: what is calibrated.
-        place: the station.
+        station: where.
     """
 
-    def __init__(self, request: RunRequest, place: StationLocation) -> None:
-        self._place, self._request = place, request
+    def __init__(self, request: RunRequest, station: VisitedStation) -> None:
+        self._place, self._streams, _ = station
+        self._request = request
         now = datetime.now(UTC)
         self._lock = threading.Lock()
         # None ends the question that waits.
@@ -164,7 +174,13 @@ class GuidedRun:
         self._is_cancelled = threading.Event()
         self._is_finished = threading.Event()
         self.image = b""
-        run = {"camera": self._camera, "glove": self._glove}[request.kind]
+        self._orders: SimpleQueue[Order] = SimpleQueue()
+        run = {
+            "camera": self._camera,
+            "mount": self._mount,
+            "glove": self._glove,
+            "time": self._time,
+        }[request.kind]
         self._thread = threading.Thread(target=partial(self._work, run), name="calibration-run")
         self._thread.start()
 
@@ -182,17 +198,34 @@ class GuidedRun:
         with self._lock:
             if self._status.state != "asking":
                 raise ConflictError(f"calibration run: {self._status.state}, it asks nothing")
-            self._set(state="running", question="", busy_s=0.0)
+            self._set(state="running", **_NO_QUESTION)
             self._answers.put(text)
         return self._status
 
+    def order(self, order: Order) -> RunStatus:
+        """Keep the present place of a mount's run as soon as it is still, or drop the last one.
+
+        Raises:
+            ConflictError: the run is of another kind, or not on.
+        """
+        if self._request.kind != "mount" or self._status.state != "running":
+            raise ConflictError(
+                f"calibration run: {self._status.state}, it keeps no places that could be "
+                "taken or dropped"
+            )
+        self._orders.put(order)
+        return self._status
+
     def finish(self) -> RunStatus:
-        """Calibrate a camera with the views so far."""
+        """Calibrate a camera or its mount with the views so far."""
         self._is_finished.set()
         return self._status
 
     def cancel(self) -> RunStatus:
-        """End the run; nothing is written, a take that is being recorded is discarded."""
+        """End the run without a result.
+
+        A take that is being recorded is discarded; the places of a mount are kept.
+        """
         self._is_cancelled.set()
         self._answers.put(None)
         self._thread.join()
@@ -203,13 +236,14 @@ class GuidedRun:
             facts = run()
             self._set(state="done", facts=facts)
         except _CancelledError:
-            self._set(state="cancelled", question="")
+            self._set(state="cancelled", **_NO_QUESTION)
         except DexTouchError as error:
-            self._set(state="failed", question="", problem=error.message)
+            self._set(state="failed", problem=error.message, **_NO_QUESTION)
         except Exception as error:
             # Supervisor of the run: the operator has to see that it ended.
             logger.exception("calibration_run_failed")
-            self._set(state="failed", question="", problem=f"{type(error).__name__}: {error}")
+            problem = f"{type(error).__name__}: {error}"
+            self._set(state="failed", problem=problem, **_NO_QUESTION)
 
     def _set(self, **changes: object) -> None:
         self._status = self._status.model_copy(update=changes)
@@ -217,8 +251,15 @@ class GuidedRun:
     def _say(self, text: str) -> None:
         self._set(lines=(*self._status.lines, text)[-MAX_LINES:])
 
-    def _ask(self, question: str) -> str:
-        self._set(state="asking", question=question)
+    def _ask(self, question: Question) -> str:
+        self._set(
+            state="asking",
+            question=question.text,
+            action=question.action,
+            takes_text=question.takes_text,
+            choices=tuple(Choice(label=label, answer=text) for label, text in question.choices),
+            countdown=None,
+        )
         text = self._answers.get()
         if text is None:
             raise _CancelledError
@@ -227,7 +268,23 @@ class GuidedRun:
     def _wait(self, seconds: float) -> None:
         if self._is_cancelled.wait(seconds):
             raise _CancelledError
-        self._set(busy_s=self._status.busy_s + seconds)
+        countdown = self._status.countdown
+        if countdown is not None:
+            elapsed_s = min(countdown.elapsed_s + seconds, countdown.duration_s)
+            self._set(countdown=countdown.model_copy(update={"elapsed_s": elapsed_s}))
+
+    def _count_down(self, label: str, duration_s: float) -> None:
+        self._set(countdown=Countdown(label=label, duration_s=duration_s))
+
+    def _recorder(self, request: Callable[..., Reply], task: str) -> TakeRecorder:
+        return TakeRecorder(
+            request,
+            task,
+            spool=self._place.spool,
+            store=self._place.store_url,
+            wait=self._wait,
+            announce=partial(self._count_down, "Recording"),
+        )
 
     def _glove(self) -> dict[str, object]:
         place, side = self._place, self._request.subject
@@ -244,8 +301,78 @@ class GuidedRun:
             full_scale=FULL_SCALE_COUNTS,
         )
         with closing(place.link()) as link:
-            guide = Guide(options, link.request, ask=self._ask, say=self._say, wait=self._wait)
+            recorder = self._recorder(link.request, glove.TASK)
+            guide = Guide(options, recorder, ask=self._ask, say=self._say)
             return glove.calibrate(options, guide, say=self._say)
+
+    def _time(self) -> dict[str, object]:
+        place = self._place
+        record = f"Record {SHAKE_S:g} s"
+        options = argparse.Namespace(
+            take="", store=place.store_url, to=place.folder, streams=None, reference=None
+        )
+        answer = self._ask(
+            Question(
+                "Strap or hold all trackers and cameras together. Then turn them briskly and "
+                "irregularly about all axes, cameras towards a room with edges.",
+                record,
+            )
+        )
+        number = 0
+        while True:
+            number += 1
+            if not answer:
+                options.take = self._shake(f"{self._status.run_id}-{number}")
+            options.streams = answer or None
+            try:
+                return measure_times(options, say=self._say)
+            except InvalidInputError as error:
+                trackers = ",".join(name for name in self._streams if name in TRACKERS)
+                choices = () if answer else (("Leave the cameras out", trackers),)
+                answer = self._ask(
+                    Question(f"Not measured: {error.message}", f"{record} again", choices=choices)
+                )
+
+    def _shake(self, name: str) -> str:
+        """Record a take in which everything is shaken, and return it."""
+        self._count_down("Take everything in hand; recording begins in", LEAD_S)
+        for _ in range(round(LEAD_S / TICK_S)):
+            self._wait(TICK_S)
+        with closing(self._place.link()) as link:
+            recorder = self._recorder(link.request, TIME_TASK)
+            words = "all trackers and cameras shaken together"
+            take, _ = recorder.record(name, words, SHAKE_S, str)
+        self._set(countdown=None)
+        return take
+
+    def _mount(self) -> dict[str, object]:
+        camera, folder = self._request.subject, self._place.folder
+        photos = self._place.mount_photos(camera)
+        options = argparse.Namespace(
+            camera=camera,
+            board=self._request.board,
+            to=folder,
+            photos=photos,
+            poses=photos / POSES_FILE,
+            intrinsics=None,
+            invert=None,
+            check=False,
+        )
+        session = MountSession(options, is_resumed=self._request.is_resumed)
+        with closing(self._place.link()) as link:
+            sightings = station_sightings(link, camera, wait=self._wait)
+            for index, sighting in enumerate(sightings):
+                while not self._orders.empty():
+                    {"take": session.take, "drop": session.drop}[self._orders.get()]()
+                session.add(sighting)
+                self.image = sighting.image or self.image
+                self._set(mount=_mount_view(index, session))
+                if session.progress.is_enough or self._is_finished.is_set():
+                    break
+        self._say(f"{session.num_kept} places: solving")
+        facts = calibrate_mount(options, say=self._say)
+        session.archive(self._status.run_id)
+        return facts
 
     def _camera(self) -> dict[str, object]:
         camera, folder = self._request.subject, self._place.folder
@@ -290,6 +417,27 @@ def _camera_view(index: int, session: Session) -> CameraRunView:
     )
 
 
+def _mount_view(index: int, session: MountSession) -> MountRunView:
+    newest, progress = session.newest, session.progress
+    width_px, height_px = session.size_px
+    left_out = progress.result.left_out_views if progress.result else ()
+    return MountRunView(
+        image_index=index,
+        width_px=width_px,
+        height_px=height_px,
+        corners_px=_points(newest.pixels) if newest is not None else (),
+        todo=progress.todo,
+        hint=session.hint,
+        is_board_seen=newest is not None,
+        is_tracked=session.is_tracked,
+        is_still=session.is_still,
+        places=tuple(place not in left_out for place in range(session.num_kept)),
+        gauges=tuple(GaugeView(**asdict(gauge)) for gauge in progress.gauges),
+        problem=progress.problem,
+        can_finish=progress.result is not None,
+    )
+
+
 def _outline(view: BoardView) -> Outline:
     """The four corners that are outermost on the board, in turn."""
     x, y = view.points_board[:, 0], view.points_board[:, 1]
@@ -315,23 +463,40 @@ class CalibrationRuns:
             ConflictError: another one is not done.
             InvalidInputError: no such board, subject or station.
         """
-        expected = ("left", "right") if request.kind == "glove" else ("head", "wrist_left")
-        is_hand = request.subject in {"left", "right"}
-        if is_hand != (request.kind == "glove"):
+        subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(request.kind, tuple(TRACKERS))
+        if request.subject not in subjects:
             raise InvalidInputError(
-                f"calibration run of a {request.kind}: got {request.subject!r}, expected one such "
-                f"as {' or '.join(expected)}"
+                f"calibration run of kind {request.kind}: got {request.subject!r}, expected "
+                f"{' or '.join(subjects)}"
             )
-        if request.kind == "camera":
-            parse_board(request.board)
-        place, _ = self.place.visited()
+        if request.kind in {"camera", "mount"}:
+            board = parse_board(request.board)
+            if request.kind == "mount":
+                check_unambiguous(board, request.board)
+        station = self.place.visited()
+        if request.kind == "mount":
+            read_lens(station.place.folder, request.subject)
         with self._lock:
             if self._run is not None and self._run.status.state not in ENDED:
                 raise ConflictError(
                     f"calibration run {self._run.status.run_id!r} is not done; end it first"
                 )
-            self._run = GuidedRun(request, place)
+            self._run = GuidedRun(request, station)
             return self._run.status
+
+    def switch_practice(self, *, is_on: bool) -> None:
+        """Start or stop the practice devices of the station.
+
+        Raises:
+            ConflictError: a run is on, or the station has real devices.
+        """
+        with self._lock:
+            if self._run is not None and self._run.status.state not in ENDED:
+                raise ConflictError(
+                    f"practice devices: calibration run {self._run.status.run_id!r} is on; end it"
+                )
+            self.place.switch_practice(is_on=is_on)
+            self._run = None
 
     def status(self) -> RunStatus | None:
         """The run that is on, or the last one; None before the first."""

@@ -10,7 +10,7 @@ from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor, check_camera_matrix
-from dextouch.tactile import pad_forces_n
+from dextouch.tactile.layout import common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.grid_actions import (
@@ -53,6 +53,11 @@ from services.alignment.synchronization.resampling import (
 
 # Samples without which a stream is as if it were not there.
 MIN_USABLE = 2
+# What an episode takes over from its recording.
+SHARED_ATTRIBUTES = (
+    *("task", "instruction", "domain", "station", "operator", "trace_id"),
+    *("success", "recovered", "complete", "incomplete_cause"),
+)
 
 
 @dataclass(frozen=True)
@@ -192,7 +197,8 @@ def _find_stretch(
     for number, name in enumerate(names):
         on_progress(progress_within("placing", number / len(names), name))
         # Pressures of an hour do not fit in memory, the forces of its pads do.
-        of = pad_forces_n if name in TOUCH_STREAMS else np.asarray
+        layout = streams[name].descriptor.tactile_layout
+        of = layout.pad_forces_n if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
         if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
             # Such as a hand that was never seen.
@@ -216,10 +222,8 @@ def _find_stretch(
     if np.count_nonzero(gridded.valid[first:stop]) < options.min_num_steps:
         bad = {name: int((~mine).sum()) for name, mine in valid.items()}
         worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
-        latest, earliest = (
-            max(first_ns, key=first_ns.__getitem__),
-            min(last_ns, key=last_ns.__getitem__),
-        )
+        latest = max(first_ns, key=first_ns.__getitem__)
+        earliest = min(last_ns, key=last_ns.__getitem__)
         worst += f"; {latest} begins last and {earliest} ends first"
         raise InvalidInputError(
             f"{where}: the longest stretch without a gap has {stop - first} of {num_steps} steps, "
@@ -253,20 +257,12 @@ def _episode_attributes(
     source = recording.attributes
     origin = LineageEntry(kind="recording", id=source.recording_id, sha256=recording.content_sha256)
     return EpisodeAttributes(
+        **{name: getattr(source, name) for name in SHARED_ATTRIBUTES},
         episode_id=episode_id,
-        task=source.task,
-        instruction=source.instruction,
-        domain=source.domain,
         origin="recorded",
-        station=source.station,
-        operator=source.operator,
         anchor=StoredAnchor.from_poses(actions.anchor),
         K_head=source.calibration.get("K_head"),
         absent=actions.absent,
-        success=source.success,
-        recovered=source.recovered,
-        complete=source.complete,
-        incomplete_cause=source.incomplete_cause,
         lineage=(*source.lineage, origin),
         calibration=source.calibration
         | {name: rows for stream in streams.values() for name, rows in stream.calibration.items()},
@@ -274,7 +270,6 @@ def _episode_attributes(
         # What the station measured, too; of two figures with one name the aligned one counts.
         quality=source.quality | quality,
         created_at=source.started_at,
-        trace_id=source.trace_id,
     )
 
 
@@ -285,6 +280,15 @@ def check_complete(recording: RecordingReader) -> None:
         InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
     _check_hands(recording, recording.streams)
+    # One window holds both hands.
+    common_layout(
+        [
+            stream.tactile_layout
+            for name, stream in recording.streams.items()
+            if name in TOUCH_STREAMS
+        ],
+        what=f"recording {recording.attributes.recording_id!r}",
+    )
     _check_lenses(recording)
 
 

@@ -13,7 +13,7 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import FINGERS, SIDES, Side
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
-from services.alignment.retargeting.hand_profile import calibrated_profile
+from services.alignment.retargeting.hand_retargeter import calibrated_profile
 from services.alignment.retargeting.wrist_frame import hand_axes_check
 from services.alignment.retargeting.wrist_transfer import NUM_PADS, transfer_by_touch
 from services.alignment.settings import WristChoice
@@ -172,8 +172,8 @@ def make_actions(
         left, right = (gridded.poses(f"wrist_{side}_commanded") for side in SIDES)
         by_side = np.split(gridded.vectors("joints_commanded"), 2, axis=1)
         # Nobody commands the head: where it was is where it should have been.
-        wanted = HandTrajectory(left, right, by_side[0], by_side[1], head)
-        commanded = actions_from_poses(wanted, anchor)
+        requested = HandTrajectory(left, right, by_side[0], by_side[1], head)
+        commanded = actions_from_poses(requested, anchor)
         wrists = [f"wrist_{side}_commanded" for side in SIDES]
         absent += [name for name in wrists if name not in gridded.streams]
     return GridActions(

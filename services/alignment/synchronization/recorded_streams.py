@@ -21,7 +21,6 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
 from dextouch.streams import ENCODED_UNITS, H264_UNIT, HEAD_CAMERA, StreamDescriptor, encoded_values
-from dextouch.tactile.layout import NUM_TAXELS
 from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration, unusable_taxels
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
@@ -226,12 +225,15 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
             f"stream {name!r}: got samples of {raw.descriptor.shape}, expected a row of cells"
         )
     num_cells = raw.descriptor.shape[0]
-    glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells, stream=name)
+    layout = raw.descriptor.layout
+    glove = TactileCalibration.from_record(
+        calibration, side, num_cells=num_cells, stream=name, layout=layout
+    )
     refused = unusable_taxels(glove, (piece.values for piece in raw.pieces()))
     quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
     for state in np.unique(refused[refused > 0]).tolist():
         quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))
-    in_kpa = {"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
+    in_kpa = {"shape": (len(glove.cells),), "dtype": "float32", "unit": "kPa"}
     return replace(
         raw,
         descriptor=raw.descriptor.model_copy(update=in_kpa),

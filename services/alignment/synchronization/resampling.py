@@ -90,10 +90,8 @@ def poses_on_grid(poses: np.ndarray, at: GridPlacement) -> Float64[np.ndarray, "
 
 def runs_of(valid: np.ndarray) -> list[tuple[int, int]]:
     """First and one past the last index of every stretch of True, in order."""
-    edges = np.flatnonzero(
-        np.diff(np.concatenate([[False], np.asarray(valid, dtype=bool), [False]]))
-    )
-    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+    edges = np.flatnonzero(np.diff(np.pad(np.asarray(valid, dtype=bool), 1)))
+    return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
 def longest_run(valid: np.ndarray) -> tuple[int, int]:
@@ -249,13 +247,12 @@ def refused_matrices(parts: list[RefusedPart]) -> dict[str, Matrix]:
 
 def refused_parts(calibration: Mapping[str, Matrix]) -> tuple[RefusedPart, ...]:
     """The refused parts that an episode carries, in order of time."""
+    names = ("start_s", "stop_s", "reason", "stream")
     parts = [
-        RefusedPart.model_validate(
-            {"start_s": start_s, "stop_s": stop_s, "reason": match[1], "stream": match[2]}
-        )
+        RefusedPart.model_validate(dict(zip(names, (*row, *match.groups()), strict=True)))
         for name, rows in calibration.items()
         if (match := _KEY.fullmatch(name))
-        for start_s, stop_s in rows
+        for row in rows
     ]
     return tuple(sorted(parts, key=lambda part: (part.start_s, part.stop_s, part.stream or "")))
 

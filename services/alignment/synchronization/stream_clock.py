@@ -28,8 +28,6 @@ MIN_LATENESS_NS = 5e6
 # Stamps are better: all samples of five seconds are later than a USB frame of 1 ms only with a
 # wrong fit or a delay that lasts.
 MAX_STAMPED_LATENESS_NS = 1e6
-
-
 # Stamps of another unit are off by a thousand; clocks, rates and losses never by so much.
 MIN_UNIT_RATIO = 20.0
 # Of the blocks of samples between which a clock may step; chosen: all but one of ten.
@@ -117,17 +115,16 @@ def time_stream(
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
-    """Reasons to doubt the times, if any."""
-    skew_limit_ppm = MAX_SKEW_PPM if dated.method == "device" else MAX_RATE_ERROR_PPM
-    lateness_limit_ns = max(period_ns, MIN_LATENESS_NS)
+    """Reasons why the times may be wrong, if any."""
+    skew_limit_ppm, lateness_limit_ns = MAX_RATE_ERROR_PPM, max(period_ns, MIN_LATENESS_NS)
     if dated.method == "device":
-        lateness_limit_ns = MAX_STAMPED_LATENESS_NS
-    doubts: dict[ClockWarning, bool] = {
+        skew_limit_ppm, lateness_limit_ns = MAX_SKEW_PPM, MAX_STAMPED_LATENESS_NS
+    warnings: dict[ClockWarning, bool] = {
         "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
         "residual": dated.lateness_ns > lateness_limit_ns,
         "stop": dated.has_unsure_stops,
     }
-    return tuple(name for name, is_so in doubts.items() if is_so)
+    return tuple(name for name, is_so in warnings.items() if is_so)
 
 
 def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:

@@ -1,7 +1,9 @@
 // The calibration page: what is due, and guided runs with live coverage of the board.
 
-import { ageWords, capital, countWords, LEVELS, nextWords, polygon, progressOf, runLevel, runTitle } from "./calibration_words.js";
-import { element, levelBadge, setText } from "./dom.js";
+import {
+  ageWords, capital, countWords, delayRows, isOfCamera, LEVELS, nextWords, placesWords, polygon, progressOf, runLevel, runTitle, secondsLeft, signsOf,
+} from "./calibration_words.js";
+import { element, levelBadge, setText, showChildren } from "./dom.js";
 import { ask } from "./session.js";
 import { startTheme } from "./theme.js";
 
@@ -12,8 +14,13 @@ const ENDED = ["done", "failed", "cancelled"];
 const find = (id) => document.getElementById(id);
 
 let chosen = null;
+let isPractised = false;
 let closed = sessionStorage.getItem("closed_run");
 let shown = { run_id: "", state: "", image_index: -1 };
+const PRACTICE_WORDS = {
+  off: "Nothing has to be calibrated. To practise, start simulated devices: a board moves before the head camera, trackers move with it, gloves lie untouched.",
+  on: "You practise with simulated devices; their calibration is kept apart from that of real ones. The board is chessboard:9x6:25mm.",
+};
 
 async function get(path) {
   const answer = await ask(`${API}${path}`);
@@ -30,7 +37,7 @@ async function post(path, body) {
 }
 
 function regions(item) {
-  if (item.views_by_region.length === 0) return "–";
+  if (item.views_by_region.length === 0) return "";
   const cells = item.views_by_region.flat().map((views) => element("span", { "data-enough": views >= 2 }, String(views)));
   return element("span", { class: "regions", title: "views of the board in each ninth of the image" }, ...cells);
 }
@@ -44,8 +51,8 @@ function row(item) {
     element("td", {}, badge),
     element("td", { class: "name" }, item.title, element("span", { class: "why" }, item.name)),
     element("td", { class: "number" }, ageWords(item.age_days)),
-    element("td", {}, item.sigma || "–"),
-    element("td", { class: "free" }, item.residual || "–", item.meaning ? element("span", { class: "why" }, item.meaning) : null),
+    element("td", {}, item.sigma),
+    element("td", { class: "free" }, item.residual, item.meaning ? element("span", { class: "why" }, item.meaning) : null),
     element("td", {}, regions(item)),
     element("td", { class: "free step" }, element("span", {}, ...item.reasons.map((reason) => element("strong", { class: "why" }, reason)), item.step)),
     element("td", {}, begin));
@@ -53,36 +60,66 @@ function row(item) {
 
 async function showItems() {
   try {
-    const overview = await get("");
-    find("item_rows").replaceChildren(...overview.items.map(row));
-    setText(find("folder"), overview.folder);
-    setText(find("calibration_note"), overview.note);
+    showOverview(await get(""));
   } catch (error) {
     setText(find("calibration_note"), error.message);
     find("calibration_note").dataset.level = "ERROR";
   }
 }
 
+function showOverview({ items, folder, note, is_simulated: isSimulated, practice }) {
+  find("item_rows").replaceChildren(...items.map(row));
+  setText(find("folder"), folder);
+  setText(find("calibration_note"), note);
+  find("calibration_note").dataset.level = "WARN";
+  find("practice").hidden = !isSimulated;
+  isPractised = practice === "on";
+  setText(find("practice_title"), isPractised ? "Practice" : "Simulated devices");
+  setText(find("practice_words"), PRACTICE_WORDS[practice] ?? "");
+  find("practice_start").hidden = practice !== "off";
+  find("practice_stop").hidden = !isPractised;
+}
+
+async function switchPractice(way, button) {
+  const words = button.textContent;
+  button.disabled = true;
+  setText(button, way === "start" ? "Starting, about ten seconds …" : "Stopping …");
+  await act(async () => {
+    const overview = await post(`/practice/${way}`);
+    find("begin").hidden = find("run").hidden = true;
+    showOverview(overview);
+  });
+  button.disabled = false;
+  setText(button, words);
+  find(way === "start" ? "practice_stop" : "practice_start").focus();
+}
+
 function choose(item) {
   chosen = item;
-  const isCamera = item.run.kind === "camera";
+  const hasBoard = isOfCamera({ request: item.run });
   setText(find("begin_title"), runTitle(item.run));
   setText(find("begin_step"), item.step);
-  find("board").value = localStorage.getItem("board") ?? "charuco:5x7:30mm:22mm";
-  for (const id of ["board_field", "board_help"]) find(id).hidden = !isCamera;
+  find("board").value = isPractised ? "chessboard:9x6:25mm" : localStorage.getItem("board") ?? "charuco:5x7:30mm:22mm";
+  for (const id of ["board_field", "board_help"]) find(id).hidden = !hasBoard;
+  const kept = item.num_kept_places;
+  find("resume_field").hidden = kept === 0;
+  find("resume").checked = true;
+  setText(find("resume_words"), `Go on with the ${kept} ${kept > 1 ? "places" : "place"} of the run that was ended`);
   find("begin").hidden = false;
   find("begin").scrollIntoView({ block: "nearest" });
-  (isCamera ? find("board") : find("begin_form").querySelector("button")).focus();
+  (hasBoard ? find("board") : find("begin_form").querySelector("button")).focus();
 }
 
 async function begin(event) {
   event.preventDefault();
-  const board = chosen.run.kind === "camera" ? find("board").value.trim() : "";
-  if (board) localStorage.setItem("board", board);
+  const board = isOfCamera({ request: chosen.run }) ? find("board").value.trim() : "";
+  if (board && !isPractised) localStorage.setItem("board", board);
+  const isResumed = chosen.num_kept_places > 0 && find("resume").checked;
   await act(async () => {
-    const run = await post("/runs", { ...chosen.run, board });
+    const run = await post("/runs", { ...chosen.run, board, is_resumed: isResumed });
     find("begin").hidden = true;
     showRun(run);
+    find("run").scrollIntoView({ block: "start" });
   });
 }
 
@@ -104,24 +141,81 @@ function shape(name, attributes) {
   return node;
 }
 
-function showView(camera) {
-  find("view").hidden = !camera;
-  if (!camera || camera.image_index === shown.image_index) return;
-  shown.image_index = camera.image_index;
-  const { width_px: width, height_px: height } = camera;
-  find("view_image").src = `${API}/run/image?at=${camera.image_index}`;
+function showView(seen) {
+  find("view").hidden = !seen;
+  if (!seen || seen.image_index === shown.image_index) return;
+  shown.image_index = seen.image_index;
+  const { width_px: width, height_px: height } = seen;
+  find("view_image").src = `${API}/run/image?at=${seen.image_index}`;
   const overlay = find("view_overlay");
   overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
-  const kept = camera.outlines_px.map((points) => shape("polygon", { points: polygon(points), class: "kept" }));
+  const corners = seen.corners_px.map(([x, y]) => shape("circle", { cx: x, cy: y, r: width / 160, "data-kept": seen.hint === "" }));
+  overlay.replaceChildren(...(seen.views_by_region ? coverage(seen) : []), ...corners);
+}
+
+function coverage({ width_px: width, height_px: height, outlines_px: outlines, views_by_region: regions_ }) {
+  const kept = outlines.map((points) => shape("polygon", { points: polygon(points), class: "kept" }));
   const lines = [1, 2].flatMap((n) => [
     shape("line", { x1: (n * width) / 3, x2: (n * width) / 3, y1: 0, y2: height }), shape("line", { x1: 0, x2: width, y1: (n * height) / 3, y2: (n * height) / 3 })]);
-  const counts = camera.views_by_region.flatMap((views, y) => views.map((count, x) => {
+  const counts = regions_.flatMap((views, y) => views.map((count, x) => {
     const text = shape("text", { "font-size": width / 22, x: ((x + 0.04) * width) / 3, y: ((y + 0.16) * height) / 3, "data-enough": count >= 2 });
     text.textContent = String(count);
     return text;
   }));
-  const corners = camera.corners_px.map(([x, y]) => shape("circle", { cx: x, cy: y, r: width / 160, "data-kept": camera.hint === "" }));
-  overlay.replaceChildren(...kept, ...lines, ...counts, ...corners);
+  return [...kept, ...lines, ...counts];
+}
+
+function gauge({ title, value, wanted, share }) {
+  return element("li", { "data-full": share >= 1 },
+    element("span", { class: "gauge_title" }, title), element("meter", { min: 0, max: 1, value: share, "aria-label": title }),
+    element("span", { class: "gauge_value" }, value, element("span", { class: "quiet" }, `, wanted ${wanted}`)));
+}
+
+function showMount(mount, isOn) {
+  find("view_signs").hidden = find("gauges").hidden = !mount;
+  find("run_take").hidden = find("run_drop").hidden = !mount || !isOn;
+  if (!mount) return;
+  find("view_signs").hidden = !isOn;
+  showChildren(find("view_signs"), signsOf(mount).map(([words, isGood]) => element("li", { class: "level", "data-level": isGood ? "OK" : "WARN" }, words)));
+  showChildren(find("gauges"), mount.gauges.map(gauge));
+  find("run_drop").disabled = mount.places.length === 0;
+}
+
+function showResult(run) {
+  const isShown = run.state === "done" && run.request.kind === "time";
+  find("result").hidden = !isShown;
+  if (!isShown || shown.state === "done") return;
+  const { streams, pairs, leftOut, note } = delayRows(run.facts);
+  const table = (title, rows) => element("table", {}, element("thead", {}, element("tr", {}, element("th", { scope: "col" }, title), element("th", { scope: "col" }, "Delay (± one sigma)"))),
+    element("tbody", {}, ...rows.map(([name, words]) => element("tr", {}, element("td", { class: "name" }, name), element("td", {}, words)))));
+  find("result").replaceChildren(table("Stream", streams), table("Pair, second after first", pairs), element("p", {}, note),
+    element("ul", { class: "todo" }, ...leftOut.map((words) => element("li", {}, `Left out: ${words}`))));
+}
+
+function showCountdown(countdown) {
+  find("run_countdown").hidden = !countdown;
+  if (!countdown) return;
+  find("countdown_bar").max = countdown.duration_s;
+  find("countdown_bar").value = countdown.elapsed_s;
+  find("countdown_bar").setAttribute("aria-label", countdown.label);
+  setText(find("countdown_left"), `${secondsLeft(countdown)} s`);
+}
+
+function showQuestion(run) {
+  const form = find("answer_form");
+  const wasAsking = !form.hidden;
+  form.hidden = run.state !== "asking";
+  if (form.hidden || (wasAsking && form.dataset.question === run.question)) return;
+  form.dataset.question = run.question;
+  find("answer").value = "";
+  find("answer_field").hidden = !run.takes_text;
+  setText(find("answer_action"), run.action);
+  find("answer_choices").replaceChildren(...run.choices.map(({ label, answer }) => {
+    const button = element("button", { type: "button" }, label);
+    button.addEventListener("click", () => reply(answer));
+    return button;
+  }));
+  find(run.takes_text ? "answer" : "answer_action").focus();
 }
 
 function showRun(run) {
@@ -132,37 +226,40 @@ function showRun(run) {
   const state = find("run_state");
   state.dataset.level = runLevel(run.state);
   setText(state, run.state);
-  setText(find("run_next"), nextWords(run));
-  showView(run.camera);
-  const { camera } = run;
+  setText(find("run_next"), nextWords(run, isPractised));
+  const { camera, mount } = run;
+  const seen = camera ?? mount;
+  showView(seen);
+  showMount(mount, run.state === "running");
+  showResult(run);
+  showCountdown(run.countdown);
   setText(find("run_hint"), hintOf(run, isEnded));
-  find("run_count").hidden = !camera;
+  find("run_count").hidden = !seen;
   if (camera) {
     find("run_progress").value = progressOf(camera);
     setText(find("run_count_text"), countWords(camera));
+  } else if (mount) {
+    find("run_progress").value = Math.min(...mount.gauges.map(({ share }) => share));
+    setText(find("run_count_text"), placesWords(mount));
   }
-  const todo = camera && !isEnded ? camera.todo.slice(1) : [];
-  find("run_todo").replaceChildren(...todo.map((words) => element("li", {}, words)));
-  const form = find("answer_form");
-  const wasAsking = !form.hidden;
-  form.hidden = run.state !== "asking";
-  if (!form.hidden && (!wasAsking || form.dataset.question !== run.question)) {
-    form.dataset.question = run.question;
-    find("answer").value = "";
-    find("answer").focus();
-  }
-  find("run_finish").hidden = isEnded || !camera || camera.num_views < 5;
+  const todo = seen && !isEnded ? seen.todo.slice(1) : [];
+  showChildren(find("run_todo"), todo.map((words) => element("li", {}, words)));
+  showQuestion(run);
+  find("run_finish").hidden = isEnded || !seen || !(camera ? camera.num_views >= 5 : mount.can_finish);
+  setText(find("run_finish"), mount ? "Write the mount now" : "Calibrate now");
   find("run_cancel").hidden = isEnded;
+  setText(find("run_cancel"), mount?.places.length ? "Pause: keep the places" : "End without result");
   find("run_close").hidden = !isEnded;
   find("run_lines").replaceChildren(...run.lines.map((line) => element("li", {}, line)));
   if (isEnded && shown.state !== run.state) showItems();
   shown = { ...shown, run_id: run.run_id, state: run.state };
 }
 
-function hintOf({ camera, lines }, isEnded) {
-  if (isEnded) return "";
-  if (!camera) return lines.at(-1) ?? "";
-  return camera.hint ? capital(camera.hint) : "Kept: move the board to the next place.";
+function hintOf({ camera, mount, lines, countdown }, isEnded) {
+  if (isEnded || countdown) return "";
+  const seen = camera ?? mount;
+  if (!seen) return lines.at(-1) ?? "";
+  return seen.hint ? capital(seen.hint) : `Kept: move the ${camera ? "board" : "camera"} to the next place.`;
 }
 
 async function poll() {
@@ -176,11 +273,24 @@ async function poll() {
   setTimeout(poll, ENDED.includes(shown.state) || shown.state === "" ? 4 * PERIOD_MS : PERIOD_MS);
 }
 
+function reply(text) {
+  return act(async () => showRun(await post("/run/answer", { text })));
+}
+
 find("begin_form").addEventListener("submit", begin);
 find("begin_back").addEventListener("click", () => { find("begin").hidden = true; });
 find("answer_form").addEventListener("submit", (event) => {
   event.preventDefault();
-  act(async () => showRun(await post("/run/answer", { text: find("answer").value })));
+  reply(find("answer").value);
+});
+find("practice_start").addEventListener("click", ({ target }) => switchPractice("start", target));
+find("practice_stop").addEventListener("click", ({ target }) => switchPractice("stop", target));
+for (const order of ["take", "drop"]) find(`run_${order}`).addEventListener("click", () => act(async () => showRun(await post(`/run/${order}`))));
+addEventListener("keydown", (event) => {
+  const id = { t: "run_take", d: "run_drop" }[event.key.toLowerCase()];
+  if (!id || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, select") || find("run").hidden || find(id).hidden) return;
+  event.preventDefault();
+  find(id).click();
 });
 find("run_finish").addEventListener("click", () => act(async () => showRun(await post("/run/finish"))));
 find("run_cancel").addEventListener("click", () => act(async () => showRun(await post("/run/cancel"))));

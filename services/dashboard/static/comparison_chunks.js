@@ -3,14 +3,13 @@
 import { readHeader } from "./step_messages.js";
 
 const KIND = 3;
-const TAXELS = 320;
 export const SIDES = ["real", "imagined"];
 
 // Steps of one chunk (see comparison.compared): real first in every array.
 export function readChunk(buffer) {
   if (new DataView(buffer).getUint8(0) !== KIND) throw new Error("not a chunk of a comparison");
   const { header, offset } = readHeader(buffer);
-  const touch = new Float32Array(buffer, offset, 2 * header.num_steps * 2 * TAXELS);
+  const touch = new Float32Array(buffer, offset, 2 * header.num_steps * 2 * header.num_taxels);
   const pixels = new Uint8Array(buffer, offset + touch.byteLength);
   return { ...header, touch, pixels };
 }
@@ -25,8 +24,9 @@ export function stepOf(chunk, step) {
   const size = chunk.height * chunk.width * 3;
   return Object.fromEntries(SIDES.map((side, row) => {
     const place = row * chunk.num_steps + index;
-    const taxels = chunk.touch.subarray(place * 2 * TAXELS, (place + 1) * 2 * TAXELS);
-    return [side, { rgb: chunk.pixels.subarray(place * size, (place + 1) * size), left: taxels.subarray(0, TAXELS), right: taxels.subarray(TAXELS) }];
+    const count = chunk.num_taxels;
+    const taxels = chunk.touch.subarray(place * 2 * count, (place + 1) * 2 * count);
+    return [side, { rgb: chunk.pixels.subarray(place * size, (place + 1) * size), left: taxels.subarray(0, count), right: taxels.subarray(count) }];
   }));
 }
 

@@ -11,7 +11,6 @@ import { startTheme } from "./theme.js";
 
 const STALE_MS = 800;
 const IMAGE_PERIOD_MS = 1000;
-const NUM_TAXELS = 320;
 const SIDES = ["left", "right"];
 const NOTHING = new Float32Array(0);
 const find = (id) => document.getElementById(id);
@@ -60,7 +59,10 @@ class StationTile {
     setText(this.facts.today, number(tile.hours_today, 2, "h"));
     setText(this.facts.disk, diskText(tile));
     this.showCamera(tile.camera);
-    for (const side of SIDES) if (!tile.gloves.includes(side)) this.hands[side].update(NOTHING);
+    for (const side of SIDES) {
+      this.hands[side].use(tile.layouts?.[side] ?? null);
+      if (!tile.gloves.includes(side)) this.hands[side].update(NOTHING);
+    }
   }
 
   showCamera(camera) {
@@ -72,10 +74,10 @@ class StationTile {
     }
   }
 
-  showTaxels(pressures_kpa) {
-    SIDES.forEach((side, index) => {
-      if (this.tile.gloves.includes(side)) this.hands[side].update(pressures_kpa.subarray(index * NUM_TAXELS, (index + 1) * NUM_TAXELS));
-    });
+  // `count` is the number of taxels of the left hand, which come first.
+  showTaxels(pressures_kpa, count) {
+    const hands = { left: pressures_kpa.subarray(0, count), right: pressures_kpa.subarray(count) };
+    for (const side of SIDES) if (this.tile.gloves.includes(side)) this.hands[side].update(hands[side]);
   }
 
   clear(cause) {
@@ -111,7 +113,7 @@ const link = new LiveLink({
   onBinary: (buffer) => {
     // uint8 kind (3), uint8 place in the list, uint16 0, float32 kPa of the left, then of the right hand.
     const view = new DataView(buffer);
-    if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4));
+    if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4), view.getUint16(2, true));
   },
   onState: (connected) => {
     setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");

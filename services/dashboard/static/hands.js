@@ -4,12 +4,11 @@
 import { beforeNextFrame, cleared, css } from "./canvas.js";
 import { setText } from "./dom.js";
 import { number } from "./format.js";
+import { withLayout } from "./layouts.js";
 import { drawMark } from "./taxel_marks.js";
 import { PADS, padForces, STATES, statesOf, taxelName, trusted } from "./taxels.js";
 
 const GAP = 0.09;
-const TIP_TAXELS = 16;
-const NUM_TIPS = 5;
 
 function box(cells, columns) {
   const rows = cells.map((cell) => Math.floor(cell / columns));
@@ -23,16 +22,12 @@ export class HandCanvas {
   constructor(canvas, texts, side, heatmap) {
     this.canvas = canvas;
     this.texts = texts;
-    this.heatmap = heatmap;
-    this.cells = heatmap.cells[side];
-    this.pads = [];
-    for (let tip = 0; tip < NUM_TIPS; tip += 1) {
-      this.pads.push(box(this.cells.slice(tip * TIP_TAXELS, (tip + 1) * TIP_TAXELS), heatmap.columns));
-    }
-    this.palm = box(this.cells.slice(NUM_TIPS * TIP_TAXELS), heatmap.columns);
+    this.side = side;
+    this.ownHeatmap = heatmap;
     this.pressures_kpa = null;
     this.states = new Map();
     this.hovered = null;
+    this.setHeatmap(heatmap);
     this.request = beforeNextFrame(() => this.draw());
     for (const name of ["pointermove", "pointerdown"]) canvas.addEventListener(name, (event) => this.hover(event));
     canvas.addEventListener("pointerleave", () => this.hover(null));
@@ -40,9 +35,33 @@ export class HandCanvas {
     this.request();
   }
 
+  setHeatmap(heatmap) {
+    this.heatmap = heatmap;
+    this.cells = heatmap.cells[this.side];
+    const boxOf = (pad) => box(this.cells.slice(pad.start, pad.start + pad.rows * pad.columns), heatmap.columns);
+    this.fingers = heatmap.pads.filter(({ part }) => part !== "palm").map(boxOf);
+    this.palm = heatmap.pads.filter(({ part }) => part === "palm").map(boxOf)[0] ?? null;
+    this.unloadedKey = null;
+    this.hovered = null;
+  }
+
+  // Draw a glove of a layout (JSON of TactileLayout) from now on; null is that of the page's heat map.
+  use(layout) {
+    const key = layout ? JSON.stringify(layout) : "";
+    if (key === (this.layoutKey ?? "")) return;
+    this.layoutKey = key;
+    this.setHeatmap(withLayout(this.ownHeatmap, layout));
+    this.pressures_kpa = null;
+    this.request();
+  }
+
   update(pressures_kpa) {
     if (pressures_kpa.length === 0) {
       this.clear("no glove is heard");
+      return;
+    }
+    if (pressures_kpa.length !== this.cells.length) {
+      this.clear(`${pressures_kpa.length} taxels of a glove whose layout is not known here`);
       return;
     }
     this.pressures_kpa = pressures_kpa;
@@ -116,11 +135,12 @@ export class HandCanvas {
   }
 
   drawSilhouette(context) {
+    if (!this.palm) return;
     const { top, left, height, width } = this.palm;
     context.fillStyle = context.strokeStyle = css("--hand");
     context.lineCap = "round";
     context.lineWidth = 4.9;
-    for (const pad of this.pads) {
+    for (const pad of this.fingers) {
       const x = pad.left + pad.width / 2;
       const inside = Math.min(Math.max(x, left + 2.5), left + width - 2.5);
       context.beginPath();
@@ -175,13 +195,13 @@ export class HandCanvas {
       setText(summary, touching.length === 0 ? "no contact" : `${touching.length} taxels in contact, peak ${Math.max(...touching).toFixed(0)} kPa`);
     }
     if (forces) {
-      const forces_n = known_kpa ? padForces(known_kpa, this.heatmap.contact_kpa) : PADS.map(() => null);
+      const forces_n = known_kpa ? padForces(known_kpa, this.heatmap.contact_kpa, this.heatmap.pads) : PADS.map(() => null);
       [...forces.children].forEach((value, pad) => setText(value.lastElementChild, number(forces_n[pad], 1, "N")));
     }
     if (taxel) {
       const state = STATES[this.states.get(this.hovered)]?.text ?? "in order";
       const pressure = number(pressures_kpa?.[this.hovered], 1, "kPa");
-      setText(taxel, this.hovered === null ? "" : `${taxelName(this.hovered)}: ${pressure} · ${state}`);
+      setText(taxel, this.hovered === null ? "" : `${taxelName(this.hovered, this.heatmap.pads)}: ${pressure} · ${state}`);
     }
   }
 }

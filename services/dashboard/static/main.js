@@ -59,6 +59,7 @@ function showGloves(gloves) {
   const counts = {};
   for (const [side, hand] of Object.entries(hands)) {
     const glove = gloves[side];
+    if (glove) hand.use(glove.layout);
     hand.mark(glove?.taxels ?? {});
     for (const [state, taxels] of Object.entries(glove?.taxels ?? {})) counts[state] = (counts[state] ?? 0) + taxels.length;
     setText(find(`hand_${side}_tare`), glove ? `tared ${glove.tare_age_s === null ? "at an unknown time" : `${age(glove.tare_age_s)} ago`}` : "");

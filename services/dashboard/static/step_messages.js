@@ -2,7 +2,6 @@
 
 export const STEPS_KIND = 2;
 const HEADER_START = 8;
-const TAXELS = 320;
 
 export function readHeader(buffer) {
   const length = new DataView(buffer).getUint32(4, true);
@@ -18,7 +17,7 @@ export function readSteps(buffer) {
   let offset = start;
   let touch = null;
   if (header.has_touch) {
-    touch = new Float32Array(buffer, offset, count * 2 * TAXELS);
+    touch = new Float32Array(buffer, offset, count * 2 * header.num_taxels);
     offset += touch.byteLength;
   }
   const cameras = header.cameras.map(({ name, height, width }) => {
@@ -31,8 +30,9 @@ export function readSteps(buffer) {
 
 export function touchOf(steps, index, side) {
   if (!steps.touch) return null;
-  const start = (2 * index + (side === "left" ? 0 : 1)) * TAXELS;
-  return steps.touch.subarray(start, start + TAXELS);
+  const { num_taxels } = steps.header;
+  const start = (2 * index + (side === "left" ? 0 : 1)) * num_taxels;
+  return steps.touch.subarray(start, start + num_taxels);
 }
 
 export function imageOf(camera, index) {

@@ -1,10 +1,6 @@
-// Names, states and forces of a hand's 320 taxels; no DOM, so that node can test it.
+// Names, states and forces of a hand's taxels; no DOM, so that node can test it.
 
 export const PADS = ["thumb", "index", "middle", "ring", "little", "palm"];
-const TIP_TAXELS = 16;
-const NUM_TIPS = 5;
-const COLUMNS = { tip: 4, palm: 16 };
-const AREAS_MM2 = { tip: 16, palm: 30 };
 
 // In the order of the legend; the first one of a taxel is shown.
 export const STATES = {
@@ -21,17 +17,16 @@ export const STATES = {
 // States in which a taxel still measures; undefined is one in order.
 const MEASURES = new Set([undefined, "refused"]);
 
-function placeOf(taxel) {
-  const isTip = taxel < NUM_TIPS * TIP_TAXELS;
-  const pad = isTip ? Math.floor(taxel / TIP_TAXELS) : NUM_TIPS;
-  return { pad, kind: isTip ? "tip" : "palm", inPad: taxel - pad * TIP_TAXELS };
+// The pad that a taxel is on; `pads` are those of the heat map.
+function padOf(taxel, pads) {
+  return pads.findLast((pad) => pad.start <= taxel);
 }
 
 // Pad, row from distal to proximal and column from the thumb's side, counted from 1.
-export function taxelName(taxel) {
-  const { pad, kind, inPad } = placeOf(taxel);
-  const columns = COLUMNS[kind];
-  return `${PADS[pad]}${kind === "tip" ? " tip" : ""}, row ${Math.floor(inPad / columns) + 1}, column ${(inPad % columns) + 1}`;
+export function taxelName(taxel, pads) {
+  const { part, start, columns } = padOf(taxel, pads);
+  const inPad = taxel - start;
+  return `${part}${part === "palm" ? "" : " tip"}, row ${Math.floor(inPad / columns) + 1}, column ${(inPad % columns) + 1}`;
 }
 
 // Pressures without those of taxels that are out of order: what they read is no touch.
@@ -39,12 +34,12 @@ export function trusted(pressures_kpa, states) {
   return pressures_kpa.map((pressure_kpa, taxel) => (MEASURES.has(states.get(taxel)) ? pressure_kpa : 0));
 }
 
-// Force on each pad in newton: pressure times area of the taxels in contact.
-export function padForces(pressures_kpa, contact_kpa) {
+// Force on each of PADS in newton: pressure times area of the taxels in contact.
+export function padForces(pressures_kpa, contact_kpa, pads) {
   const forces_n = new Array(PADS.length).fill(0);
   pressures_kpa.forEach((pressure_kpa, taxel) => {
-    const { pad, kind } = placeOf(taxel);
-    if (pressure_kpa >= contact_kpa) forces_n[pad] += pressure_kpa * AREAS_MM2[kind] * 1e-3;
+    const { part, taxel_area_mm2 } = padOf(taxel, pads);
+    if (pressure_kpa >= contact_kpa) forces_n[PADS.indexOf(part)] += pressure_kpa * taxel_area_mm2 * 1e-3;
   });
   return forces_n;
 }

@@ -61,6 +61,9 @@ _TESTED_AT_ONCE = 128
 MOMENTS_AN_EPISODE = 3
 # Chunks that vary less (in squared deviations of their principal axes) teach nothing.
 MIN_VARIANCE = 1e-9
+# Augmentation, chosen: noise and brightness of images (standard deviations, of 0 … 1), and noise of
+# poses relative to their spread, so that the policy meets poses beside the demonstrated ones.
+_IMAGE_NOISE, _BRIGHTNESS, _POSE_NOISE = 0.02, 0.06, 0.2
 # Large weights stored as float16 to keep files below a megabyte.
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
@@ -70,7 +73,7 @@ class Moment:
     """Image and touch at one step."""
 
     image: UInt8[np.ndarray, "h w 3"]
-    tactile_kpa: Float32[np.ndarray, "2 320"]
+    tactile_kpa: Float32[np.ndarray, "2 taxels"]
 
 
 @dataclass(frozen=True)
@@ -311,13 +314,12 @@ def train_cloned_policy(
 
     def loss(generator: torch.Generator) -> torch.Tensor:
         index = learned.drawn(settings.batch_size, generator)
-        part = _disturbed(learned.batch(index), network, settings, generator)
+        part = _disturbed(learned.batch(index), network, generator)
         return (network(part) - wanted[index]).square().sum(1).mean() / variance
 
     early: Checkpoint | None = None
     cpu_s = 0.0
-    limits = (settings.num_training_steps, settings.max_cpu_s)
-    for used in optimized(network, loss, settings, limits=limits, title="policy"):
+    for used in optimized(network, loss, settings, title="policy"):
         cpu_s = used.cpu_s
         if early_at is not None and early is None and used.share() >= early_at:
             with used.paused():
@@ -336,10 +338,7 @@ def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
 
 
 def _disturbed(
-    batch: CloningBatch,
-    network: CloningNetwork,
-    settings: CloningSettings,
-    generator: torch.Generator,
+    batch: CloningBatch, network: CloningNetwork, generator: torch.Generator
 ) -> CloningBatch:
     """Augment with pixel noise, a random brightness per sample, and noise on poses.
 
@@ -348,11 +347,11 @@ def _disturbed(
     """
     state = batch.state.clone()
     noise = torch.randn((len(state), NUM_POSE_FEATURES), generator=generator)
-    network.poses(state).add_(noise * network.pose_scale * settings.pose_noise)
+    network.poses(state).add_(noise * network.pose_scale * _POSE_NOISE)
 
     def spoilt(images: torch.Tensor) -> torch.Tensor:
-        noise = torch.randn(images.shape, generator=generator) * settings.image_noise
-        brightness = torch.randn((len(images), 1, 1, 1), generator=generator) * settings.brightness
+        noise = torch.randn(images.shape, generator=generator) * _IMAGE_NOISE
+        brightness = torch.randn((len(images), 1, 1, 1), generator=generator) * _BRIGHTNESS
         return images + noise + brightness
 
     return replace(batch, state=state, first=spoilt(batch.first), newest=spoilt(batch.newest))

@@ -5,7 +5,7 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -165,6 +165,29 @@ class PolicySource:
     def _is_inside(self, package: str | None) -> bool:
         """Whether this is the module itself or one of its parent packages, not an import of it."""
         return package is not None and f"{self.module}.".startswith(f"{package}.")
+
+
+def load_policies(
+    addresses: Sequence[str], arguments: Mapping[str, Mapping[str, Any]], others: Sequence[str]
+) -> dict[str, Policy]:
+    """Custom policies by name, with the arguments of their factories by name.
+
+    `others` are the names of all policies beside them.
+
+    Raises:
+        InvalidInputError: two policies of one name, or one that does not load.
+        NotFoundError, UnknownNameError: as `PolicySource.load`; also arguments of another policy.
+    """
+    sources = [PolicySource.parse(text) for text in addresses]
+    names = [source.name for source in sources]
+    if unknown := sorted(set(arguments) - set(names)):
+        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
+    names += others
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInputError(
+            f"policies: {repeated[0]!r} is given twice; rename one, --policy NAME=MODULE:FACTORY"
+        )
+    return {source.name: source.load(arguments.get(source.name, {})) for source in sources}
 
 
 class _WithoutReset:

@@ -16,6 +16,7 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, is_rollout
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, Rubric, StoredMark
 from services.evaluation.reporting.pictures import touch_image
 
@@ -217,17 +218,23 @@ class RolloutPictures:
                 f"step {step}: the rollout has the steps 0 … {episode.num_steps - 1}"
             )
         window = episode.window(step, 1, cameras=(HEAD_CAMERA,))
-        return encode_jpeg(side_by_side(window.images[HEAD_CAMERA][0], window.tactile_kpa[0]))
+        return encode_jpeg(
+            side_by_side(
+                window.images[HEAD_CAMERA][0], window.tactile_kpa[0], window.tactile_layout
+            )
+        )
 
 
 def side_by_side(
-    image: UInt8[np.ndarray, "h w 3"], tactile_kpa: Float32[np.ndarray, "2 320"]
+    image: UInt8[np.ndarray, "h w 3"],
+    tactile_kpa: Float32[np.ndarray, "2 taxels"],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The image, enlarged, beside the taxel maps of the left and the right hand."""
     height, width = image.shape[:2]
     size = (round(width * IMAGE_HEIGHT_PX / height), IMAGE_HEIGHT_PX)
     shown = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
-    touch = Image.fromarray(touch_image(tactile_kpa))
+    touch = Image.fromarray(touch_image(tactile_kpa, layout=layout))
     scale = min(IMAGE_HEIGHT_PX / touch.height, size[0] / touch.width)
     touch = touch.resize((round(touch.width * scale), round(touch.height * scale)))
     canvas = Image.new("RGB", (size[0] + touch.width + 8, IMAGE_HEIGHT_PX), (_BACKGROUND,) * 3)

@@ -16,8 +16,8 @@ from dextouch.episodes import EpisodeReader
 from dextouch.hands.actions import unpack_action
 from dextouch.images import encode_jpeg
 from dextouch.streams import HEAD_CAMERA
-from dextouch.tactile import colour, hand_canvas
-from dextouch.tactile.layout import FINGERS, SIDES
+from dextouch.tactile import colour
+from dextouch.tactile.layout import DEXTOUCH_V1, FINGERS, SIDES, TactileLayout
 from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
 
 # Photographs larger than this are embedded as JPEG.
@@ -41,7 +41,8 @@ class EpisodePicture:
     title: str
     times_s: Float64[np.ndarray, " n"]
     images: UInt8[np.ndarray, "n h w 3"]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,9 @@ class PredictionPicture:
     times_s: Float64[np.ndarray, " n"]
     true_images: UInt8[np.ndarray, "n h w 3"]
     predicted_images: UInt8[np.ndarray, "n h w 3"]
-    true_tactile_kpa: Float32[np.ndarray, "n 2 320"]
-    predicted_tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    true_tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
+    predicted_tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,14 @@ class Moment:
     touch: str
 
 
-def moments(times_s: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray) -> list[Moment]:
+def moments(
+    times_s: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray, layout: TactileLayout
+) -> list[Moment]:
     """Columns of a strip, as data URLs of embedded images."""
     return [
-        Moment(f"{time:.2f} s", data_address(image), data_address(touch_image(taxels)))
+        Moment(
+            f"{time:.2f} s", data_address(image), data_address(touch_image(taxels, layout=layout))
+        )
         for time, image, taxels in zip(times_s, images, tactile_kpa, strict=True)
     ]
 
@@ -104,11 +110,12 @@ def data_address(image: UInt8[np.ndarray, "h w channels"]) -> str:
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()
 
 
-def touch_image(tactile_kpa: np.ndarray, *, scale: int = 3) -> UInt8[np.ndarray, "h w 4"]:
-    """Both hands [2, 320] side by side in hand layout; transparent where there is no taxel."""
-    hands = [
-        hand_canvas(taxels, side=side) for taxels, side in zip(tactile_kpa, SIDES, strict=True)
-    ]
+def touch_image(
+    tactile_kpa: np.ndarray, *, scale: int = 3, layout: TactileLayout = DEXTOUCH_V1
+) -> UInt8[np.ndarray, "h w 4"]:
+    """Both hands [2, taxels] side by side in hand layout; transparent where there is no taxel."""
+    pairs = zip(tactile_kpa, SIDES, strict=True)
+    hands = [layout.hand_canvas(taxels, side=side) for taxels, side in pairs]
     gap = np.full((hands[0].shape[0], 2), np.nan, dtype=np.float32)
     canvas = np.concatenate([hands[0], gap, hands[1]], axis=1)
     opacity = np.where(np.isnan(canvas), 0, 255).astype(np.uint8)
@@ -396,12 +403,12 @@ def _interval(entry: Mapping[str, Any], world: str) -> tuple[float, float]:
 def strips(pictures: ReportPictures) -> list[Strip]:
     """Episodes as one row of images, predictions below their ground truth."""
     found = [
-        Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa))])
+        Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa, e.layout))])
         for e in pictures.episodes
     ]
     for p in pictures.predictions:
-        true = moments(p.times_s, p.true_images, p.true_tactile_kpa)
-        predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa)
+        true = moments(p.times_s, p.true_images, p.true_tactile_kpa, p.layout)
+        predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa, p.layout)
         found.append(Strip(p.title, "prediction", [("true", true), ("predicted", predicted)]))
     return found
 
@@ -417,6 +424,7 @@ def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePi
         _seconds(window.t_ref_ns)[steps],
         window.images[HEAD_CAMERA][steps],
         window.tactile_kpa[steps],
+        window.tactile_layout,
     )
 
 

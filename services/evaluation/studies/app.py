@@ -19,8 +19,7 @@ from dextouch.schemas import first_problems
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.scores import RolloutFailure
 from services.evaluation.settings import StudyServiceSettings
-from services.evaluation.studies.definition import NAME_PATTERN, StudyDefinition
-from services.evaluation.studies.results import FILE, StudyResults
+from services.evaluation.studies.results import FILE, NAME_PATTERN, StudyDefinition, StudyResults
 from services.evaluation.studies.study_figures import (
     StudyFigures,
     StudyRollout,

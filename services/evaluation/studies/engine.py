@@ -18,9 +18,10 @@ from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
-from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
 from services.evaluation.studies.results import (
     PlannedRollout,
+    PolicyChoice,
+    StudyDefinition,
     StudyHeader,
     StudyResults,
     cells_of,

@@ -21,9 +21,9 @@ from services.evaluation.scores import (
     RolloutScore,
     undefined_by,
 )
-from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
     PlannedRollout,
+    StudyDefinition,
     StudyResults,
     cells_of,
     rollout_episode_id,

@@ -37,7 +37,7 @@ If required:
   profile      once per person: a take in which the hand opens, closes and spreads
   robot-base   robots that report poses in their base frame: pose pairs of tracker and effector
   time         path delays of trackers and cameras: a take in which all are shaken together
-  latency      one stream with unknown path delay: a take of brisk motion, or of taps
+  latency      a glove, or its tracker, with unknown path delay: a take of taps
 
 More: docs/calibration_guide.md"""
 
@@ -110,13 +110,11 @@ example:
   dextouch station calibrate show calibration"""
 
 _LATENCY = """\
-Two pose streams: hold both trackers together and turn them briskly and irregularly for ten
-seconds. A pose stream and a glove: tap a hard table with the flat hand, ten times, half a second
-and more apart. The result is relative to the latency that the reference has.
+Of a glove against its tracker: tap a hard table with the flat hand, ten times, half a second and
+more apart. The result is relative to the latency that the reference has. For trackers and cameras
+use `time`, which measures all at once.
 
-examples:
-  dextouch station calibrate latency --stream wrist_left --reference wrist_right \\
-    --take spool/shake --to calibration
+example:
   dextouch station calibrate latency --stream wrist_left --reference tactile_left \\
     --take spool/taps --to calibration"""
 
@@ -143,7 +141,7 @@ _COMMANDS = {
     "hand-eye": (
         "photos and poses → camera on its tracker",
         _HAND_EYE,
-        "pipelines.calibrate.cameras:calibrate_mount",
+        "alignment.station_calibration.mount:calibrate_mount",
     ),
     "glove": (
         "rest and known pressures → tare, gain, faults",
@@ -168,10 +166,10 @@ _COMMANDS = {
     "time": (
         "shaking everything together → all path delays",
         _TIME,
-        "pipelines.calibrate.times:measure_times",
+        "alignment.station_calibration.times:measure_times",
     ),
     "latency": (
-        "common motion or taps → path delay",
+        "taps of a hand → path delay of glove or tracker",
         _LATENCY,
         "pipelines.calibrate.takes:measure_latency",
     ),

@@ -1,25 +1,16 @@
 """Commands `wrist`, `profile` and `latency` of `dextouch station calibrate`, each from one take.
 
-The latency of a stream is relative to another one: two pose streams record the same brisk motion
-(trackers held together), or a glove and a tracker record a hand that taps a table.
+The latency of a tracker is relative to a glove, or the other way round: a hand taps a table.
 """
 
 import argparse
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import transform_from_pose
-from dextouch.geometry.rotations import vector_from_rotation
-from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tactile_tare import TactileCalibration
-from services.alignment.calibration.time_offset import (
-    TimeOffset,
-    estimate_tap_offset,
-    estimate_time_offset,
-)
-from services.alignment.retargeting.hand_profile import profile_name
+from services.alignment.calibration.time_offset import TimeOffset, estimate_tap_offset
+from services.alignment.retargeting.hand_retargeter import profile_name
 from services.alignment.retargeting.wrist_frame import (
     calibrate_wrist,
     calibration_name,
@@ -95,24 +86,21 @@ def _keypoints(options: argparse.Namespace) -> TakeStream:
     return taken
 
 
-# Quaternion norm below which a pose counts as lost, since trackers then send zeros.
-MIN_NORM = 0.5
+# Of a pose, in which a hand comes down on a table.
 HEIGHT = 2
 
 
 def measure_latency(options: argparse.Namespace) -> dict[str, object]:
-    """Measure the delay of one stream relative to another, in addition to calibrated latencies.
+    """Measure the delay between a glove and a tracker, in addition to calibrated latencies.
 
     Raises:
-        DegenerateMotionError: too little, too slow or too regular motion, or no taps.
-        InvalidInputError: two streams that share no motion.
+        DegenerateMotionError: no taps.
+        InvalidInputError: not a glove and a tracker.
     """
     stream = read_stream(options.take, options.stream, options.store)
     reference = read_stream(options.take, options.reference, options.store)
-    kinds, method = (reference.descriptor.kind, stream.descriptor.kind), "taps"
-    if kinds == ("pose", "pose"):
-        found, method = _from_motion(reference, stream), "motion"
-    elif kinds == ("tactile", "pose"):
+    kinds = (reference.descriptor.kind, stream.descriptor.kind)
+    if kinds == ("tactile", "pose"):
         found = _from_taps(reference, stream)
     elif kinds == ("pose", "tactile"):
         reverse = _from_taps(stream, reference)
@@ -120,7 +108,8 @@ def measure_latency(options: argparse.Namespace) -> dict[str, object]:
     else:
         raise InvalidInputError(
             f"latency of {options.stream!r} against {options.reference!r}: got streams of kind "
-            f"{kinds[1]} and {kinds[0]}, expected two poses, or a pose and a glove"
+            f"{kinds[1]} and {kinds[0]}, expected a pose and a glove, which tap a table; shake "
+            "trackers and cameras together and use `dextouch station calibrate time`"
         )
     # The offset is added to the stream's times: the latency is its negative.
     name, of_reference = f"{options.stream}_latency", f"{options.reference}_latency"
@@ -130,7 +119,7 @@ def measure_latency(options: argparse.Namespace) -> dict[str, object]:
         "stream": options.stream,
         "reference": options.reference,
         "reference_latency_ms": reference.number(f"{of_reference}_ns") * 1e-6,
-        "method": method,
+        "method": "taps",
         "take": options.take,
         "latency_ms": latency_ns * 1e-6,
         "sigma_ms": sigma_ns * 1e-6,
@@ -138,20 +127,10 @@ def measure_latency(options: argparse.Namespace) -> dict[str, object]:
     matrices = {f"{name}_ns": float(latency_ns), f"{name}_sigma_ns": sigma_ns}
     write_entry(options.to, name, matrices, facts)
     print(
-        f"{name}: {facts['latency_ms']:.2f} ± {facts['sigma_ms']:.2f} ms by {method}, where "
+        f"{name}: {facts['latency_ms']:.2f} ± {facts['sigma_ms']:.2f} ms by taps, where "
         f"{options.reference} has {facts['reference_latency_ms']:.2f} ms"
     )
     return facts
-
-
-def _from_motion(a: TakeStream, b: TakeStream) -> TimeOffset:
-    (t_a_ns, a_rad_s), (t_b_ns, b_rad_s) = _angular_velocity(a), _angular_velocity(b)
-    try:
-        return estimate_time_offset(t_a_ns, a_rad_s, t_b_ns, b_rad_s)
-    except DegenerateMotionError:
-        # The worlds of two tracking systems may be rotated to each other, but speeds are equal.
-        speeds = np.linalg.norm(a_rad_s, axis=1), np.linalg.norm(b_rad_s, axis=1)
-        return estimate_time_offset(t_a_ns, speeds[0], t_b_ns, speeds[1])
 
 
 def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
@@ -161,39 +140,15 @@ def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
         raise InvalidInputError(f"stream {stream.name!r}: has no side")
     if stream.unit != "kPa":
         known = TactileCalibration.from_record(
-            glove.calibration, stream.side, num_cells=stream.shape[0], stream=stream.name
+            glove.calibration,
+            stream.side,
+            num_cells=stream.shape[0],
+            stream=stream.name,
+            layout=stream.layout,
         )
         readings = known.to_kpa(readings)
     pressure_kpa = readings.astype(np.float64)
     whole = np.isfinite(pressure_kpa).all(axis=1)
-    t_pose_ns, poses = poses_of(tracker)
+    t_pose_ns, poses = tracker.poses()
     peaks_kpa = pressure_kpa[whole].max(axis=1)
     return estimate_tap_offset(t_ns[whole], peaks_kpa, t_pose_ns, poses[:, HEIGHT])
-
-
-def _angular_velocity(
-    stream: TakeStream,
-) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """Angular velocity in the world (rad/s), which is the same for all parts of a rigid body."""
-    t_ns, poses = poses_of(stream)
-    Rs = transform_from_pose(poses)[:, :3, :3]
-    turns_rad = vector_from_rotation(Rs[1:] @ np.swapaxes(Rs[:-1], -1, -2))
-    steps_ns = np.diff(t_ns)
-    return t_ns[:-1] + steps_ns // 2, turns_rad / (steps_ns[:, None] * 1e-9)
-
-
-def poses_of(stream: TakeStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
-    """Times and poses of valid tracking.
-
-    Raises:
-        InvalidInputError: fewer than two.
-    """
-    t_ns, values = stream.timed()
-    poses = values.astype(np.float64)
-    seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
-    if np.count_nonzero(seen) < 2:
-        raise InvalidInputError(
-            f"take {stream.take!r}: {stream.descriptor.name} has {np.count_nonzero(seen)} valid "
-            "poses, expected two seconds of them; was the tracker visible?"
-        )
-    return t_ns[seen], poses[seen]

@@ -17,7 +17,7 @@ from dextouch.hands.robot_hand import HandModel
 from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
-from services.alignment.retargeting.hand_profile import calibrated_profile, measure_profile
+from services.alignment.retargeting.hand_retargeter import calibrated_profile, measure_profile
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,

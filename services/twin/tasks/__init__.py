@@ -5,13 +5,12 @@ from typing import Final
 
 from dextouch.errors import UnknownNameError
 from services.twin.names import EVALUATED, TASK_NAMES, TASK_SETS
-from services.twin.tasks.cans import CAN_TASKS
+from services.twin.tasks.cans import CAN_TASKS, RegraspCan
 from services.twin.tasks.insert_peg import InsertPeg
 from services.twin.tasks.lift_box import LiftBox
 from services.twin.tasks.open_drawer import OpenDrawer
 from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
-from services.twin.tasks.regrasp_can import RegraspCan
 from services.twin.tasks.squeeze_ball import SqueezeBall
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle

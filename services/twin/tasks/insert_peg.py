@@ -6,21 +6,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import transform_from_pose
-from services.twin.demonstrators import Waypoint, moved
+from services.twin.demonstrators import NO_NOISE, Waypoint, moved
 from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    THUMB_UP,
-    Draw,
-    Grip,
-    Noise,
-    Poses,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import THUMB_UP, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 
 _RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
 # Grasp height above the peg's centre, to keep the hand clear of the block.
@@ -136,10 +127,8 @@ class InsertPeg:
         start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
 
         peg_m = poses[0, :3] + [0.0, 0.0, _GRIP_M]
-        beside = moved(
-            grip.around(yawed(0.0) @ THUMB_UP, peg_m), start_m + np.array([0.12, -0.02, 0.03])
-        )
-        reach = grip.around(yawed(noise[0].yaw_rad) @ THUMB_UP, peg_m + noise[0].offset_m)
+        beside = moved(grip.at(peg_m, NO_NOISE), start_m + np.array([0.12, -0.02, 0.03]))
+        reach = grip.at(peg_m, noise[0])
         took = grip.pressed(reach)
         hole_m, R_hole = poses[1, :3] + noise[1].offset_m, yawed(noise[1].yaw_rad) @ THUMB_UP
         left = grip.around(R_hole, hole_m, held_m=_HELD_FEET_M[domain])
@@ -157,7 +146,7 @@ class InsertPeg:
             (4.0, left),
             (4.8, moved(left, [0.13, -0.02, 0.03])),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Foot within 1 cm of the hole's bottom, upright within 10°, at rest, untouched."""

@@ -13,16 +13,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Noise,
-    Poses,
-    flat,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Noise, Poses, flat, is_left, one_handed, yawed
 
 # The cabinet's frame: on the table below the middle of its front; the drawer opens along -y.
 _CABINET_HALF_M: Final = (0.085, 0.060, 0.042)
@@ -69,14 +60,7 @@ def _hook(domain: Domain) -> Float64[np.ndarray, "20"]:
     return best.ravel()
 
 
-def _tips_m(domain: Domain) -> Float64[np.ndarray, "3"]:
-    """Centre of the three hooking fingertips in the wrist frame."""
-    chain = twin_hand("right", domain).kinematics.chain_points_m(_hook(domain)[None])[0]
-    return np.asarray(chain[list(_HOOK_FINGERS), 3].mean(axis=0))
-
-
 def _opening_m(poses: Float64[np.ndarray, "2 7"]) -> float:
-    """Opening of the drawer."""
     closed = apply(transform_from_pose(poses[0]), np.array([[0.0, 0.0, _DRAWER_Z_M]]))[0]
     return float(np.linalg.norm(poses[1, :3] - closed))
 
@@ -130,7 +114,10 @@ class OpenDrawer:
 
     def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over the handle, down behind it, pull, stop, up, withdraw."""
-        joints, tips = _hook(domain), _tips_m(domain)
+        joints = _hook(domain)
+        chain = twin_hand("right", domain).kinematics.chain_points_m(joints[None])[0]
+        # Centre of the three hooking fingertips in the wrist frame.
+        tips = chain[list(_HOOK_FINGERS), 3].mean(axis=0)
         start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
         T_world_cabinet = transform_from_pose(poses[0])
         bar_z = _DRAWER_Z_M + _BAR_Z_M
@@ -155,7 +142,7 @@ class OpenDrawer:
             (3.8, hand((-_PULL_M + _UNLOAD_M, 0.06), put)),
             (4.7, moved(away, away_m + _BESIDE_M)),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Open by 6 cm or more, at rest, untouched."""

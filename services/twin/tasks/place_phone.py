@@ -12,16 +12,7 @@ from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Grip,
-    Noise,
-    Poses,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 
 # Phone frame: x across, y towards its top, z out of the screen; origin at its centre.
 _PHONE_HALF_M: Final = (0.036, 0.075, 0.0045)
@@ -100,7 +91,6 @@ def _stand() -> str:
 
 
 def _in_cradle(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:
-    """T_cradle_phone, the pose of the phone in the stand."""
     T_world_phone, T_world_stand, _ = transform_from_pose(simulation.object_poses())
     return invert(T_world_stand @ _T_STAND_CRADLE) @ T_world_phone
 
@@ -185,7 +175,7 @@ class PlacePhone:
             (4.45, seat(0.0, 0.07, grip.open_rad)),
             (5.0, moved(seat(0.0, 0.07, grip.open_rad), [0.16, -0.04, 0.02])),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Seated in the stand, at rest, untouched."""

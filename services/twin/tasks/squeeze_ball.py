@@ -12,16 +12,7 @@ from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    THUMB_UP,
-    Draw,
-    Grip,
-    Noise,
-    Poses,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import THUMB_UP, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 
 # The ball's frame: on the table below it. The ball is two halves on springs along y. It is turned,
 # so that the viewer sees the hand behind the ball, and both pins.
@@ -136,7 +127,7 @@ class SqueezeBall:
             (3.3, opened_again),
             (4.6, moved(opened_again, aside + away_m)),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Both pins pushed in by 4.5 mm, at rest, and neither they nor the ball touched."""

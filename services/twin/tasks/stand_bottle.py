@@ -12,16 +12,7 @@ from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Grip,
-    Noise,
-    Poses,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 
 _RADIUS_M: Final = 0.025
 _HALF_LENGTH_M: Final = 0.115
@@ -138,7 +129,7 @@ class StandBottle:
             (3.3 + _RELEASE_S, moved(bent(stand, grip.open_rad), [0.0, 0.0, _PUSH_M])),
             (4.8, away),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Upright within 8°, on the table within 1 cm, at rest, untouched."""

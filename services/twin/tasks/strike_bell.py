@@ -12,16 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    PALM_DOWN,
-    Draw,
-    Noise,
-    Poses,
-    flat,
-    is_left,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks.task import PALM_DOWN, Draw, Noise, Poses, flat, is_left, one_handed, yawed
 
 # The bell's frame: on the table below the plunger, y away from the viewer. Top of the plunger,
 # its travel and the part of it after which its arm meets the flag's crank.
@@ -51,12 +42,6 @@ _ABOVE_M, _BELOW_M = 0.090, 0.035
 _AWAY_M: Final = np.array([0.13, -0.06, 0.02])
 _STRUCK_RAD, _RUNG_RAD = 0.1, 1.0
 _STAND, _PLUNGER, _FLAG = range(3)
-
-
-def _depth_m(simulation: Simulation) -> float:
-    """How far the plunger is pressed."""
-    poses = simulation.object_poses()
-    return float(_TOP_M - (poses[_PLUNGER, 2] - poses[_STAND, 2]))
 
 
 def _flag_rad(simulation: Simulation) -> float:
@@ -165,15 +150,14 @@ class StrikeBell:
             (3.2, moved(hand(_ABOVE_M, aim), away_m + _AWAY_M)),
             (4.8, moved(hand(_ABOVE_M, aim), 1.1 * (away_m + _AWAY_M))),
         ]
-        return with_right_hand(path, domain)
+        return one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """The flag thrown over, the plunger up again, all at rest and untouched."""
-        return bool(
-            _flag_rad(simulation) > _RUNG_RAD
-            and _depth_m(simulation) < 0.1 * _TRAVEL_M
-            and is_left(simulation)
-        )
+        heights_m = simulation.object_poses()[:, 2]
+        depth_m = _TOP_M - (heights_m[_PLUNGER] - heights_m[_STAND])
+        is_up = bool(depth_m < 0.1 * _TRAVEL_M)
+        return _flag_rad(simulation) > _RUNG_RAD and is_up and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Plunger touched by a hand; flag moved; flag thrown over; released and at rest.

@@ -117,7 +117,7 @@ def relaxed(side: Side, domain: Domain) -> HandPose:
     return HandPose(transform(R, np.array([x, -0.16, 0.13])), clipped)
 
 
-def with_right_hand(path: Iterable[tuple[float, HandPose]], domain: Domain) -> list[Waypoint]:
+def one_handed(path: Iterable[tuple[float, HandPose]], domain: Domain) -> list[Waypoint]:
     """Waypoints of a right hand at times (s), while the left one rests."""
     rest = relaxed("left", domain)
     return [Waypoint(time_s, rest, pose) for time_s, pose in path]
@@ -160,12 +160,20 @@ class Grip:
         held = middle_m + self._R_wrist_axis @ held_m
         return HandPose(transform(R_world_wrist, point_m - R_world_wrist @ held), self.open_rad)
 
+    def at(self, point_m: np.ndarray, error: WaypointNoise) -> HandPose:
+        """The open right hand, thumb up, around an upright cylinder, off by an error."""
+        return self.around(yawed(error.yaw_rad) @ THUMB_UP, point_m + error.offset_m)
+
     def pressed(self, hand: HandPose) -> HandPose:
         """A hand that presses."""
         return bent(hand, self.press_rad)
 
 
+def at_rest(simulation: Simulation, index: int | slice = slice(None)) -> bool:
+    """Whether objects, all or one, are at rest."""
+    return bool(np.max(simulation.object_speeds()[index]) < REST_SPEED)
+
+
 def is_left(simulation: Simulation, index: int | slice = slice(None)) -> bool:
     """Whether objects are at rest, all or one, and no hand touches any."""
-    at_rest = np.max(simulation.object_speeds()[index]) < REST_SPEED
-    return bool(at_rest and not simulation.hand_touches_object())
+    return at_rest(simulation, index) and not simulation.hand_touches()

@@ -11,16 +11,7 @@ from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNo
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import (
-    THUMB_UP,
-    Draw,
-    Noise,
-    Poses,
-    is_left,
-    with_palm,
-    with_right_hand,
-    yawed,
-)
+from services.twin.tasks import task
 
 # The valve's frame: on the table below the pivot; the closed lever points along x and turns
 # clockwise, seen from above.
@@ -84,25 +75,27 @@ class TurnLever:
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "2 7"]:
         """Valve behind the centre, ±3 cm and ±0.2 rad, lever closed."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
-        R = yawed(_CLOSED_RAD + float(generator.uniform(-0.2, 0.2)))
+        R = task.yawed(_CLOSED_RAD + float(generator.uniform(-0.2, 0.2)))
         pose = np.array([0.01 + x, 0.10 + y, 0.0, *quaternion_from_rotation(R)])
         poses = np.stack([pose, pose])
         poses[_LEVER, 2] = _ARM_Z_M
         return poses
 
-    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
+    def script(
+        self, poses: task.Poses, domain: Domain, draw: task.Draw, noise: task.Noise
+    ) -> list[Waypoint]:
         """Move over the table beside the grip, down, push along the arc, back, up, withdraw."""
         start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
         T_world_valve = transform_from_pose(poses[_VALVE])
 
         def hand(angle_rad: float, gap_m: float, up_m: float, error: WaypointNoise) -> HandPose:
             """Fingers towards the pivot, the palm behind the grip of a lever at an angle."""
-            R_lever = T_world_valve[:3, :3] @ yawed(-angle_rad)
+            R_lever = T_world_valve[:3, :3] @ task.yawed(-angle_rad)
             behind = np.array([_LENGTH_M, _GRIP_RADIUS_M + gap_m, 0.0])
             palm_world = T_world_valve[:3, 3] + R_lever @ behind + error.offset_m
             palm_world[2] = _PALM_Z_M + up_m
-            R = yawed(error.yaw_rad) @ R_lever @ yawed(0.5 * np.pi) @ THUMB_UP
-            return with_palm("right", domain, R, palm_world)
+            R = task.yawed(error.yaw_rad) @ R_lever @ task.yawed(0.5 * np.pi) @ task.THUMB_UP
+            return task.with_palm("right", domain, R, palm_world)
 
         took, put = noise
         path = [
@@ -124,11 +117,11 @@ class TurnLever:
             (4.1, hand(_PUSH_RAD, _AWAY_M, 0.08, put)),
             (4.8, moved(hand(_PUSH_RAD, _AWAY_M + 0.08, 0.08, put), away_m)),
         ]
-        return with_right_hand(path, domain)
+        return task.one_handed(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Turned by 60° or more, at rest, untouched."""
-        return _turned_rad(simulation) > _TURNED_RAD and is_left(simulation, _LEVER)
+        return _turned_rad(simulation) > _TURNED_RAD and task.is_left(simulation, _LEVER)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Lever touched by a hand; turned by 10°; turned by 60°; released and at rest."""

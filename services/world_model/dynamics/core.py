@@ -3,15 +3,12 @@
 A gated recurrent network (Cho et al. 2014) at 3.75 Hz that knows no tasks. Its inputs are the
 distances of hand points to the surface of every object at its predicted pose (`features`), so that
 predictions feed back; objects are described by their size and whether they move at all. An object
-moves with the left hand, with the right hand, or by itself, as three gates say.
+moves with the left hand, with the right hand, or by itself, as three gates say. Hidden units stay
+within −1 … 1 and predicted positions within reach, so that what a rollout carries is bounded.
 
-Hidden units stay within −1 … 1 by construction, and predicted positions within reach, so that what
-a rollout carries from one chunk to the next is bounded.
-
-Layers have separate weights for every member of an ensemble, computed for all members at once.
-Inputs and outputs have one batch axis in which each member's entries follow each other, all members
-with equally many. At the sizes of a single rollout a small network takes as long as its number of
-operations, so that an ensemble costs about as much as one of its members.
+Layers have separate weights for every member of an ensemble, computed for all members at once: at
+the sizes of a single rollout an ensemble costs about as much as one of its members. Inputs and
+outputs have one batch axis in which each member's entries follow each other, as many of each.
 """
 
 from dataclasses import dataclass
@@ -23,7 +20,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.features import (
     BOX_AXES,
     MAX_DISTANCE_M,
@@ -168,8 +164,7 @@ class MemberGRU(nn.Module):
 class RecurrentCore(nn.Module):
     """Predicts object poses and touch from commands and a start.
 
-    The members of an ensemble are computed together: entries of the first member come first, then
-    those of the second, and so on, equally many of each.
+    Entries of the ensemble's first member come first, then those of the second, and so on.
     """
 
     boxes_m: Tensor
@@ -216,18 +211,13 @@ class RecurrentCore(nn.Module):
         self.touch = linear(160, STEPS_PER_LATENT * channels)
         self.contact = linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
         self.pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
-        self.taxels = linear(NUM_PATTERNS, NUM_TAXELS)
+        self.taxels = linear(NUM_PATTERNS, config.tactile_layout.num_taxels)
         # A person's skin and a robot's differ; where a pad meets an object does not.
-        self.human = (
-            nn.ModuleDict(
-                {
-                    "touch": linear(160, STEPS_PER_LATENT * channels),
-                    "pattern": linear(160, STEPS_PER_LATENT * NUM_PATTERNS),
-                }
-            )
-            if config.has_humans
-            else None
-        )
+        self.human: nn.ModuleDict | None = None
+        if config.has_humans:
+            touch = linear(160, STEPS_PER_LATENT * channels)
+            pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
+            self.human = nn.ModuleDict({"touch": touch, "pattern": pattern})
         self.success = nn.Sequential(
             linear(width + MAX_OBJECTS * _END_SIZE + len(_PAIRS) * _PAIR_SIZE, 128), nn.GELU(),
             nn.Dropout(0.2), linear(128, 1),
@@ -269,11 +259,8 @@ class RecurrentCore(nn.Module):
 
         `human` is 1 where a person acts, 0 for robots; None for robots alone, as in rollouts.
         """
-        known = [
-            compressed(start.pads_kpa * 1e-2),
-            start.touch.flatten(1),
-            self._flags(start, human),
-        ]
+        flags = self._flags(start, human)
+        known = [compressed(start.pads_kpa * 1e-2), start.touch.flatten(1), flags]
         return CoreState(
             self.begin(torch.cat(known, dim=1)),
             start.objects.position_m,
@@ -321,16 +308,8 @@ class RecurrentCore(nn.Module):
             hands = self.hand(torch.cat([slots.sum(2), own[:, latent]], dim=-1))
             mixed = self.mix(torch.cat([hands.flatten(1), flags], dim=1))
             hidden = self.memory(self.dropout(mixed), hidden)
-            near = torch.cat(
-                [
-                    hidden[:, None].expand(-1, used, -1),
-                    slots.transpose(1, 2).flatten(2),
-                    about,
-                    R_object[..., 2],
-                    R_object[..., 0],
-                ],
-                dim=-1,
-            )
+            of_hands = (hidden[:, None].expand(-1, used, -1), slots.transpose(1, 2).flatten(2))
+            near = torch.cat([*of_hands, about, R_object[..., 2], R_object[..., 0]], dim=-1)
             position, R_object = _moved(
                 (position, R_object),
                 self.motion(self.objects(near)),
@@ -340,15 +319,10 @@ class RecurrentCore(nn.Module):
             steps.append((hidden, hands, position, R_object, about))
         stacked = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
         future = self._decoded(stacked, there, start.objects.position_m, human)
-        objects = future.objects
-        last = CoreState(
-            hidden,
-            objects.position_m[:, -1],
-            objects.axes[:, -1],
-            wrist_m[:, -1],
-            commands.axes[:, -1],
+        at_end = future.objects[:, -1]
+        return future, CoreState(
+            hidden, at_end.position_m, at_end.axes, wrist_m[:, -1], commands.axes[:, -1]
         )
-        return future, last
 
     def _decoded(
         self,
@@ -391,13 +365,10 @@ def direction_free_inputs(width: int) -> list[int]:
     The hidden state, of this width, comes first.
     """
     of_pairs = width + MAX_OBJECTS * _END_SIZE
-    of_objects = [
-        width + slot * _END_SIZE + index for slot in range(MAX_OBJECTS) for index in _FREE_OF_OBJECT
-    ]
-    return of_objects + [
-        of_pairs + pair * _PAIR_SIZE + index
-        for pair in range(len(_PAIRS))
-        for index in _FREE_OF_PAIR
+    of_objects = range(width, of_pairs, _END_SIZE)
+    pairs = range(of_pairs, of_pairs + len(_PAIRS) * _PAIR_SIZE, _PAIR_SIZE)
+    return [first + index for first in of_objects for index in _FREE_OF_OBJECT] + [
+        first + index for first in pairs for index in _FREE_OF_PAIR
     ]
 
 
@@ -413,7 +384,6 @@ def own_features(
 
 
 def _rotation(columns: Float32[Tensor, "*batch 6"]) -> Float32[Tensor, "*batch 3 3"]:
-    """R from its first two columns."""
     x, y = columns[..., :3], columns[..., 3:]
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
@@ -454,8 +424,7 @@ def _ending_features(
 ) -> Float32[Tensor, "batch latents features"]:
     """Poses of all objects, and of each pair relative to each other.
 
-    What a task asks for is mostly a distance or an angle between objects, in any direction. Given
-    as such, few takes teach it.
+    A task mostly asks for a distance or an angle between objects; given so, few takes teach it.
     """
     z, x = axes.unbind(-2)
     R = torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)

@@ -1,5 +1,6 @@
-"""What the dynamics read and predict: configuration, commands, hands, objects and touch."""
+"""What the dynamics read and predict: configuration, commands, words, hands, objects and touch."""
 
+import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +19,8 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
-from dextouch.tactile.layout import NUM_TAXELS
-from services.networks.principal_axes import principal_axes, root_pressure
-from services.networks.subwords import subwords
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
 from services.world_model.dynamics.trees import mapped
 
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
@@ -49,6 +49,11 @@ FREE_KPA = 2.0
 # Chosen: a sentence has some 60 subwords, and few of them tell it from another one.
 _INSTRUCTION_SIZE = 64
 _SIGN_BIT = 1 << 31
+# Trigrams of at most 24 words of average length.
+MAX_SUBWORDS: Final = 160
+WORD: Final = re.compile(r"\w+")
+# No channel is scaled up by more than sqrt(1 / this) relative to the strongest one.
+MIN_RELATIVE_SCALE: Final = 1e-3
 
 
 @dataclass(frozen=True)
@@ -104,9 +109,8 @@ def hand_motion(
 def compressed(distance_m: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
     """asinh(d / 1 cm) / 2: linear near zero, logarithmic far away.
 
-    Success is decided within millimetres, which a wrist pose relative to its own start does not
-    resolve. A millimetre near an object and a decimetre far from it both change a feature by about
-    a tenth. The scale is the same for all tasks.
+    Success is decided within millimetres: one near an object and a decimetre far from it both
+    change a feature by about a tenth. The scale is the same for all tasks.
     """
     return torch.asinh(distance_m / NEAR_M) / 2
 
@@ -119,14 +123,10 @@ def slot_features(
 ) -> Float32[Tensor, "batch 2 objects features"]:
     """Features of each hand and object at one latent step.
 
-    For each point: its distance to the object's box, negative inside; its offset from the box's
-    middle, in the object's frame; its offset from the object, in the world's.
-
-    Args:
-        points_m: points of both hands in the world at the `SAMPLE_OFFSETS`.
-        position_m: of the objects' frames in the world.
-        R: rotations of the objects' frames to the world.
-        boxes_m: middle and half sizes of each object's box in its frame.
+    For each point at the `SAMPLE_OFFSETS`: its distance to the object's box, negative inside; its
+    offset from the box's middle, in the object's frame; its offset from the object, in the world's.
+    `position_m` and `R` are the poses of the objects in the world, `boxes_m` the middle and half
+    sizes of each object's box in its frame.
     """
     points_m = points_m[..., _FIRST_POINT:, None, :]
     offset = points_m - position_m[:, None, None, None]
@@ -143,10 +143,10 @@ def slot_features(
 class DynamicsConfig(FrozenModel):
     """Architecture of a dynamics model, stored in its checkpoints.
 
-    `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
-    objects fill the first slots in the order of the episode's `object_names`. With the domain
-    `human`, cores are given whose hands act, and predict the touch of either by heads of its own.
-    With `instructions`, the sentences of training, cores read the instruction of a rollout.
+    A task's index in `tasks` selects its embedding, and its objects fill the first slots in the
+    order of the episode's `object_names`. With the domain `human`, cores are given whose hands act,
+    and have heads for the touch of either. With `instructions`, the sentences of training, cores
+    read the instruction of a rollout. `layout` is that of the taxels, None of `dextouch_v1`.
     """
 
     tasks: tuple[str, ...] = Field(min_length=1)
@@ -155,11 +155,17 @@ class DynamicsConfig(FrozenModel):
     reader_channels: int = Field(default=32, ge=8, le=256)
     reader_keypoints: int = Field(default=40, ge=4, le=256)
     width: int = Field(default=192, ge=8, le=1024)
-    touch_channels: int = Field(default=96, ge=4, le=320)
+    touch_channels: int = Field(default=96, ge=4, le=MAX_CELLS)
     domains: tuple[Domain, ...] = Field(
         default=_ROBOT_ALONE, exclude_if=lambda domains: domains == _ROBOT_ALONE
     )
     instructions: tuple[str, ...] = Field(default=(), exclude_if=not_)
+    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+
+    @property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels that the model feels."""
+        return DEXTOUCH_V1 if self.layout is None else self.layout
 
     @property
     def instruction_size(self) -> int:
@@ -178,11 +184,29 @@ class DynamicsConfig(FrozenModel):
                 f"got {len(self.tasks)} tasks and {len(self.num_objects)} numbers of objects, "
                 "expected one number for every task and no task twice"
             )
+        num_taxels = self.tactile_layout.num_taxels
+        if self.touch_channels > num_taxels:
+            raise ValueError(
+                f"touch_channels: got {self.touch_channels}, expected at most {num_taxels}, the "
+                f"taxels of layout {self.tactile_layout.name!r}"
+            )
         if any(not 1 <= count <= MAX_OBJECTS for count in self.num_objects):
             raise ValueError(
                 f"num_objects: got {self.num_objects}, expected 1 … {MAX_OBJECTS} for every task"
             )
         return self
+
+
+def subwords(instruction: str) -> list[str]:
+    """Each word and its trigrams, in lower case with a mark at both ends; at most 160.
+
+    Words of one stem share trigrams, and words that share a bucket by chance differ by theirs.
+    """
+    parts = []
+    for word in WORD.findall(instruction.lower()):
+        marked = f"<{word}>"
+        parts += [marked, *(marked[i : i + 3] for i in range(len(marked) - 2))]
+    return parts[:MAX_SUBWORDS]
 
 
 def instruction_features(
@@ -249,10 +273,9 @@ class Commands:
 class ObjectPoses:
     """Objects in the world frame.
 
-    `axes` are the directions of the object's z and x axis. An axis that cannot be observed (the yaw
-    of a round bowl) is predicted shorter than one, so that its length expresses certainty.
-    `present` is 1 for an object, 0 for unused slots and objects out of reach, and a probability in
-    between.
+    `axes` are the directions of the object's z and x axis, shorter than one where they cannot be
+    observed (the yaw of a round bowl). `present` is 1 for an object, 0 for unused slots and objects
+    out of reach, and a probability in between.
     """
 
     position_m: Float32[Tensor, "*batch objects 3"]
@@ -328,31 +351,61 @@ def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
 
 
+def principal_axes(
+    second_moment: Float64[Tensor, "dim dim"], num_channels: int
+) -> tuple[Float32[Tensor, "dim channels"], Float32[Tensor, " channels"]]:
+    """Strongest eigenvectors, strongest first, and the root mean square along each.
+
+    Each vector's largest entry is made positive, so that equal data give an equal basis.
+    """
+    # Of data that touch few taxels, whose other rows are zero, torch's solver (MKL) can fail.
+    values, vectors = map(torch.from_numpy, np.linalg.eigh(second_moment.numpy()))
+    basis = vectors[:, -num_channels:].flip(1)
+    largest = basis.abs().argmax(dim=0)
+    signs = torch.sign(basis[largest, torch.arange(num_channels)])
+    rms = values[-num_channels:].flip(0).clamp_min(0).sqrt()
+    return (basis * signs).float(), rms.float()
+
+
+def root_scale(rms: Float32[Tensor, " channels"]) -> Float32[Tensor, " channels"]:
+    """Divisors that give channel c the amplitude sqrt(rms_c / rms_0).
+
+    Full whitening would give the weakest channels, mostly noise, as much weight as the strongest;
+    without whitening the strongest would dominate.
+    """
+    strongest = rms[0].clamp_min(1e-6)
+    return torch.sqrt((rms / strongest).clamp_min(MIN_RELATIVE_SCALE)) * strongest
+
+
+def root_pressure(tactile_kpa: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
+    """Square root of pressures; negative ones count as zero."""
+    return tactile_kpa.clamp_min(0.0).sqrt()
+
+
 class TouchCodec(nn.Module):
     """Frozen encoder and decoder of one hand's taxels, the same for left and right.
 
-    Latents are in units of the strongest axis' amplitude, so that their squared error is
-    proportional to that of the root of pressure. Decoded pressure is bounded by `peak_kpa`, the
-    highest pressure in training.
+    Squared errors of latents are proportional to those of the root of pressure. Decoded pressure is
+    bounded by `peak_kpa`, the highest pressure in training.
     """
 
     basis: Tensor
     scale: Tensor
     peak_kpa: Tensor
 
-    def __init__(self, num_channels: int) -> None:
+    def __init__(self, num_channels: int, num_taxels: int = NUM_TAXELS) -> None:
         super().__init__()
-        self.register_buffer("basis", torch.eye(NUM_TAXELS, num_channels))
+        self.register_buffer("basis", torch.eye(num_taxels, num_channels))
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("peak_kpa", torch.full((), 1e3))
 
     @torch.no_grad()
-    def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
-        """Fit axes, scale and peak to training touch of single hands.
+    def fit(
+        self, tactile_kpa: Float32[Tensor, "n taxels"], *, peak_kpa: float | None = None
+    ) -> None:
+        """Fit axes and scale to a sample of training touch of single hands.
 
-        Args:
-            tactile_kpa: sample of the training data.
-            peak_kpa: highest pressure of all training data; None uses that of the sample.
+        `peak_kpa` is the highest pressure of all training data; None uses that of the sample.
         """
         roots = root_pressure(tactile_kpa).double()
         # Not centred: the mean touch is not a touch that occurs.
@@ -362,12 +415,12 @@ class TouchCodec(nn.Module):
         peak = float(tactile_kpa.max()) if peak_kpa is None else peak_kpa
         self.peak_kpa.fill_(max(peak, FREE_KPA))
 
-    def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
+    def encode(self, tactile_kpa: Float32[Tensor, "*b taxels"]) -> Float32[Tensor, "*b channels"]:
         """Latents; pressures are clipped to 0 … peak."""
         bounded = torch.minimum(tactile_kpa, self.peak_kpa)
         return (root_pressure(bounded) @ self.basis) / self.scale
 
-    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b 320"]:
+    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b taxels"]:
         """Pressures in kPa between zero and the peak."""
         roots = ((latents * self.scale) @ self.basis.T).clamp_min(0.0)
         return torch.minimum(roots.square(), self.peak_kpa)

@@ -1,8 +1,7 @@
 """Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec.
 
-`begin` estimates object poses from one observed step; `advance` predicts object motion and touch
-for the next commands. The only state kept between chunks is a `SceneMemory`, which is batched,
-unbatched and serialized here, too.
+The only state kept between chunks is a `SceneMemory`, which is batched, unbatched and serialized
+here, too.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.dynamics.core import (
     NUM_PADS,
     CoreState,
@@ -102,8 +101,8 @@ def stillness(
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 
     Hands move when they leave that position, however slowly. A scene is at rest in latent steps
-    without hand motion that follow at least `REST_LATENTS` such steps. Latent steps are counted,
-    not chunks, so that it does not matter how a client splits its commands into chunks.
+    without motion that follow `REST_LATENTS` such steps. Latent steps are counted, not chunks, so
+    that a client may split its commands as it likes.
     """
     moved, rested = [], []
     for samples_m in commanded_m.unbind(1):
@@ -117,23 +116,25 @@ def stillness(
 
 
 def by_pad(
-    tactile_kpa: Float[np.ndarray, "*batch 2 320"], reduce: Callable[..., np.ndarray]
+    tactile_kpa: Float[np.ndarray, "*batch 2 taxels"],
+    reduce: Callable[..., np.ndarray],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    `reduce` takes the taxels of a pad and an axis, such as `np.mean`.
+    `reduce` takes the taxels of a pad and an axis, such as `np.mean`. A part of the hand without
+    taxels has the pressure 0.
     """
-    tips, palm = split_pads(tactile_kpa)
-    pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
-    return np.concatenate(pads, axis=-1).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
+    return layout.by_part(tactile_kpa, reduce).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
 
 
 def first_steps(
     images: Sequence[UInt8[np.ndarray, "px px 3"]],
     Ks_head: Sequence[Float64[np.ndarray, "3 3"]],
-    tactile_kpa: Sequence[Float32[np.ndarray, "2 320"]],
+    tactile_kpa: Sequence[Float32[np.ndarray, "2 taxels"]],
     hands: Sequence[HandMotion],
     tasks: Sequence[int],
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> FirstStep:
     """A batch of observed steps as inputs of the readers; `hands` are of one step each."""
     return FirstStep(
@@ -141,7 +142,7 @@ def first_steps(
         torch.from_numpy(np.stack(Ks_head)).float(),
         torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
         torch.from_numpy(np.concatenate([one.points_m for one in hands])),
-        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean)),
+        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean, layout)),
         torch.tensor(tasks),
     )
 
@@ -152,17 +153,16 @@ class SceneMemory:
 
     `start` holds objects and touch at the first step as every member knows them, `state` the state
     of every member's core (both with axes members, batch, …), `poses` the current object poses
-    (mean over members), `disagreement_m` the ensemble disagreement about them, `success` the
-    members' probability that the task is done at the end, `points_m` the hand points when they last
-    moved, and `num_still` the number of latent steps since then (at least `REST_LATENTS` from the
-    start on for hands that touch nothing).
+    (mean over members), `disagreement_m` the largest spread of a position, `success` the members'
+    probability that the task is done at the end, `points_m` the hand points when they last moved,
+    `num_still` the latent steps since then (`REST_LATENTS` at first for hands that touch nothing).
     """
 
     start: SceneStart
     state: CoreState
     poses: ObjectPoses
     disagreement_m: Float32[Tensor, " batch"]
-    tactile_kpa: Float32[Tensor, "batch 2 320"]
+    tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     success: Float32[Tensor, "members batch"]
     points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
@@ -170,10 +170,8 @@ class SceneMemory:
 
 @dataclass(frozen=True)
 class _Run:
-    """Predictions for a run of latent steps; as `ImaginedSteps`."""
-
     poses: ObjectPoses
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
     disagreement_m: Float32[Tensor, "batch latents"]
     distance: Float32[Tensor, "batch latents"]
     success: Float32[Tensor, "members batch latents"]
@@ -199,7 +197,7 @@ class DynamicsModel(nn.Module):
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
         super().__init__()
         self.config = config
-        self.codec = TouchCodec(config.touch_channels)
+        self.codec = TouchCodec(config.touch_channels, config.tactile_layout.num_taxels)
         self.eyes = nn.ModuleList(StartReader(config) for _ in range(num_members))
         self.core = RecurrentCore(config, num_members)
         self._predict: Callable[..., tuple[CoreState, _Run]] = self._predicted
@@ -212,7 +210,7 @@ class DynamicsModel(nn.Module):
     def begin(
         self,
         first: FirstStep,
-        tactile_kpa: Float32[Tensor, "batch 2 320"],
+        tactile_kpa: Float32[Tensor, "batch 2 taxels"],
         holding: Commands,
         commanded: Float32[Tensor, " batch"],
         instruction: Float32[Tensor, "batch features"],
@@ -294,11 +292,8 @@ class DynamicsModel(nn.Module):
         run = self._imagined(poses, future, self.core.distance(commands, state.wrist_m[0]))
         return unfolded(after, members), run
 
-    def _kind_of(
-        self, commands: Commands, start: SceneStart, state: CoreState, poses: ObjectPoses
-    ) -> tuple[int, int, int]:
+    def _kind_of(self, commands: Commands, start: SceneStart, *_: object) -> tuple[int, int, int]:
         """Latent steps, entries of the batch, and the slots that some entry uses."""
-        del state, poses
         return len(commands), start.task.shape[1], self.core.used_slots(start.task[0])
 
     def readers(self) -> list[StartReader]:
@@ -318,8 +313,10 @@ class DynamicsModel(nn.Module):
         )
 
     def decode_touch(
-        self, touch: Float32[Tensor, "*batch 2 channels"], taxels: Float32[Tensor, "*batch 2 320"]
-    ) -> Float32[Tensor, "*batch 2 320"]:
+        self,
+        touch: Float32[Tensor, "*batch 2 channels"],
+        taxels: Float32[Tensor, "*batch 2 taxels"],
+    ) -> Float32[Tensor, "*batch 2 taxels"]:
         """Pressures in kPa from latents and from contact log odds of each taxel.
 
         Taxels in contact have at least the contact threshold pressure, all others have none.
@@ -329,7 +326,7 @@ class DynamicsModel(nn.Module):
 
 
 def _spread_m(poses: ObjectPoses) -> Float32[Tensor, "*batch"]:
-    """Largest standard deviation over members of the position of an object that is present."""
+    """Largest standard deviation over members of the position of a present object."""
     used = poses.present.mean(0) > PRESENCE_THRESHOLD
     return (poses.position_m.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
@@ -361,7 +358,6 @@ def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
 
 
 def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) -> _Run:
-    """Latent steps in which everything stays constant."""
     num_latents = distance.shape[1]
 
     def held(now: Tensor, count: int) -> Tensor:
@@ -427,9 +423,8 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
     objects, zeros = MAX_OBJECTS, torch.zeros
 
     def poses(*batch: int) -> ObjectPoses:
-        return ObjectPoses(
-            zeros(*batch, objects, 3), zeros(*batch, objects, 2, 3), zeros(*batch, objects)
-        )
+        sizes = (objects, 3), (objects, 2, 3), (objects,)
+        return ObjectPoses(*(zeros(*batch, *size) for size in sizes))
 
     start = SceneStart(
         objects=poses(members, 1),
@@ -453,7 +448,7 @@ def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
         state=state,
         poses=poses(1),
         disagreement_m=zeros(1),
-        tactile_kpa=zeros(1, 2, NUM_TAXELS),
+        tactile_kpa=zeros(1, 2, config.tactile_layout.num_taxels),
         success=zeros(members, 1),
         points_m=zeros(1, 2, NUM_POINTS, 3),
         num_still=zeros(1, dtype=torch.int64),
@@ -473,10 +468,9 @@ def _checked(name: str, arrays: Mapping[str, np.ndarray], expected: Tensor) -> T
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise NonFiniteError(f"snapshot: {name} contains NaN or infinity")
-    if array.dtype.kind == "f" and np.abs(array).max() > _LARGEST:
+    if array.dtype.kind == "f" and (largest := np.abs(array).max()) > _LARGEST:
         raise InvalidInputError(
-            f"snapshot: {name} has values up to {np.abs(array).max():.3g}, expected at most "
-            f"{_LARGEST:.0e}"
+            f"snapshot: {name} has values up to {largest:.3g}, expected at most {_LARGEST:.0e}"
         )
     found = torch.from_numpy(np.array(array))
     return found.clamp(*_RANGES[name]) if name in _RANGES else found

@@ -2,8 +2,8 @@
 
 A small convolutional network with feature points (spatial soft-argmax, Levine et al. 2016)
 predicts a pixel and a height for every object; the position is where the pixel's ray reaches that
-height, so that the known camera pose is used exactly instead of being learned. A second network
-looks at a crop about every such pixel, and at where the hands are from there, and corrects it.
+height, so that the known camera pose is used exactly. A second network looks at a crop about every
+such pixel, and at where the hands are from there, and corrects it.
 """
 
 from dataclasses import dataclass
@@ -71,9 +71,8 @@ class Reading:
 class StartReader(nn.Module):
     """Predicts object poses, sizes, their uncertainty and presence from one observed step.
 
-    Feature points of the whole image give a first guess; a crop about each guess, with the hands as
-    seen from there, corrects it. Channels of the image are standardized, so that exposure, gain and
-    the colour of the light have no effect.
+    Channels of the image are standardized, so that exposure, gain and the colour of the light have
+    no effect.
     """
 
     height_mean: Tensor
@@ -84,14 +83,11 @@ class StartReader(nn.Module):
         channels, points = config.reader_channels, config.reader_keypoints
         self.register_buffer("height_mean", torch.zeros(len(config.tasks), MAX_OBJECTS))
         self.eye = nn.Sequential(
-            nn.Conv2d(3, channels, 5, stride=2, padding=2),
-            nn.GELU(),
-            nn.Conv2d(channels, channels, 3, padding=1),
-            nn.GELU(),
-            nn.Conv2d(channels, channels, 3, padding=1),
-            nn.GELU(),
+            nn.Conv2d(3, channels, 5, stride=2, padding=2), nn.GELU(),
+            nn.Conv2d(channels, channels, 3, padding=1), nn.GELU(),
+            nn.Conv2d(channels, channels, 3, padding=1), nn.GELU(),
             nn.Conv2d(channels, points, 1),
-        )
+        )  # fmt: skip
         self.sharpness = nn.Parameter(torch.ones(points))
         self.task = nn.Embedding(len(config.tasks), TASK_WIDTH)
         known = 3 * points + TASK_WIDTH + _POINT_SIZE + NUM_PADS + _CAMERA_SIZE
@@ -100,16 +96,11 @@ class StartReader(nn.Module):
             nn.Linear(192, MAX_OBJECTS * _OUTPUTS),
         )  # fmt: skip
         self.lens = nn.Sequential(
-            nn.Conv2d(3, channels, 5, stride=2, padding=2),
-            nn.GELU(),
-            nn.Conv2d(channels, 48, 3, padding=1),
-            nn.GELU(),
-            nn.Conv2d(48, 64, 3, stride=2, padding=1),
-            nn.GELU(),
-            nn.Flatten(),
-            nn.Linear(64 * (_CROP_PX // 4) ** 2, 128),
-            nn.GELU(),
-        )
+            nn.Conv2d(3, channels, 5, stride=2, padding=2), nn.GELU(),
+            nn.Conv2d(channels, 48, 3, padding=1), nn.GELU(),
+            nn.Conv2d(48, 64, 3, stride=2, padding=1), nn.GELU(),
+            nn.Flatten(), nn.Linear(64 * (_CROP_PX // 4) ** 2, 128), nn.GELU(),
+        )  # fmt: skip
         about = TASK_WIDTH + MAX_OBJECTS + _POINT_SIZE + NUM_PADS + _CAMERA_SIZE + _OUTPUTS
         last = nn.Linear(128, _OUTPUTS)
         nn.init.zeros_(last.weight)
@@ -176,9 +167,8 @@ class StartReader(nn.Module):
         used = torch.arange(MAX_OBJECTS) < counts[:, None]
         present = outputs[..., 9].sigmoid() * used
         position = ray_at_height(pixel, height_m, first.K_head, first.T_world_camera)
-        objects = ObjectPoses(
-            position, outputs[..., 3:9].reshape(*outputs.shape[:2], 2, 3), present
-        )
+        axes = outputs[..., 3:9].reshape(*outputs.shape[:2], 2, 3)
+        objects = ObjectPoses(position, axes, present)
         sd_m = (_USUAL_SD_M * outputs[..., 10].clamp(-4.0, 4.0).exp()).clamp_min(LEAST_SD_M)
         return Reading(objects, sd_m, (_LOG_SIZE * outputs[..., 11:13].tanh()).exp())
 
@@ -190,18 +180,9 @@ class StartReader(nn.Module):
         columns = (weight.sum(2) * places).sum(-1)
         rows = (weight.sum(3) * places).sum(-1)
         strength = (weight * maps).sum((2, 3))
-        return torch.cat(
-            [
-                3 * columns,
-                3 * rows,
-                strength.tanh(),
-                self.task(first.task),
-                compressed(first.points_m).flatten(1),
-                compressed(first.pads_kpa * 1e-2),
-                _camera(first),
-            ],
-            dim=1,
-        )
+        points = compressed(first.points_m).flatten(1)
+        seen = (3 * columns, 3 * rows, strength.tanh(), self.task(first.task), points)
+        return torch.cat([*seen, compressed(first.pads_kpa * 1e-2), _camera(first)], dim=1)
 
 
 def _camera(first: FirstStep) -> Float32[Tensor, "batch 7"]:

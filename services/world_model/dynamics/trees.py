@@ -1,8 +1,7 @@
 """Operations on all tensors of nested dataclasses, and traces of functions that take such trees.
 
-A chunk of one rollout has a thousand small operations, and calling them from Python takes as
-long as computing them. A trace (torch.jit) has the same operations in the same order, so that its
-numbers are those of the model, bit for bit.
+A chunk of one rollout has a thousand small operations, and calling them from Python takes as long
+as computing them. A trace (torch.jit) has the same operations, so that its numbers are the same.
 """
 
 import warnings
@@ -70,16 +69,11 @@ def stacked(parts: Sequence[Part]) -> Part:
 
 
 class Traced(Generic[Outputs]):
-    """Stands in for a function of a model whose weights do not change any more.
+    """A function of a model whose weights do not change any more, and become constants of traces.
 
-    From the fourth call of a kind on, a call is computed by a trace; at most sixteen are kept, and
-    further kinds are computed by the function.
-
-    Args:
-        model: its weights become constants of the traces.
-        function: takes and returns tensors, or dataclasses and tuples of tensors.
-        kind_of: kind of a call. Calls of one kind have the same shapes, and the function takes the
-            same way through its code.
+    From the fourth call of a kind on, a trace computes it; at most sixteen are kept. The function
+    takes and returns tensors, or dataclasses and tuples of tensors. Calls of one kind, as `kind_of`
+    says, have the same shapes and the same way through its code.
     """
 
     def __init__(
@@ -102,7 +96,6 @@ class Traced(Generic[Outputs]):
         return outputs
 
     def _traced(self, inputs: tuple[Any, ...]) -> tuple[Callable[..., tuple[Tensor, ...]], Outputs]:
-        """A trace for inputs of these shapes, and outputs of its form."""
         forms: list[Outputs] = []
         function = self._function
 
@@ -139,7 +132,6 @@ def _tensors(part: Any) -> Iterator[Tensor]:  # noqa: ANN401 - any nesting of da
 
 
 def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
-    """The form with other tensors."""
     if isinstance(form, Tensor):
         return next(tensors)
     parts = [_rebuilt(one, tensors) for one in _parts(form)]

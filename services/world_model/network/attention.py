@@ -28,6 +28,8 @@ PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
 _THETA = 1e4
 NUM_MODULATIONS = 6
 Heads = Float[Tensor, "batch heads tokens head_width"]
+Tokens = Float[Tensor, "batch tokens width"]
+_Rows = Float[Tensor, "*batch width"]
 
 
 @cache
@@ -36,13 +38,11 @@ def left_joint_signs() -> Float64[np.ndarray, "20"]:
 
     A mirror maps an axis a to -S a; the sign says whether that is the right hand's axis.
     """
-    left, right = RobotHand("left"), RobotHand("right")
-    signs = [
-        np.sign(np.dot(-MIRROR_WRIST * np.array(row_left.axis), np.array(row_right.axis)))
-        for finger_left, finger_right in zip(left.fingers, right.fingers, strict=True)
-        for row_left, row_right in zip(finger_left.joints, finger_right.joints, strict=True)
+    axes = [
+        np.array([joint.axis for finger in RobotHand(side).fingers for joint in finger.joints])
+        for side in ("left", "right")
     ]
-    return np.array(signs, dtype=np.float64)
+    return np.sign(np.einsum("ij,ij->i", -MIRROR_WRIST * axes[0], axes[1]))
 
 
 def mirror_pose_9d(
@@ -107,9 +107,7 @@ def angles(positions: Float32[Tensor, "tokens 3"], head_width: int) -> Float32[T
     return torch.cat(parts, dim=1).float()
 
 
-def rotate(
-    heads: Float[Tensor, "batch heads tokens width"], turn: Float32[Tensor, "tokens n"]
-) -> Float[Tensor, "batch heads tokens width"]:
+def rotate(heads: Heads, turn: Float32[Tensor, "tokens n"]) -> Heads:
     """Turn each pair of values by its angle, in float32."""
     first, second = split_axis(heads.float(), -1, (-1, 2)).unbind(-1)
     cos, sin = turn.cos(), turn.sin()
@@ -158,16 +156,13 @@ class ActionAttention(nn.Module):
         self.to_out = nn.Linear(inner, width, bias=False)
 
     def forward(
-        self,
-        tokens: Float32[Tensor, "batch tokens width"],
-        actions: Float32[Tensor, "batch groups keys width"],
-    ) -> Float32[Tensor, "batch tokens width"]:
+        self, tokens: Tokens, actions: Float32[Tensor, "batch groups keys width"]
+    ) -> Tokens:
         """What the tokens take from their actions; groups are consecutive and of one size."""
         groups = split_axis(self.norm(tokens), 1, (actions.shape[1], -1)).flatten(0, 1)
         query = split_axis(self.to_query(groups), -1, (self.num_heads, -1)).transpose(1, 2)
-        both = split_axis(
-            self.to_key_value(actions.flatten(0, 1)), -1, (2, self.num_heads, -1)
-        ).permute(2, 0, 3, 1, 4)
+        both = split_axis(self.to_key_value(actions.flatten(0, 1)), -1, (2, self.num_heads, -1))
+        both = both.permute(2, 0, 3, 1, 4)
         attended = functional.scaled_dot_product_attention(
             self.query_norm(query), self.key_norm(both[0]), both[1]
         )
@@ -186,7 +181,7 @@ class KeysValues:
 class Text:
     """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
 
-    The words do not depend on the flow time, so that the steps of a sampler can share one object.
+    They do not depend on the flow time, so that the steps of a sampler can share one object.
     """
 
     words: Float[Tensor, "batch words width"]
@@ -209,7 +204,7 @@ class Stream:
     `actions` the action tokens of each group of tokens, for cross-attention.
     """
 
-    tokens: Float[Tensor, "batch tokens width"]
+    tokens: Tokens
     modulation: Float[Tensor, "batch groups 6 width"]
     turn: Float32[Tensor, "tokens angles"] | None = None
     text: Text | None = None
@@ -229,7 +224,7 @@ class Stream:
             if (values := getattr(self, name)) is not None
         }
         first, others = (
-            replace(self, **{name: both[index] for name, both in parts.items()}) for index in (0, 1)
+            replace(self, **{name: both[i] for name, both in parts.items()}) for i in (0, 1)
         )
         return first, others
 
@@ -357,11 +352,7 @@ class JointLayer(nn.Module):
         return seen, self.tactile.finish(tactile, attended[:, num_video:])
 
 
-def modulated_norm(
-    tokens: Float[Tensor, "*batch width"],
-    shift: Float[Tensor, "*batch width"],
-    scale: Float[Tensor, "*batch width"],
-) -> Float[Tensor, "*batch width"]:
+def modulated_norm(tokens: _Rows, shift: _Rows, scale: _Rows) -> _Rows:
     """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
 

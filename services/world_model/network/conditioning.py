@@ -1,10 +1,8 @@
 """Conditions of the experts: flow time, actions, instruction, action kind and scene.
 
 They are vectors that modulate the experts (AdaLN); with `action_conditioning` "cross_attention" the
-actions are tokens instead, which the experts attend to.
-
-Dual rate (equation 4 of the paper): video latent j is conditioned on a[4j-3 … 4j], tactile step t
-on a_t, and index 0 on zeros.
+actions are tokens instead. Dual rate (equation 4 of the paper): video latent j is conditioned on
+a[4j-3 … 4j], tactile step t on a_t, and index 0 on zeros.
 """
 
 import math
@@ -82,9 +80,8 @@ class TimeEmbedding(nn.Module):
     def forward(self, t: Float32[Tensor, "..."]) -> Float32[Tensor, "*batch width"]:
         """Sines and cosines followed by two layers."""
         half = TIME_WIDTH // 2
-        rates = torch.exp(
-            -math.log(1e4) * torch.arange(half, dtype=torch.float32, device=t.device) / half
-        )
+        steps = torch.arange(half, dtype=torch.float32, device=t.device)
+        rates = torch.exp(-math.log(1e4) * steps / half)
         angles = t[..., None] * TIME_RANGE * rates
         return self.project(torch.cat([angles.cos(), angles.sin()], dim=-1))
 
@@ -221,27 +218,20 @@ class SceneEncoder(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv2d(5, 16, 4, stride=2, padding=1),
-            nn.GELU(),
-            nn.Conv2d(16, 24, 4, stride=2, padding=1),
-            nn.GELU(),
-            nn.Conv2d(24, 32, 4, stride=2, padding=1),
-            nn.GELU(),
-            nn.Conv2d(32, 32, 4, stride=2, padding=1),
-            nn.GELU(),
-            nn.AdaptiveAvgPool2d(4),
-            nn.Flatten(),
-            nn.Linear(32 * 16, width),
-        )
+            nn.Conv2d(5, 16, 4, stride=2, padding=1), nn.GELU(),
+            nn.Conv2d(16, 24, 4, stride=2, padding=1), nn.GELU(),
+            nn.Conv2d(24, 32, 4, stride=2, padding=1), nn.GELU(),
+            nn.Conv2d(32, 32, 4, stride=2, padding=1), nn.GELU(),
+            nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(32 * 16, width),
+        )  # fmt: skip
 
     def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch 2 width"]:
         """One vector per hand; the left hand's image is mirrored."""
         image = inputs.first_image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         ends = inputs.raster[:, [0, -1]].transpose(1, 2)
         ends = nn.functional.interpolate(ends.flatten(0, 1), size=image.shape[-2:])
-        views = torch.cat(
-            [image[:, None].expand(-1, 2, -1, -1, -1), split_axis(ends, 0, (-1, 2))], dim=2
-        )
+        both = image[:, None].expand(-1, 2, -1, -1, -1)
+        views = torch.cat([both, split_axis(ends, 0, (-1, 2))], dim=2)
         views = torch.stack([views[:, 0].flip(-1), views[:, 1]], dim=1)
         return split_axis(self.layers(views.flatten(0, 1)), 0, (-1, 2))
 

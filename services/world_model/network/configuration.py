@@ -1,14 +1,18 @@
 """Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.tactile import LayoutDescription
 
 if TYPE_CHECKING:
     import torch
+
+    from dextouch.tactile.layout import TactileLayout
 
 
 Sampler = Literal["euler", "unipc"]
@@ -50,9 +54,7 @@ class WanFiles(FrozenModel):
         default=None, description="folder in which text features of instructions are kept"
     )
     max_memory_gb: float | None = Field(
-        default=None,
-        gt=0,
-        description="limit of memory for the weights of one network; default: what is available",
+        default=None, gt=0, description="limit of memory for one network; default: what there is"
     )
 
     @property
@@ -72,8 +74,7 @@ class WanConfig(FrozenModel):
     vae_decoder_width: int = Field(default=256, ge=1, description="last width of the decoder")
     vae_blocks: int = Field(default=2, ge=1, description="residual blocks per resolution")
     precision: Precision = Field(
-        default="bfloat16",
-        description="of the weights; norms, time embedding and modulation are always float32",
+        default="bfloat16", description="of the weights; norms, times and modulation are float32"
     )
 
     @property
@@ -129,8 +130,7 @@ class NetworkConfig(FrozenModel):
     """Shape and sampling of the joint model; stored in every checkpoint."""
 
     video_expert: Literal["tiny", "wan"] = Field(
-        default="tiny",
-        description="video expert and codec: small ones, or Wan2.2 from --wan.folder",
+        default="tiny", description="video expert and codec: small, or Wan2.2 from --wan.folder"
     )
     image_px: int = Field(default=64, ge=16, le=1024, description="side of the square head image")
     patch_px: int = Field(default=8, description="side of a visual patch")
@@ -146,63 +146,45 @@ class NetworkConfig(FrozenModel):
         default=48, ge=1, le=240, description="latents per palm pad of principal_axes"
     )
     tactile_channels: int = Field(
-        default=192,
-        ge=6,
-        le=1920,
-        multiple_of=6,
-        description="latents per hand of split_hands and grid",
+        default=192, ge=6, le=1920, multiple_of=6, description="latents per hand of learned ones"
     )
     video_width: int = Field(default=96, ge=8, description="width of the visual expert")
     tactile_width: int = Field(default=96, ge=8, description="width of the tactile expert")
     num_layers: int = Field(default=3, ge=1, description="layers of each expert")
     num_heads: int = Field(default=3, ge=1, description="attention heads")
     head_width: int = Field(default=32, ge=4, description="width of an attention head")
-    ffn_ratio: int = Field(
-        default=3, ge=1, description="feed-forward width relative to the expert's width"
-    )
+    ffn_ratio: int = Field(default=3, ge=1, description="feed-forward width per expert's width")
     instruction_encoder: Literal["hashed_words", "subwords"] = Field(
-        default="hashed_words",
-        description="instructions as the mean of hashed words, or as weighted parts of words",
+        default="hashed_words", description="mean of hashed words, or weighted parts of words"
     )
-    num_word_buckets: int = Field(
-        default=64, ge=2, description="hash buckets for words of hashed_words"
-    )
+    num_word_buckets: int = Field(default=64, ge=2, description="buckets of hashed_words")
     word_width: int = Field(default=16, ge=1, description="width of a word embedding")
-    use_touch: bool = Field(
-        default=True, description="predict touch; without it the tactile expert is left out"
-    )
+    use_touch: bool = Field(default=True, description="predict touch, with a tactile expert")
     action_conditioning: Literal["adaln", "cross_attention"] = Field(
-        default="adaln",
-        description="actions enter by the modulation of layer norms, or by cross-attention",
+        default="adaln", description="actions enter by the layer norms, or by cross-attention"
     )
     add_condition_to_tokens: bool = Field(
         default=True, description="add the conditions to the tokens, too"
     )
     use_pose_raster: bool = Field(
-        default=True,
-        description="condition on a raster of the projected hands, too, of 4 cells per token side",
+        default=True, description="condition on a raster of the projected hands, too"
     )
     use_scene_encoder: bool = Field(
-        default=True,
-        description="condition touch on an encoding of the first image and the hands' places, too",
+        default=True, description="condition touch on the first image and the hands' places, too"
     )
     use_contact_geometry: bool = Field(
         default=False,
-        description="condition on the distances of hand points to the boxes of the objects, as "
-        "they lie at a chunk's first step, too; needs episodes with object poses",
+        description="condition on distances of hands to the boxes of objects at a chunk's first "
+        "step, too; needs episodes with object poses",
     )
     prediction: Literal["clean", "velocity"] = Field(
-        default="clean",
-        description="what the network predicts and the loss compares: the clean latents, or the "
-        "flow's velocity",
+        default="clean", description="what is predicted: the clean latents, or the flow's velocity"
     )
     video_target: Literal["residual", "plain"] = Field(
-        default="residual",
-        description="video latents: residuals from the first one, or the latents themselves",
+        default="residual", description="video latents: residuals from the first, or themselves"
     )
     tactile_target: Literal["residual", "plain"] = Field(
-        default="residual",
-        description="tactile latents: residuals from the first ones, or the latents themselves",
+        default="residual", description="tactile latents: residuals from the first, or themselves"
     )
     training_time_shift: float = Field(
         default=5.0, ge=1.0, description="shift of flow-matching times in training"
@@ -212,11 +194,29 @@ class NetworkConfig(FrozenModel):
     )
     sampling_steps: int = Field(default=2, ge=1, le=64, description="network calls per chunk")
     sampler: Sampler = Field(
-        default="euler",
-        description="solver of the flow: unipc needs fewer steps for the same accuracy",
+        default="euler", description="solver of the flow: unipc needs fewer steps"
     )
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
+
+    @property
+    def tactile_layout(self) -> "TactileLayout":
+        """Layout of the taxels that the network feels."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
+        return DEXTOUCH_V1
+
+    def with_layout(self, layout: "TactileLayout") -> "NetworkConfig":
+        """The configuration of a network for the taxels of another glove."""
+        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
+
+        if layout == self.tactile_layout:
+            return self
+        known = {name: getattr(self, name) for name in NetworkConfig.model_fields}
+        if layout == DEXTOUCH_V1:
+            return NetworkConfig.model_construct(self.model_fields_set - {"layout"}, **known)
+        fields_set = self.model_fields_set | {"layout"}
+        return GloveNetworkConfig.model_construct(fields_set, **known, layout=layout)
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
@@ -248,10 +248,9 @@ class NetworkConfig(FrozenModel):
             "prediction": "velocity",
             "video_target": "plain",
         }
+        given = {name: getattr(self, name) for name in expected}
         others = {
-            name: (getattr(self, name), value)
-            for name, value in expected.items()
-            if getattr(self, name) != value
+            name: (given[name], value) for name, value in expected.items() if given[name] != value
         }
         if self.wan is not None and others:
             raise ValueError(f"video_expert wan: got other sizes (got, expected): {others}")
@@ -286,3 +285,16 @@ class NetworkConfig(FrozenModel):
 def num_latents(num_steps: int) -> int:
     """Latent frames of 1 + 4k steps: the first step alone, then groups of four."""
     return 1 + (num_steps - 1) // FRAMES_PER_LATENT
+
+
+class GloveNetworkConfig(NetworkConfig):
+    """Shape of a joint model of a glove other than `dextouch_v1`; training data say its layout."""
+
+    layout: LayoutDescription
+
+    @cached_property
+    def tactile_layout(self) -> "TactileLayout":
+        """Layout of the taxels that the network feels."""
+        from dextouch.tactile.layout import TactileLayout  # not for a parser
+
+        return TactileLayout.model_validate(self.layout.model_dump())

@@ -22,21 +22,17 @@ from services.world_model.network.configuration import Sampler
 
 # Lower bound of training times: velocities divide by them.
 MIN_TIME = 1e-3
-Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 # UniPC's half log-odds of data are infinite at t = 1; the same bound as in diffusers.
 _MAX_TIME = 1.0 - 1e-6
+Latents = Float32[Tensor, "batch ..."]
+Times = Float32[Tensor, " batch"]
+Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Euler:
     """Euler's method, of first order."""
 
-    def step(
-        self,
-        noisy: Float32[Tensor, "batch ..."],
-        guess: Float32[Tensor, "batch ..."],
-        t: float,
-        t_next: float,
-    ) -> Float32[Tensor, "batch ..."]:
+    def step(self, noisy: Latents, guess: Latents, t: float, t_next: float) -> Latents:
         """X + (t' - t) (x - x_0) / t, written so that t' = 0 gives x_0 without rounding."""
         keep = t_next / t
         return keep * noisy + (1.0 - keep) * guess
@@ -55,13 +51,7 @@ class UniPC:
         self._times: list[float] = []
         self._order = 1
 
-    def step(
-        self,
-        noisy: Float32[Tensor, "batch ..."],
-        guess: Float32[Tensor, "batch ..."],
-        t: float,
-        t_next: float,
-    ) -> Float32[Tensor, "batch ..."]:
+    def step(self, noisy: Latents, guess: Latents, t: float, t_next: float) -> Latents:
         """Correct `noisy`, then extrapolate the last two predictions to t_next."""
         if self._start is not None:
             noisy = self._corrected(self._start, guess, t)
@@ -111,37 +101,23 @@ def shift_time(t: Float32[Tensor, " n"], shift: float) -> Float32[Tensor, " n"]:
     return shift * t / (1.0 + (shift - 1.0) * t)
 
 
-def training_times(
-    batch: int, *, shift: float, generator: torch.Generator
-) -> Float32[Tensor, " batch"]:
+def training_times(batch: int, *, shift: float, generator: torch.Generator) -> Times:
     """Random times in (0, 1], biased towards noise, where the actions matter most."""
     return shift_time(torch.rand(batch, generator=generator), shift).clamp_min(MIN_TIME)
 
 
-def add_noise(
-    clean: Float32[Tensor, "batch ..."],
-    noise: Float32[Tensor, "batch ..."],
-    t: Float32[Tensor, " batch"],
-) -> Float32[Tensor, "batch ..."]:
+def add_noise(clean: Latents, noise: Latents, t: Times) -> Latents:
     """x_t = (1 - t) x_0 + t ε; exact at both ends."""
     spread = t.view(-1, *[1] * (clean.ndim - 1))
     return (1.0 - spread) * clean + spread * noise
 
 
-def implied_noise(
-    noisy: Float32[Tensor, "batch ..."],
-    clean: Float32[Tensor, "batch ..."],
-    t: Float32[Tensor, " batch"],
-) -> Float32[Tensor, "batch ..."]:
+def implied_noise(noisy: Latents, clean: Latents, t: Times) -> Latents:
     """The noise from which `noisy` is on the straight path to `clean`; t > 0."""
     return clean + (noisy - clean) / t.view(-1, *[1] * (clean.ndim - 1))
 
 
-def clean_from_velocity(
-    noisy: Float32[Tensor, "batch ..."],
-    velocity: Float32[Tensor, "batch ..."],
-    t: Float32[Tensor, " batch"],
-) -> Float32[Tensor, "batch ..."]:
+def clean_from_velocity(noisy: Latents, velocity: Latents, t: Times) -> Latents:
     """x_0 = x_t - t v."""
     return noisy - t.view(-1, *[1] * (noisy.ndim - 1)) * velocity
 
@@ -153,13 +129,13 @@ def sampling_times(num_steps: int, shift: float) -> Float32[Tensor, " times"]:
 
 def sample(
     denoise: Denoiser,
-    noise: tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]],
+    noise: tuple[Latents, Latents],
     *,
     num_steps: int,
     shift: float,
     sampler: Sampler = "euler",
     stop_after: int | None = None,
-) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
+) -> tuple[Latents, Latents]:
     """Integrate from noise to data, for both streams at once.
 
     `denoise` maps noisy video, noisy touch and times [batch] to predictions of the clean ones. With
@@ -175,9 +151,8 @@ def sample(
     of_video, of_tactile = SOLVERS[sampler](), SOLVERS[sampler]()
     times = sampling_times(num_steps, shift).tolist()
     for t, t_next in islice(pairwise(times), stop_after):
-        guess_video, guess_tactile = denoise(
-            video, tactile, torch.full((len(video),), t, device=video.device)
-        )
+        now = torch.full((len(video),), t, device=video.device)
+        guess_video, guess_tactile = denoise(video, tactile, now)
         video = of_video.step(video, guess_video, t, t_next)
         tactile = of_tactile.step(tactile, guess_tactile, t, t_next)
     return video, tactile

@@ -30,7 +30,7 @@ from dextouch.hands.actions import (
 )
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, ActionKind
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import (
     SAMPLE_OFFSETS,
     SLOT_SIZE,
@@ -87,9 +87,8 @@ def contact_geometry(
 ) -> Float32[np.ndarray, "time 2 size"]:
     """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object.
 
-    They are those of the state model's core, for the objects as they lie at the first step of a
-    window: millimetres decide contact, which pixels of a centimetre and actions relative to each
-    hand's own start do not show.
+    They are those of the state model's core, for objects as they lie at a window's first step:
+    millimetres decide contact, which neither pixels of a centimetre nor actions show.
     """
     points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]
     steps = len(points_m)
@@ -170,7 +169,7 @@ class PredictionRequest:
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
-    first_tactile_kpa: Float32[np.ndarray, "2 320"]
+    first_tactile_kpa: Float32[np.ndarray, "2 taxels"]
     actions: Float64[np.ndarray, "time 67"]
     action_kind: ActionKind
     instruction: str
@@ -184,7 +183,7 @@ class ModelInputs:
     """Batched tensors of requests in physical units; normalized inside the network."""
 
     first_image: UInt8[Tensor, "batch px px 3"]
-    first_tactile_kpa: Float32[Tensor, "batch 2 320"]
+    first_tactile_kpa: Float32[Tensor, "batch 2 taxels"]
     hands: Float32[Tensor, "batch time 2 29"]
     camera: Float32[Tensor, "batch time 2 9"]
     layout: Float32[Tensor, "batch 2 9"]
@@ -228,38 +227,34 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         raise ShapeError(
             f"model input: got windows of {sorted(lengths)} steps in one batch, expected one length"
         )
+    kinds = [r.action_kind for r in requests]
+    if unknown := set(kinds) - set(ACTION_KINDS):
+        raise UnknownNameError("action kind", unknown.pop(), list(ACTION_KINDS))
     actions = np.stack(checked)
     anchors = np.stack([_checked_anchor(r.anchor) for r in requests])
     K_head = np.stack([_checked_camera(r.K_head) for r in requests])
     raster = pose_raster(
         actions, anchors, K_head, image_px=config.image_px, cells=config.raster_cells
     )
+    # A network that does not use contact geometry has no features of it.
+    geometry = np.zeros((*actions.shape[:2], 2, 0), dtype=np.float32)
+    if config.use_contact_geometry:
+        each = zip(requests, actions, strict=True)
+        geometry = np.stack([contact_geometry(row, r.anchor, r.objects) for r, row in each])
     return ModelInputs(
         first_image=torch.from_numpy(np.stack([_checked_image(r, config) for r in requests])),
-        first_tactile_kpa=torch.from_numpy(np.stack([_checked_tactile(r) for r in requests])),
-        hands=_float_tensor(hand_features(actions)),
-        camera=_float_tensor(camera_features(actions)),
-        layout=_float_tensor(_hand_layout(anchors)),
+        first_tactile_kpa=torch.from_numpy(
+            np.stack([_checked_tactile(r, config.tactile_layout) for r in requests])
+        ),
+        hands=torch.from_numpy(hand_features(actions).astype(np.float32)),
+        camera=torch.from_numpy(camera_features(actions).astype(np.float32)),
+        layout=torch.from_numpy(_hand_layout(anchors).astype(np.float32)),
         raster=torch.from_numpy(raster),
-        geometry=torch.from_numpy(_geometry(requests, actions, config)),
-        commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
+        geometry=torch.from_numpy(geometry),
+        commanded=torch.tensor([float(kind == "commanded") for kind in kinds]),
         words=torch.stack([instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
     )
-
-
-def _geometry(
-    requests: Sequence[PredictionRequest], actions: np.ndarray, config: NetworkConfig
-) -> Float32[np.ndarray, "batch time 2 features"]:
-    """Contact geometry of every step; no features for a network that does not use it."""
-    if not config.use_contact_geometry:
-        return np.zeros((*actions.shape[:2], 2, 0), dtype=np.float32)
-    each = zip(requests, actions, strict=True)
-    return np.stack([contact_geometry(rows, one.anchor, one.objects) for one, rows in each])
-
-
-def _float_tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(values.astype(np.float32))
 
 
 def _hand_layout(anchors: np.ndarray) -> Float64[np.ndarray, "batch 2 9"]:
@@ -342,10 +337,13 @@ def _checked_image(request: PredictionRequest, config: NetworkConfig) -> np.ndar
     return image
 
 
-def _checked_tactile(request: PredictionRequest) -> np.ndarray:
+def _checked_tactile(request: PredictionRequest, layout: TactileLayout) -> np.ndarray:
     tactile = np.asarray(request.first_tactile_kpa, dtype=np.float32)
-    if tactile.shape != (2, NUM_TAXELS):
-        raise ShapeError(f"first touch: got shape {tactile.shape}, expected [2, {NUM_TAXELS}]")
+    if tactile.shape != (2, layout.num_taxels):
+        raise ShapeError(
+            f"first touch: got shape {tactile.shape}, expected [2, {layout.num_taxels}] of the "
+            f"glove layout {layout.name!r}, which the model was trained with"
+        )
     if not np.isfinite(tactile).all():
         raise NonFiniteError("first touch: contains NaN or infinity; mask the faulty taxels first")
     if tactile.max() > MAX_PRESSURE_KPA:
@@ -353,9 +351,3 @@ def _checked_tactile(request: PredictionRequest) -> np.ndarray:
             f"first touch: got {tactile.max():.3g} kPa, expected at most {MAX_PRESSURE_KPA:.0e}"
         )
     return tactile
-
-
-def _is_commanded(action_kind: str) -> bool:
-    if action_kind not in ACTION_KINDS:
-        raise UnknownNameError("action kind", action_kind, list(ACTION_KINDS))
-    return action_kind == "commanded"

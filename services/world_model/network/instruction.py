@@ -1,9 +1,9 @@
 """Text instructions as inputs of the network: words in a hashed table, or features of UMT5.
 
 Words, or their parts, are hashed, so that any text is accepted without a vocabulary. Entries start
-at zero: words that were not trained on have no effect. The full size takes the features of a text
-encoder, which are computed once for each instruction and kept in memory, in the checkpoint and, if
-a folder is given, on disk, so that serving known instructions needs no text encoder.
+at zero: words that were not trained on have no effect. At full size, the features of a text encoder
+are computed once for each instruction, and kept in memory, in the checkpoint and, if a folder is
+given, on disk, so that serving known instructions needs no text encoder.
 """
 
 import hashlib
@@ -18,8 +18,8 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.networks.subwords import MAX_SUBWORDS, WORD, subwords
 from services.networks.weight_files import read_tensors, write_tensors
+from services.world_model.dynamics.features import MAX_SUBWORDS, WORD, subwords
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 
 MAX_WORDS = 16
@@ -106,22 +106,17 @@ class TextEncoder:
             str(folder / TOKENIZER_FOLDER), local_files_only=True
         )
         self._encoder: Any = UMT5EncoderModel.from_pretrained(
-            str(folder / ENCODER_FOLDER),
-            local_files_only=True,
-            use_safetensors=True,
+            str(folder / ENCODER_FOLDER), local_files_only=True, use_safetensors=True,
             dtype=config.dtype,
-        ).eval()
+        ).eval()  # fmt: skip
 
     @torch.no_grad()
     def encode(self, text: str) -> Float[Tensor, "words width"]:
         """Features of the text's words and end mark, at most `text_tokens` of them."""
         words = self._tokenizer(
-            [text],
-            max_length=self._config.text_tokens,
-            truncation=True,
-            return_attention_mask=True,
-            return_tensors="pt",
-        )
+            [text], max_length=self._config.text_tokens, truncation=True,
+            return_attention_mask=True, return_tensors="pt",
+        )  # fmt: skip
         features: Tensor = self._encoder(words.input_ids, words.attention_mask).last_hidden_state
         return features[0]
 

@@ -97,7 +97,7 @@ class Prediction:
     """Future after the first step; images of all its steps, or of the last four only."""
 
     images: Float32[Tensor, "batch shown px px 3"]
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
 
 
 class JointWorldModel(nn.Module):
@@ -112,16 +112,14 @@ class JointWorldModel(nn.Module):
         # Small parts and those of Wan2.2 have the same methods. The latter are on the meta device
         # until their weights are loaded.
         wan = config.wan
-        transformer: Any = (
-            None
-            if wan is None
-            else empty_transformer(
+        transformer: Any = None
+        if wan is not None:
+            transformer = empty_transformer(
                 wan,
                 num_layers=config.num_layers,
                 num_heads=config.num_heads,
                 head_width=config.head_width,
             )
-        )
         self.codec: VisualCodec | WanVideoCodec = (
             VisualCodec(config) if wan is None else WanVideoCodec(wan)
         )
@@ -140,9 +138,8 @@ class JointWorldModel(nn.Module):
         )
         self.tactile: TactileExpert | None = None
         if config.use_touch:
-            self.tactile = TactileExpert(
-                config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
-            )
+            tokens, channels = self.tokenizer.num_tokens, self.tokenizer.channels
+            self.tactile = TactileExpert(config, num_tokens=tokens, channels=channels)
         self.layers = nn.ModuleList(
             JointLayer(
                 ExpertBlock(config, config.video_width)
@@ -167,7 +164,8 @@ class JointWorldModel(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "JointWorldModel":  # noqa: FBT001, FBT002
         """Move or convert the weights; codecs, conditions and norms keep their precision."""
         tensors = (*self.named_parameters(), *self.named_buffers())
-        kept = {name: tensor.data for name, tensor in tensors if _keeps_precision(name)}
+        parts = {name: any(part in name for part in FLOAT32_PARTS) for name, _ in tensors}
+        kept = {n: one.data for n, one in tensors if n.startswith(_EXACT_PARTS) or parts[n]}
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         for name, tensor in (*self.named_parameters(), *self.named_buffers()):
             if name in kept and tensor.dtype != kept[name].dtype:
@@ -184,7 +182,7 @@ class JointWorldModel(nn.Module):
     def targets(
         self,
         images: UInt8[Tensor, "batch time px px 3"],
-        tactile_kpa: Float32[Tensor, "batch time 2 320"],
+        tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
     ) -> JointLatents:
         """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
 
@@ -196,7 +194,7 @@ class JointWorldModel(nn.Module):
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
 
     def tactile_targets(
-        self, tactile_kpa: Float32[Tensor, "batch time 2 320"]
+        self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
         """Clean tactile latents; as `targets`."""
         tactile = self.tokenizer.encode(tactile_kpa)
@@ -283,12 +281,12 @@ class JointWorldModel(nn.Module):
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
         """Mask by which clean tokens (first latent frame and touch) attend to each other only."""
         per_latent = self.config.tokens_per_latent
-        is_clean_video = torch.arange(num_latents(num_steps) * per_latent) < per_latent
-        if not self.config.use_touch:
-            return clean_mask(is_clean_video)
-        per_step = 2 * self.tokenizer.num_tokens
-        is_clean_tactile = torch.arange(num_steps * per_step) < per_step
-        return clean_mask(torch.cat([is_clean_video, is_clean_tactile]))
+        is_clean = torch.arange(num_latents(num_steps) * per_latent) < per_latent
+        if self.config.use_touch:
+            per_step = 2 * self.tokenizer.num_tokens
+            of_touch = torch.arange(num_steps * per_step) < per_step
+            is_clean = torch.cat([is_clean, of_touch])
+        return clean_mask(is_clean)
 
     def noise(self, num_steps: int, generator: torch.Generator) -> JointLatents:
         """Noise for one chunk of one rollout; stack several for a batch."""
@@ -346,10 +344,9 @@ class JointWorldModel(nn.Module):
             with products_in(precision, device.type):
                 noisy = JointLatents(video, tactile)
                 # Weights that are sharded over processes are there in `forward` only.
-                if kept is None:
-                    guess = self(inputs, first, noisy, t)
-                else:
-                    guess = self.denoise(kept, noisy, t)
+                guess = (
+                    self(inputs, first, noisy, t) if kept is None else self.denoise(kept, noisy, t)
+                )
             found = guess.video.float(), guess.tactile.float()
             if self.config.prediction == "clean":
                 return found
@@ -386,11 +383,6 @@ class JointWorldModel(nn.Module):
             tactile = torch.zeros_like(tactile)
         images = self.codec.decode_future(video, all_images=all_images)
         return Prediction(images, self.tokenizer.decode(tactile))
-
-
-def _keeps_precision(name: str) -> bool:
-    """Whether a tensor keeps its precision when the experts are converted."""
-    return name.startswith(_EXACT_PARTS) or any(part in name for part in FLOAT32_PARTS)
 
 
 @contextmanager

@@ -10,15 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from dextouch.tactile.layout import (
-    NUM_FINGERTIPS,
-    NUM_TAXELS,
-    NUM_TIP_TAXELS,
-    PALM_SHAPE,
-    TIP_SHAPE,
-    join_pads,
-)
-from services.networks.principal_axes import principal_axes, root_pressure, root_scale
+from dextouch.tactile import PADS
+from dextouch.tactile.layout import TactileLayout
+from services.world_model.dynamics.features import principal_axes, root_pressure, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Stream,
@@ -31,11 +25,12 @@ from services.world_model.network.attention import (
 from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 
+Pressures = Float32[Tensor, "*batch taxels"]
+Latents = Float32[Tensor, "*batch tokens channels"]
 NUM_PADS = 6
 # Amplitude of palms relative to that of tips; the best value in an ablation on touch.
 PALM_SCALE = 0.7
-CANVAS_SHAPE = (20, 20)
-_PALM_COLUMN = 2
+_CANVAS_MULTIPLE = 4
 # For checkpoints without a stored training peak: twice the peak of eight demonstrations of the
 # twin's first two tasks.
 UNKNOWN_PEAK_KPA = 200.0
@@ -57,74 +52,62 @@ class TactileTokenizer(nn.Module, ABC):
         self.register_buffer("peak_kpa", torch.full((), UNKNOWN_PEAK_KPA))
 
     @abstractmethod
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit what follows from training touch in closed form, including `peak_kpa`."""
 
     @abstractmethod
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
-    ) -> Float32[Tensor, "*batch tokens channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
 
     @abstractmethod
-    def decode(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
 
     def bounded(
         self,
-        tactile_kpa: Float32[Tensor, "batch steps 2 320"],
-        first_kpa: Float32[Tensor, "batch 2 320"],
-    ) -> Float32[Tensor, "batch steps 2 320"]:
+        tactile_kpa: Float32[Tensor, "batch steps 2 taxels"],
+        first_kpa: Float32[Tensor, "batch 2 taxels"],
+    ) -> Float32[Tensor, "batch steps 2 taxels"]:
         """Clip decoded pressures to the larger of the training peak and the first touch's peak."""
         highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
 
 
 class LearnedTokenizer(TactileTokenizer):
-    """Autoencoder of root pressures in units of their root mean square.
-
-    `dextouch train tokenizer` trains one.
-    """
+    """Autoencoder of root pressures in units of their root mean square (`train tokenizer`)."""
 
     root_scale: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         num_tokens = NUM_PADS if config.tactile_tokens == "pad" else 1
         super().__init__(num_tokens=num_tokens, channels=config.tactile_channels // num_tokens)
+        self._num_taxels = config.tactile_layout.num_taxels
         self.register_buffer("root_scale", torch.ones(()))
 
     @abstractmethod
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of scaled root pressures."""
 
     @abstractmethod
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Scaled root pressures of latents; values may be below zero."""
 
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit the scale and `peak_kpa`; the weights are learned by gradient."""
         self.root_scale.copy_(root_pressure(tactile_kpa).square().mean().sqrt().clamp_min(1e-3))
         self.peak_kpa.copy_(tactile_kpa.max())
 
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
-    ) -> Float32[Tensor, "*batch tokens channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
-        roots = root_pressure(tactile_kpa).reshape(-1, NUM_TAXELS) / self.root_scale
+        roots = root_pressure(tactile_kpa).reshape(-1, self._num_taxels) / self.root_scale
         latents = self.encode_roots(roots)
         return latents.reshape(*tactile_kpa.shape[:-1], self.num_tokens, self.channels)
 
-    def decode(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
         return self.roots(latents).clamp_min(0.0).square()
 
-    def roots(
-        self, latents: Float32[Tensor, "*batch tokens channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    def roots(self, latents: Latents) -> Pressures:
         """Root pressures (√kPa), which the loss compares; values may be below zero."""
         flat = latents.reshape(-1, self.num_tokens * self.channels)
         return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
@@ -169,16 +152,11 @@ class MapEncoder(nn.Module):
         super().__init__()
         self.first = _convolution(1, shape.width)
         self.position = nn.Parameter(torch.zeros(shape.width, shape.rows, shape.columns))
-        strides = [2] * shape.num_halvings or [1]
-        self.deeper = nn.Sequential(
-            *(
-                layer
-                for stride in strides
-                for layer in (_convolution(shape.width, shape.width, stride=stride), nn.GELU())
-            ),
-            nn.Flatten(),
-            nn.Linear(shape.num_features, shape.hidden, bias=False),
-        )
+        layers: list[nn.Module] = []
+        for stride in [2] * shape.num_halvings or [1]:
+            layers += [_convolution(shape.width, shape.width, stride=stride), nn.GELU()]
+        features = nn.Linear(shape.num_features, shape.hidden, bias=False)
+        self.deeper = nn.Sequential(*layers, nn.Flatten(), features)
         self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
         self.to_latents = nn.Linear(shape.hidden, shape.channels, bias=False)
 
@@ -200,18 +178,11 @@ class MapDecoder(nn.Module):
         self.from_latents = nn.Linear(shape.channels, shape.hidden, bias=False)
         self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
         self.to_features = nn.Linear(shape.hidden, shape.num_features, bias=False)
-        self.deeper = nn.Sequential(
-            nn.GELU(),
-            *(
-                layer
-                for _ in range(shape.num_halvings - 1)
-                for layer in (
-                    nn.Upsample(scale_factor=2),
-                    _convolution(shape.width, shape.width),
-                    nn.GELU(),
-                )
-            ),
-        )
+        layers: list[nn.Module] = [nn.GELU()]
+        for _ in range(shape.num_halvings - 1):
+            convolution = _convolution(shape.width, shape.width)
+            layers += [nn.Upsample(scale_factor=2), convolution, nn.GELU()]
+        self.deeper = nn.Sequential(*layers)
         # The last doubling of the resolution writes four cells per feature.
         factor = 2 if shape.num_halvings else 1
         rows, columns = (n * 2**shape.num_halvings // factor for n in shape.lowest)
@@ -235,46 +206,60 @@ def _convolution(in_width: int, out_width: int, *, stride: int = 1) -> nn.Conv2d
     return nn.Conv2d(in_width, out_width, 3, stride=stride, padding=1, bias=False)
 
 
-def canvas_cells() -> np.ndarray:
-    """Cell of the canvas, counted row by row, of each of the 320 taxels.
+def canvas_cells(layout: TactileLayout) -> tuple[np.ndarray, tuple[int, int]]:
+    """Cell of the canvas, counted row by row, of each taxel, and the canvas' rows and columns.
 
-    Rows 0 to 3 hold the fingertips side by side, thumb to little finger in columns 0 to 19. Rows 4
-    to 18 hold the palm in columns 2 to 17. The other 80 cells are empty. Inside every pad rows run
+    The fingers are side by side in the top rows, thumb to little finger, and the palm is below,
+    in the middle. Of `dextouch_v1` the fingertips fill columns 0 to 19 of rows 0 to 3, the palm
+    columns 2 to 17 of rows 4 to 18, and 80 of the 400 cells are empty. Inside every pad rows run
     from distal to proximal and columns from radial to ulnar.
     """
-    cells = np.arange(CANVAS_SHAPE[0] * CANVAS_SHAPE[1]).reshape(CANVAS_SHAPE)
-    rows, columns = TIP_SHAPE
-    tips = [cells[:rows, columns * finger :][:, :columns] for finger in range(NUM_FINGERTIPS)]
-    palm = cells[rows : rows + PALM_SHAPE[0], _PALM_COLUMN : _PALM_COLUMN + PALM_SHAPE[1]]
-    return join_pads(np.stack(tips), palm)
+    fingers, palm = layout.fingers, layout.palm
+    palm_shape = (0, 0) if palm is None else palm.shape
+    finger_rows = max((pad.rows for pad in fingers), default=0)
+    width = max(sum(pad.columns for pad in fingers), palm_shape[1])
+    # Whole cells at the lowest resolution, a quarter of the canvas'.
+    sizes = (finger_rows + palm_shape[0], width)
+    shape = tuple(-(-size // _CANVAS_MULTIPLE) * _CANVAS_MULTIPLE for size in sizes)
+    cells = np.arange(shape[0] * shape[1]).reshape(shape)
+    places, column = [], 0
+    for pad in fingers:
+        places.append(cells[: pad.rows, column : column + pad.columns].ravel())
+        column += pad.columns
+    if palm is not None:
+        left = (width - palm.columns) // 2
+        block = cells[finger_rows : finger_rows + palm.rows, left : left + palm.columns]
+        places.append(block.ravel())
+    return np.concatenate(places), (shape[0], shape[1])
 
 
 class GridTokenizer(LearnedTokenizer):
     """One autoencoder for palm and fingertips on one canvas, the paper's baseline.
 
-    It has as many weights and latents as Split-Hands. The canvas makes neighbours of taxels that
-    are far apart on the hand.
+    It has as many weights as Split-Hands; taxels far apart on the hand are neighbours on it.
     """
 
     _cells: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
+        cells, self._canvas_shape = canvas_cells(config.tactile_layout)
         # The most accurate of three sizes with as many weights as Split-Hands.
         shape = MapShape(
-            *CANVAS_SHAPE, num_maps=1, channels=config.tactile_channels, width=24, hidden=90,
+            *self._canvas_shape, num_maps=1, channels=config.tactile_channels, width=24, hidden=90,
             num_halvings=2,
         )  # fmt: skip
         self.encoder, self.decoder = MapEncoder(shape), MapDecoder(shape)
-        self.register_buffer("_cells", torch.from_numpy(canvas_cells()), persistent=False)
+        self.register_buffer("_cells", torch.from_numpy(cells), persistent=False)
 
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of the canvas."""
-        canvas = roots.new_zeros(len(roots), CANVAS_SHAPE[0] * CANVAS_SHAPE[1])
+        rows, columns = self._canvas_shape
+        canvas = roots.new_zeros(len(roots), rows * columns)
         canvas[:, self._cells] = roots
-        return self.encoder(canvas.reshape(-1, 1, *CANVAS_SHAPE)).flatten(1)
+        return self.encoder(canvas.reshape(-1, 1, rows, columns)).flatten(1)
 
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Root pressures at the taxels' cells."""
         return self.decoder(latents[:, None]).flatten(1)[:, self._cells]
 
@@ -289,74 +274,87 @@ class SplitHandsTokenizer(LearnedTokenizer):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        channels = config.tactile_channels // NUM_PADS
+        layout, channels = config.tactile_layout, config.tactile_channels // NUM_PADS
+        shapes = {pad.shape for pad in layout.fingers}
+        if len(layout.pads) != len(PADS) or len(shapes) != 1 or layout.palm is None:
+            raise InvalidInputError(
+                f"tokenizer split_hands: got layout {layout.name!r} with pads "
+                f"{[(pad.part, *pad.shape) for pad in layout.pads]}, expected five fingers of one "
+                "shape and a palm; train with --tokenizer grid"
+            )
+        self._tip_shape, self._palm_shape = shapes.pop(), layout.palm.shape
+        self._num_fingers = len(layout.fingers)
+        self._num_finger_taxels = layout.num_finger_taxels
         tip = MapShape(
-            *TIP_SHAPE, num_maps=NUM_FINGERTIPS, channels=channels, width=16, hidden=64,
+            *self._tip_shape, num_maps=self._num_fingers, channels=channels, width=16, hidden=64,
             num_halvings=0,
         )  # fmt: skip
         palm = MapShape(
-            *PALM_SHAPE, num_maps=1, channels=channels, width=24, hidden=128, num_halvings=2
+            *self._palm_shape, num_maps=1, channels=channels, width=24, hidden=128, num_halvings=2
         )
         self.tip_encoder, self.tip_decoder = MapEncoder(tip), MapDecoder(tip)
         self.palm_encoder, self.palm_decoder = MapEncoder(palm), MapDecoder(palm)
 
-    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+    def encode_roots(self, roots: Float32[Tensor, "n taxels"]) -> Float32[Tensor, "n latents"]:
         """Latents of the five fingertips, then of the palm."""
-        tips = split_axis(roots[:, :NUM_TIP_TAXELS], 1, (NUM_FINGERTIPS, *TIP_SHAPE))
-        palm = split_axis(roots[:, NUM_TIP_TAXELS:], 1, (1, *PALM_SHAPE))
+        first = self._num_finger_taxels
+        tips = split_axis(roots[:, :first], 1, (self._num_fingers, *self._tip_shape))
+        palm = split_axis(roots[:, first:], 1, (1, *self._palm_shape))
         return torch.cat([self.tip_encoder(tips), self.palm_encoder(palm)], dim=1).flatten(1)
 
-    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n taxels"]:
         """Root pressures of the five fingertips, then of the palm."""
         pads = split_axis(latents, 1, (NUM_PADS, -1))
-        tips = self.tip_decoder(pads[:, :NUM_FINGERTIPS]).flatten(1)
-        return torch.cat([tips, self.palm_decoder(pads[:, NUM_FINGERTIPS:]).flatten(1)], dim=1)
+        tips = self.tip_decoder(pads[:, : self._num_fingers]).flatten(1)
+        palm = self.palm_decoder(pads[:, self._num_fingers :]).flatten(1)
+        return torch.cat([tips, palm], dim=1)
 
 
 class PrincipalAxesTokenizer(TactileTokenizer):
-    """Tips as they are and palms along their principal axes, as one token, in closed form.
-
-    Fitted in a second, it loses little touch, but learns nothing about the hand.
-    """
+    """Tips as they are and palms along their principal axes, as one token, in closed form."""
 
     tip_scale: Tensor
     palm_basis: Tensor
     palm_scale: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__(num_tokens=1, channels=NUM_TIP_TAXELS + config.palm_channels)
-        num_palm = NUM_TAXELS - NUM_TIP_TAXELS
+        layout = config.tactile_layout
+        num_tips = layout.num_finger_taxels
+        num_palm = layout.num_taxels - layout.num_finger_taxels
+        if config.use_touch and config.palm_channels > num_palm:
+            raise InvalidInputError(
+                f"tokenizer principal_axes: got palm_channels {config.palm_channels} for layout "
+                f"{layout.name!r}, expected at most {num_palm}, the taxels of its palm"
+            )
+        super().__init__(num_tokens=1, channels=num_tips + config.palm_channels)
+        self._num_tips = num_tips
         self.register_buffer("tip_scale", torch.ones(()))
         self.register_buffer("palm_basis", torch.eye(num_palm, config.palm_channels))
         self.register_buffer("palm_scale", torch.ones(config.palm_channels))
 
-    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 taxels"]) -> None:
         """Fit scales and palm axes to training touch (both hands alike)."""
         roots = root_pressure(tactile_kpa).double()
-        palms = roots[..., NUM_TIP_TAXELS:].reshape(-1, NUM_TAXELS - NUM_TIP_TAXELS)
+        palms = roots[..., self._num_tips :].reshape(-1, len(self.palm_basis))
         # Not centred: the mean touch is not a touch that occurs.
         basis, rms = principal_axes(palms.T @ palms / len(palms), self.palm_basis.shape[1])
-        tips_rms = roots[..., :NUM_TIP_TAXELS].square().mean().sqrt()
+        tips_rms = roots[..., : self._num_tips].square().mean().sqrt()
         self.palm_basis.copy_(basis)
         self.palm_scale.copy_(root_scale(rms) * PALM_SCALE)
         self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
         self.peak_kpa.copy_(tactile_kpa.max())
 
-    def encode(
-        self, tactile_kpa: Float32[Tensor, "*batch 320"]
-    ) -> Float32[Tensor, "*batch 1 channels"]:
+    def encode(self, tactile_kpa: Pressures) -> Latents:
         """Latents; pressures below zero count as zero."""
         roots = root_pressure(tactile_kpa)
-        tips = roots[..., :NUM_TIP_TAXELS] / self.tip_scale
-        palm = (roots[..., NUM_TIP_TAXELS:] @ self.palm_basis) / self.palm_scale
+        tips = roots[..., : self._num_tips] / self.tip_scale
+        palm = (roots[..., self._num_tips :] @ self.palm_basis) / self.palm_scale
         return torch.cat([tips, palm], dim=-1)[..., None, :]
 
-    def decode(
-        self, latents: Float32[Tensor, "*batch 1 channels"]
-    ) -> Float32[Tensor, "*batch 320"]:
+    def decode(self, latents: Latents) -> Pressures:
         """Pressures in kPa, never below zero."""
-        tips = latents[..., 0, :NUM_TIP_TAXELS] * self.tip_scale
-        palm = (latents[..., 0, NUM_TIP_TAXELS:] * self.palm_scale) @ self.palm_basis.T
+        tips = latents[..., 0, : self._num_tips] * self.tip_scale
+        palm = (latents[..., 0, self._num_tips :] * self.palm_scale) @ self.palm_basis.T
         return torch.cat([tips, palm], dim=-1).clamp_min(0.0).square()
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.networks.principal_axes import principal_axes, root_scale
+from services.world_model.dynamics.features import principal_axes, root_scale
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Block,
@@ -48,6 +48,13 @@ if TYPE_CHECKING:
     from diffusers import AutoencoderKLWan, WanTransformer3DModel
 
 
+Latents = Float32[Tensor, "batch latents tokens channels"]
+Images = Float32[Tensor, "batch time px px 3"]
+_Raster = Float32[Tensor, "batch time 2 cells cells"]
+_Shown = Float32[Tensor, "batch shown px px 3"]
+_Patches = Float32[Tensor, "batch latents rows cols values"]
+
+
 class VideoExpert(nn.Module):
     """Visual stream: `tokens_per_latent` tokens per latent frame; the first frame is clean."""
 
@@ -70,10 +77,10 @@ class VideoExpert(nn.Module):
 
     def start(
         self,
-        noisy: Float32[Tensor, "batch latents tokens channels"],
+        noisy: Latents,
         first: Float32[Tensor, "batch tokens channels"],
         condition: Condition,
-        raster: Float32[Tensor, "batch time 2 cells cells"],
+        raster: _Raster,
     ) -> Stream:
         """Tokens before the first layer.
 
@@ -92,22 +99,15 @@ class VideoExpert(nn.Module):
         per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
         return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
 
-    def finish(
-        self, stream: Stream, condition: Condition
-    ) -> Float32[Tensor, "batch latents tokens channels"]:
+    def finish(self, stream: Stream, condition: Condition) -> Latents:
         """Predict the clean latents, or the velocity, as the configuration says."""
         condition = condition.to(self.places.dtype)
         tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], -1))
-        shift, scale = (
-            self.modulate_out(condition.vector)[:, :, None]
-            .expand(-1, -1, tokens.shape[2], -1)
-            .chunk(2, dim=-1)
-        )
+        ends = self.modulate_out(condition.vector)[:, :, None]
+        shift, scale = ends.expand(-1, -1, tokens.shape[2], -1).chunk(2, dim=-1)
         return self.predict(modulated_norm(tokens, shift, scale)).float()
 
-    def raster_tokens(
-        self, raster: Float32[Tensor, "batch time 2 cells cells"]
-    ) -> Float32[Tensor, "batch latents tokens values"]:
+    def raster_tokens(self, raster: _Raster) -> Float32[Tensor, "batch latents tokens values"]:
         """The raster cut into image tokens: four steps, four by four cells and two hands each."""
         groups = _by_latent(raster)
         cells = (self.tokens_across, RASTER_CELLS_PER_TOKEN)
@@ -119,9 +119,8 @@ class VideoExpert(nn.Module):
 class VisualCodec(nn.Module):
     """Linear tokenizer of 1 + 4k images by principal axes of 8×8×4 patches, in closed form.
 
-    The first image forms a group of its own (repeated four times), followed by groups of four, as
-    in causal video autoencoders. A token covers two by two patches of one latent frame. It is
-    fitted once on training images, then frozen in the checkpoint.
+    The first image forms a group of its own (repeated four times), followed by groups of four. A
+    token covers two by two patches of one latent frame. Frozen once fitted on training images.
     """
 
     mean: Tensor
@@ -155,16 +154,12 @@ class VisualCodec(nn.Module):
         self.basis.copy_(basis)
         self.scale.copy_(root_scale(rms))
 
-    def encode(
-        self, images: Float32[Tensor, "batch time px px 3"]
-    ) -> Float32[Tensor, "batch latents tokens channels"]:
+    def encode(self, images: Images) -> Latents:
         """Latents of images in 0 … 1; time is 1 + 4k."""
         coded = ((self._patches(images) - self.mean) @ self.basis) / self.scale
         return _tokens_of(coded)
 
-    def decode(
-        self, latents: Float32[Tensor, "batch latents tokens channels"]
-    ) -> Float32[Tensor, "batch time px px 3"]:
+    def decode(self, latents: Latents) -> Images:
         """Images in 0 … 1; the first latent gives one image, the others four each."""
         coded = _patches_of(latents)
         patches = (coded * self.scale) @ self.basis.T + self.mean
@@ -174,9 +169,7 @@ class VisualCodec(nn.Module):
         first = images[:, 0].mean(dim=1, keepdim=True)
         return torch.cat([first, images[:, 1:].flatten(1, 2)], dim=1).clamp(0.0, 1.0)
 
-    def decode_future(
-        self, latents: Float32[Tensor, "batch latents tokens channels"], *, all_images: bool
-    ) -> Float32[Tensor, "batch shown px px 3"]:
+    def decode_future(self, latents: Latents, *, all_images: bool) -> _Shown:
         """Images after the first, or those of the last latent only.
 
         The last latent is decoded separately, so that its images are bit-identical whether or not
@@ -187,9 +180,7 @@ class VisualCodec(nn.Module):
             images = torch.cat([self.decode(latents[:, :-1])[:, 1:], images], dim=1)
         return images
 
-    def _patches(
-        self, images: Float32[Tensor, "batch time px px 3"]
-    ) -> Float32[Tensor, "batch latents rows cols values"]:
+    def _patches(self, images: Images) -> _Patches:
         groups = _by_latent(images)
         grid = split_axis(split_axis(groups, 4, (-1, self.patch_px)), 3, (-1, self.patch_px))
         # [B, L, 4, rows, p, cols, p, 3] -> [B, L, rows, cols, 4, p, p, 3]
@@ -202,18 +193,14 @@ def _by_latent(steps: Float32[Tensor, "batch time ..."]) -> Float32[Tensor, "bat
     return split_axis(torch.cat([first, steps[:, 1:]], dim=1), 1, (-1, FRAMES_PER_LATENT))
 
 
-def _tokens_of(
-    patches: Float32[Tensor, "batch latents rows cols channels"],
-) -> Float32[Tensor, "batch latents tokens values"]:
+def _tokens_of(patches: _Patches) -> Latents:
     """Two by two patches as one token, row by row."""
     across = (patches.shape[2] // 2, 2)
     grid = split_axis(split_axis(patches, 3, across), 2, across).transpose(3, 4)
     return grid.flatten(4).flatten(2, 3)
 
 
-def _patches_of(
-    tokens: Float32[Tensor, "batch latents tokens values"],
-) -> Float32[Tensor, "batch latents rows cols channels"]:
+def _patches_of(tokens: Latents) -> _Patches:
     """Inverse of `_tokens_of`."""
     across = math.isqrt(tokens.shape[2])
     grid = split_axis(split_axis(tokens, 2, (across, across)), 4, (2, 2, -1))
@@ -245,9 +232,7 @@ class WanVideoCodec(nn.Module):
         """Do nothing: the autoencoder is pretrained."""
 
     @torch.no_grad()
-    def encode(
-        self, images: Float32[Tensor, "batch time px px 3"]
-    ) -> Float32[Tensor, "batch latents tokens channels"]:
+    def encode(self, images: Images) -> Latents:
         """Latents of images in 0 … 1; time is 1 + 4k."""
         pixels = images.permute(0, 4, 1, 2, 3) * 2.0 - 1.0
         # The mean of the encoder's distribution, not a sample of it.
@@ -256,18 +241,14 @@ class WanVideoCodec(nn.Module):
         return _tokens_of(((latents - mean) / std).permute(0, 2, 3, 4, 1))
 
     @torch.no_grad()
-    def decode(
-        self, tokens: Float32[Tensor, "batch latents tokens channels"]
-    ) -> Float32[Tensor, "batch time px px 3"]:
+    def decode(self, tokens: Latents) -> Images:
         """Images in 0 … 1; the first latent gives one image, the others four each."""
         latents = _patches_of(tokens).permute(0, 4, 1, 2, 3)
         mean, std = _statistics(latents)
         pixels = self.autoencoder.decode(latents * std + mean).sample
         return (pixels.permute(0, 2, 3, 4, 1) + 1.0) / 2.0
 
-    def decode_future(
-        self, tokens: Float32[Tensor, "batch latents tokens channels"], *, all_images: bool
-    ) -> Float32[Tensor, "batch shown px px 3"]:
+    def decode_future(self, tokens: Latents, *, all_images: bool) -> _Shown:
         """Images after the first, or the last four; all are decoded, since they depend in order."""
         images = self.decode(tokens)
         return images[:, 1:] if all_images else images[:, -FRAMES_PER_LATENT:]
@@ -301,10 +282,9 @@ class WanConstants:
 class WanVideoCondition(nn.Module):
     """Times, actions and instructions as the transformer of Wan2.2 takes them.
 
-    Each latent frame has its own time, 0 for the clean first one, so modulations are computed per
-    latent frame, not per token. Actions are added to the embedding of the time, with an effect of
-    zero before training. Without them and without tactile tokens, the video side equals diffusers'
-    `WanTransformer3DModel`.
+    Modulations are computed per latent frame, each with its own time, 0 for the clean first one.
+    Actions are added to the embedding of the time, with an effect of zero before training. Without
+    them and tactile tokens, the video side equals diffusers' `WanTransformer3DModel`.
     """
 
     def __init__(self, config: NetworkConfig, wan: WanConfig, embedder: nn.Module) -> None:
@@ -323,12 +303,8 @@ class WanVideoCondition(nn.Module):
         kind = inputs.commanded[:, None, None] * self.commanded.float()
         return self.of(actions + kind, self.text_features.stack(inputs.instructions))
 
-    def of(
-        self,
-        actions: Float32[Tensor, "batch latents width"],
-        text: Float[Tensor, "batch words features"],
-    ) -> WanConstants:
-        """What embedded actions and text features contribute."""
+    def of(self, actions: Tensor, text: Float[Tensor, "batch words features"]) -> WanConstants:
+        """What embedded actions [batch, latents, width] and text features contribute."""
         weight = self.embedder.time_proj.weight
         return WanConstants(actions, Text(self.embedder.text_embedder(text.to(weight))))
 
@@ -353,14 +329,13 @@ class WanBlock(Block):
         attention = self.block.attn1
         shift, scale, *_ = self._modulation(stream)
         normed = self._modulated(self.block.norm1, stream.tokens, shift, scale)
-        query, key, value = (
-            split_axis(part, -1, (attention.heads, -1)).transpose(1, 2)
-            for part in (
-                attention.norm_q(attention.to_q(normed)),
-                attention.norm_k(attention.to_k(normed)),
-                attention.to_v(normed),
-            )
+        parts = (
+            attention.norm_q(attention.to_q(normed)),
+            attention.norm_k(attention.to_k(normed)),
+            attention.to_v(normed),
         )
+        heads = (attention.heads, -1)
+        query, key, value = (split_axis(part, -1, heads).transpose(1, 2) for part in parts)
         if stream.turn is None:
             return query, key, value
         return rotate(query, stream.turn), rotate(key, stream.turn), value
@@ -378,7 +353,6 @@ class WanBlock(Block):
         return replace(stream, tokens=tokens)
 
     def _read(self, tokens: Tensor, text: Text) -> Tensor:
-        """What tokens take from the text by cross-attention."""
         attention = self.block.attn2
         heads = (attention.heads, -1)
 
@@ -397,7 +371,6 @@ class WanBlock(Block):
         return out
 
     def _modulation(self, stream: Stream) -> tuple[Tensor, ...]:
-        """Shift, scale and gate of each latent frame, twice."""
         return (stream.modulation + self.block.scale_shift_table).unbind(2)
 
     @staticmethod
@@ -425,10 +398,10 @@ class WanVideoExpert(nn.Module):
 
     def start(
         self,
-        noisy: Float32[Tensor, "batch latents tokens channels"],
+        noisy: Latents,
         first: Float32[Tensor, "batch tokens channels"],
         condition: WanCondition,
-        _: Float32[Tensor, "batch time 2 cells cells"],
+        _: _Raster,
     ) -> Stream:
         """Tokens before the first layer; the first latent frame is the clean `first`."""
         latents = torch.cat([first[:, None], noisy[:, 1:]], dim=1)
@@ -444,9 +417,7 @@ class WanVideoExpert(nn.Module):
             text=condition.text,
         )
 
-    def finish(
-        self, stream: Stream, condition: WanCondition
-    ) -> Float32[Tensor, "batch latents tokens channels"]:
+    def finish(self, stream: Stream, condition: WanCondition) -> Latents:
         """Predict the velocity, noise less data."""
         tokens = split_axis(stream.tokens, 1, (condition.time.shape[1], -1))
         ends = self.scale_shift_table + condition.time[:, :, None]

@@ -6,12 +6,12 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from services.networks.training_settings import (
-    AverageDecay,
+    AdamWSettings,
     Batch,
+    BudgetSettings,
     CpuBudget,
-    LearningRate,
-    MaxGradientNorm,
-    MaxSteps,
+    NonNegative,
+    Share,
     WarmupSteps,
     WeightDecay,
 )
@@ -32,12 +32,9 @@ class RendererConfig(FrozenModel):
         default=(1, 1, 2), min_length=1, max_length=4, description="residual blocks per level"
     )
     stem_px: int = Field(default=1, ge=1, le=5, description="kernel size of the first convolution")
-    interpolation: Interpolation = Field(
-        default="bicubic", description="interpolation of the warped start image"
-    )
+    interpolation: Interpolation = Field(default="bicubic", description="of the warped start image")
     redraws_table: bool = Field(
-        default=True,
-        description="let the network redraw the whole image when only the camera moves",
+        default=True, description="redraw the whole image when only the camera moves"
     )
 
     @property
@@ -46,29 +43,17 @@ class RendererConfig(FrozenModel):
         return 2 ** len(self.widths)
 
 
-class RendererTraining(FrozenModel):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+class RendererTraining(AdamWSettings, BudgetSettings):
+    """One training run of the renderer."""
 
     cpu_budget_s: CpuBudget = 400.0
-    max_steps: MaxSteps = None
     batch: Batch = 24
-    learning_rate: LearningRate = 2e-3
     warmup_steps: WarmupSteps = 50
     weight_decay: WeightDecay = 0.01
-    ema_decay: AverageDecay = 0.995
-    max_gradient_norm: MaxGradientNorm = 1.0
-    gradient_weight: float = Field(default=0.5, ge=0, description="image gradient loss")
-    sharpness_weight: float = Field(
-        default=0.3, ge=0, description="weight of the edge strength loss (7 px windows)"
+    gradient_weight: NonNegative = Field(default=0.5, description="image gradient loss")
+    sharpness_weight: NonNegative = Field(
+        default=0.3, description="edge strength loss (7 px windows)"
     )
-    late_start_fraction: float = Field(
-        default=0.5, ge=0, le=1, description="share of pairs with a random start image"
-    )
-    shaken_fraction: float = Field(
-        default=0.5, ge=0, le=1, description="share of pairs with pose noise"
-    )
-    shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
-    shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
-    uses_bfloat16: bool = Field(
-        default=True, description="convolve in bfloat16 where that is faster"
-    )
+    shaken_fraction: Share = Field(default=0.5, description="share of pairs with pose noise")
+    shake_m: NonNegative = Field(default=0.003, description="position noise per axis")
+    uses_bfloat16: bool = Field(default=True, description="convolve in bfloat16 if that is faster")

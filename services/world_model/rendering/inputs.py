@@ -1,9 +1,9 @@
 """Network inputs of the renderer: warped start image, drawn hands and drawn objects.
 
-All requested images are computed at once. `change` masks where the network may draw: it is zero,
-and the image therefore exactly the warped start image, where no body moved relative to the table
-and the camera stood still. Pixels of the table plane (z = 0 in the world) move by a homography;
-rays that meet the plane beyond `FAR_M`, or never, move as if they came from infinity.
+`change` masks where the network may draw: it is zero, and the image therefore exactly the warped
+start image, where no body moved relative to the table and the camera stood still. Pixels of the
+table plane (z = 0 in the world) move by a homography; rays that meet the plane beyond `FAR_M`, or
+never, move as if they came from infinity.
 """
 
 from dataclasses import dataclass
@@ -137,13 +137,8 @@ class Bodies:
         Ts_camera_box = T_camera_world[:, None] @ Ts_world_box
         hands_world = base_points_world(states)
         corners = box_corners(Ts_camera_box, boxes_m[..., 3:])
-        points = np.concatenate(
-            [
-                apply(T_camera_world, hands_world.reshape(len(states), -1, 3)),
-                corners.reshape(len(states), -1, 3),
-            ],
-            axis=1,
-        )
+        hands = apply(T_camera_world, hands_world.reshape(len(states), -1, 3))
+        points = np.concatenate([hands, corners.reshape(len(states), -1, 3)], axis=1)
         depth = points[..., 2:]
         pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, MIN_DEPTH_M)
         return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > MIN_DEPTH_M)
@@ -293,18 +288,17 @@ def _warped(
         torch.from_numpy(start.layers)[torch.from_numpy(owner)],
         torch.from_numpy(positions),
         interpolation=config.interpolation,
-    ).clamp_(0.0, 1.0)
-    planes: np.ndarray = sampled.numpy()
+    )
+    planes: np.ndarray = sampled.clamp_(0.0, 1.0).numpy()
     outside = ~is_inside(positions, start.layers.shape[2:])
     return planes[:, :3], planes[:, 3:], outside[:, None].astype(np.float32)
 
 
 def _objects(seen: _ObjectPixels, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
     """Objects in the start image's colours, and their mask."""
-    hits = seen.hits
-    texture = colours_at_positions(start.rgb, seen.owner[hits.image], seen.at_start)
+    texture = colours_at_positions(start.rgb, seen.owner[seen.hits.image], seen.at_start)
     values = np.concatenate([texture, np.ones((len(texture), 1))], axis=1)
-    return _plane(hits, values, (len(seen.owner), *start.rgb.shape[2:]))
+    return _plane(seen.hits, values, (len(seen.owner), *start.rgb.shape[2:]))
 
 
 def _coarse(
@@ -344,9 +338,8 @@ def _moved_at_start(
     boxes = table[np.arange(len(owner))[:, None, None], start.shown[owner]]
     hands = (start.hands[owner] > _COVERED) * moved[:, :2, None, None]
     shares = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
-    sampled = sample_images(
-        torch.from_numpy(shares), torch.from_numpy(positions), interpolation="bilinear"
-    )
+    moved_from = torch.from_numpy(positions)
+    sampled = sample_images(torch.from_numpy(shares), moved_from, interpolation="bilinear")
     return np.asarray(sampled.numpy())
 
 
@@ -355,8 +348,7 @@ def grown(
 ) -> Float32[np.ndarray, "*batch h w"]:
     """Largest value of a mask (0 or more) within some pixels along both axes.
 
-    A window doubles with each comparison, one axis after the other: ten times faster than
-    `torch.nn.functional.max_pool2d`.
+    A window doubles with each comparison: ten times faster than torch's `max_pool2d`.
     """
     for axis in (-2, -1):
         mask = np.swapaxes(mask, axis, -2)
@@ -372,7 +364,7 @@ def grown(
 
 def _camera_change(positions: Float32[np.ndarray, "n h w 2"]) -> Float64[np.ndarray, "n 1 1 1"]:
     """Change from 0 to 1 by the motion of the image's corners."""
-    _, height, width, _ = positions.shape
+    height, width = positions.shape[1:3]
     home = pixel_centres(height, width).reshape(height, width, 2)
     corners = (positions - home)[:, :: height - 1, :: width - 1]
     farthest = np.abs(corners).max(axis=(1, 2, 3))
@@ -398,12 +390,9 @@ def sample_images(
 ) -> Float32[Tensor, "n c rows cols"]:
     """Sample images at positions in pixels; outside, the nearest border pixel."""
     sides = torch.tensor([images.shape[3], images.shape[2]], dtype=torch.float32)
+    at = positions * (2.0 / sides) - 1.0
     return functional.grid_sample(
-        images,
-        positions * (2.0 / sides) - 1.0,
-        mode=interpolation,
-        padding_mode="border",
-        align_corners=False,
+        images, at, mode=interpolation, padding_mode="border", align_corners=False
     )
 
 
@@ -423,10 +412,8 @@ def motion_shares(
 
     A body moves when any of its points leaves its position in the warped start image.
     """
-    there = before.pixels[owner]
-    shift = np.linalg.norm(motion.to_start(now.pixels) - there, axis=-1)
-    both = before.in_front[owner] & now.in_front
-    shift = np.where(both, shift, 0.0)
+    shift = np.linalg.norm(motion.to_start(now.pixels) - before.pixels[owner], axis=-1)
+    shift = np.where(before.in_front[owner] & now.in_front, shift, 0.0)
     # Points that crossed the camera plane have moved.
     shift[before.in_front[owner] != now.in_front] = np.inf
     hands, boxes = shift[:, :44].reshape(-1, 2, 22), shift[:, 44:].reshape(len(owner), -1, 8)

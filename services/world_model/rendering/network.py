@@ -89,8 +89,7 @@ class RendererNetwork(nn.Module):
     def _entered(self, inputs: DrawingInputs) -> Float[Tensor, "n width rows cols"]:
         """Stem convolution of all channels, with 2×2 blocks of fine pixels folded into channels.
 
-        Computed as a convolution of the fine pixels with stride 2, whose kernel holds the weights
-        of their four positions, which copies less than folding the pixels.
+        A stride of 2, with the weights of four positions in a kernel, copies less than folding.
         """
         weight, px = self.stem.weight, self.config.stem_px
         dtype, padding = weight.dtype, px // 2
@@ -133,11 +132,9 @@ def has_fast_bfloat16() -> bool:
     speedup = bfloat16_speedup()
     is_faster = speedup >= LEAST_SPEEDUP
     logger.info(
-        "convolution_precision_chosen",
-        precision="bfloat16" if is_faster else "float32",
-        bfloat16_speedup=round(speedup, 2),
-        least_speedup=LEAST_SPEEDUP,
-    )
+        "convolution_precision_chosen", precision="bfloat16" if is_faster else "float32",
+        bfloat16_speedup=round(speedup, 2), least_speedup=LEAST_SPEEDUP,
+    )  # fmt: skip
     return is_faster
 
 
@@ -149,9 +146,7 @@ def uses_bfloat16(*, setting: bool | None) -> bool:
 def bfloat16_speedup(clock: Callable[[], float] = time.thread_time) -> float:
     """Time of the renderer's layers in float32 over that in bfloat16, median of alternate runs.
 
-    Args:
-        clock: processor seconds of this thread, in which everything is computed: with several
-            threads on a busy machine the ratio would be that of their waiting.
+    `clock` gives processor seconds of this thread: the ratio of several would be of their waiting.
     """
     threads = torch.get_num_threads()
     with torch.random.fork_rng(devices=[]):

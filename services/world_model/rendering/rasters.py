@@ -1,10 +1,9 @@
 """Scene states, and rasters of their objects and hands in an image.
 
 Objects are bounding boxes found by casting rays; the nearest box wins. A hit takes its colour from
-the start image: the point moves with its object back to its pose at the start and is projected
-there. Hands are coloured bones, by splatting points of the kinematic chains: each bone is a ribbon
-of points that faces the camera, and a point keeps the colour of its position in the start image. A
-soft depth test resolves occlusion.
+where its object's point was in the start image. Hands are coloured bones, by splatting points of
+the kinematic chains: each bone is a ribbon of points that faces the camera, coloured by the start
+image. A soft depth test resolves occlusion.
 """
 
 from collections.abc import Sequence
@@ -147,8 +146,7 @@ def cast_boxes(
 ) -> BoxHits:
     """Intersect the rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986).
 
-    Only pixels in the bounding rectangle of a box's corners are tested; a box with corners behind
-    the camera is tested everywhere.
+    Only pixels in the bounding rectangle of a box are tested; of one behind the camera, all.
     """
     half_m = np.maximum(half_m, MIN_HALF_M)[present]
     Ts_box_camera = invert(Ts_camera_box[present])
@@ -399,12 +397,9 @@ def _taps(
     for axis, count in ((0, width), (1, height)):
         at = corner[:, axis].astype(np.int64)
         upper = share[:, axis]
-        axes.append(
-            [
-                (at.clip(0), np.where(at >= 0, 1 - upper, 0.0)),
-                ((at + 1).clip(max=count - 1), np.where(at < count - 1, upper, 0.0)),
-            ]
-        )
+        below = (at.clip(0), np.where(at >= 0, 1 - upper, 0.0))
+        above = ((at + 1).clip(max=count - 1), np.where(at < count - 1, upper, 0.0))
+        axes.append((below, above))
     first = image * (height * width)
     places, weights = [], []
     for row, down in axes[1]:

@@ -20,11 +20,7 @@ from services.world_model.rendering.inputs import (
     drawing_inputs,
 )
 from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
-from services.world_model.rendering.rasters import (
-    MAX_DRAWN_OBJECTS,
-    SceneStates,
-    joined,
-)
+from services.world_model.rendering.rasters import MAX_DRAWN_OBJECTS, SceneStates, joined
 
 # Chosen: about 1.5 MB of working memory an image; larger blocks are not faster.
 _BLOCK_IMAGES: Final = 32
@@ -61,9 +57,8 @@ class Renderer:
         for weight in self._network.parameters():
             if weight.ndim == 4:
                 weight.data = weight.data.contiguous(memory_format=torch.channels_last)
-        self._paint = Traced(
-            self._network, self._network.__call__, lambda inputs: inputs.fine.shape
-        )
+        call = self._network.__call__
+        self._paint = Traced(self._network, call, lambda inputs: inputs.fine.shape)
         # A rollout draws all its chunks from one start. Those used last are at the end.
         self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
         self._lock = threading.Lock()
@@ -71,10 +66,8 @@ class Renderer:
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
         """Draw images of any number of rollouts; together as alone, except for rounding.
 
-        Start images have one size, whose sides are multiples of `pixel_multiple`.
-
-        If camera, hands and objects are where they were at the start, the image is exactly the
-        start image.
+        Start images have one size, whose sides are multiples of `pixel_multiple`. Where nothing
+        moved since the start, the image is exactly the start image.
         """
         if not drawings:
             return []
@@ -83,11 +76,10 @@ class Renderer:
         counts = [len(states) for states in later]
         states = joined(later)
         owner = np.repeat(np.arange(len(drawings)), counts)
+        ends = range(_BLOCK_IMAGES, len(states), _BLOCK_IMAGES)
         blocks = [
             self._drawn_block(starts, states.take(rows), owner[rows])
-            for rows in np.split(
-                np.arange(len(states)), range(_BLOCK_IMAGES, len(states), _BLOCK_IMAGES)
-            )
+            for rows in np.split(np.arange(len(states)), ends)
         ]
         return np.split(np.concatenate(blocks), np.cumsum(counts)[:-1])
 

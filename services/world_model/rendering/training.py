@@ -12,13 +12,7 @@ from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from services.networks.optimizer import (
-    Budget,
-    OptimizerLoop,
-    OptimizerOptions,
-    floored_cosine,
-    update_average,
-)
+from services.networks.optimizer import Budget, OptimizerLoop, update_average
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.rendering.inputs import (
     DrawingInputs,
@@ -31,6 +25,10 @@ from services.world_model.rendering.rasters import SceneStates, joined, object_t
 
 LOG_EVERY_STEPS = 50
 _EDGE_WINDOW_PX = 7
+# Chosen: half of the pairs begin at the first image of an episode, as rollouts do.
+_LATE_START_SHARE = 0.5
+# Chosen: rotation noise (rad) on each axis, beside `shake_m` of position noise.
+_SHAKE_RAD = 0.05
 OnProgress = Callable[[float, int, float], None]
 
 
@@ -63,8 +61,7 @@ def train_renderer(
     """Train on pairs of images of one clip: a start image and a target image.
 
     `rng` draws initial weights, pairs and pose noise. `on_progress` is called every few steps with
-    the completed share, the step and the loss. Training starts from the weights of `initial`, which
-    has the same shape, if there is one.
+    the completed share, the step and the loss. Weights begin as those of `initial`, if given.
 
     Returns:
         The averaged network, and the CPU seconds of training.
@@ -77,16 +74,8 @@ def train_renderer(
     if initial is not None:
         run.network.load_state_dict(initial.state_dict())
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
-    options = OptimizerOptions(
-        learning_rate=settings.learning_rate,
-        weight_decay=settings.weight_decay,
-        max_gradient_norm=settings.max_gradient_norm,
-        warmup_steps=settings.warmup_steps,
-        schedule=floored_cosine,
-        betas=(0.9, 0.95),
-    )
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
-    for loss in OptimizerLoop(run.network, options, budget).run(run.loss):
+    for loss in OptimizerLoop(run.network, settings.options(), budget).run(run.loss):
         update_average(averaged, run.network, decay=settings.ema_decay, num_updates=budget.step - 1)
         if on_progress is not None and budget.step % LOG_EVERY_STEPS == 0:
             on_progress(min(budget.share(), 1.0), budget.step, loss)
@@ -142,7 +131,7 @@ class RendererRun:
         for _ in range(self._settings.batch):
             clip = int(self._rng.integers(len(self._clips)))
             length = len(self._clips[clip])
-            is_late = self._rng.random() < self._settings.late_start_fraction
+            is_late = self._rng.random() < _LATE_START_SHARE
             start = int(self._rng.integers(length - 1)) if is_late else 0
             starts.append((clip, start))
             laters.append((clip, int(self._rng.integers(start + 1, length))))
@@ -153,7 +142,7 @@ class RendererRun:
         settings, shape = self._settings, states.object_present.shape
         is_shaken = self._rng.random(len(states)) < settings.shaken_fraction
         shift = self._rng.normal(size=(*shape, 3)) * settings.shake_m
-        turn = self._rng.normal(size=(*shape, 3)) * settings.shake_rad
+        turn = self._rng.normal(size=(*shape, 3)) * _SHAKE_RAD
         poses = states.object_poses.copy()
         poses[..., :3] += shift * is_shaken[:, None, None]
         R = rotation_from_vector(turn * is_shaken[:, None, None])

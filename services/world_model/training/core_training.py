@@ -37,15 +37,17 @@ _SETTLED_M = 1e-3
 # Cores are trained from the first step and from every so many steps after it.
 _START_STRIDE = 8
 _TAXEL_SHARE = 4
+# Chosen: some examples have measured actions, so that rollouts of these are known, too.
+_MEASURED_SHARE = 0.15
 
 
 @dataclass(frozen=True)
 class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
-    Cores start from true poses with noise, and know its size, as they know that of a reader's error
-    in a rollout. `readings` are a reader's by start step, which episodes start from whose objects
-    are not labelled or not known there, or all if `starts_read`; empty if none does.
+    Cores start from true poses with noise of known size. `readings` are a reader's by start step,
+    which episodes start from whose objects are not labelled or not known there, or all if
+    `starts_read`; empty if none does.
     """
 
     table: SceneTable
@@ -89,9 +91,8 @@ def train_core(
         def loss() -> Tensor:
             return core_loss(core, data, _draw(data, settings, generator, rng), settings)
 
-        return train_averaged(
-            core, loss, settings, weight_decay=settings.weight_decay, on_step=on_step
-        )
+        decay = settings.weight_decay
+        return train_averaged(core, loss, settings, weight_decay=decay, on_step=on_step)
 
 
 @torch.no_grad()
@@ -123,8 +124,7 @@ def start_steps(table: SceneTable) -> list[int]:
 def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:
     """Random start, with a probability proportional to the root of the remaining length.
 
-    Starts near the end teach little about persistence, but rollouts begin there, too. Starts that
-    few episodes have are as much rarer.
+    Starts near the end teach little about persistence. Those of few episodes are as much rarer.
     """
     remaining = np.sqrt([table.num_steps - 1 - step for step in later])
     weight = remaining * [len(table.starts_at(step)) for step in later]
@@ -144,27 +144,20 @@ def _draw(
     def chance(fraction: float) -> Bool[Tensor, " batch"]:
         return torch.rand(len(rows), generator=generator) < fraction
 
-    measured = chance(settings.measured_fraction) | ~table.commanded[rows]
+    measured = chance(_MEASURED_SHARE) | ~table.commanded[rows]
     commands = table.commands(rows, start_step, measured)
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
     held &= _is_settled(table, rows, start_step) & table.labelled[rows]
     start = _read_start(data, rows, start_step, settings, generator)
-    return _Batch(
-        rows=rows,
-        start_step=start_step,
-        start=SceneStart(
-            start.objects,
-            start.sd_m,
-            start.size,
-            data.touch[rows, start_step].float(),
-            table.pads_kpa[rows, start_step],
-            table.task[rows],
-            (~measured).float(),
-            table.instruction[rows],
-        ),
-        commands=_held_still(commands, held),
-        is_held=held,
+    scene = SceneStart(
+        **vars(start),
+        touch=data.touch[rows, start_step].float(),
+        pads_kpa=table.pads_kpa[rows, start_step],
+        task=table.task[rows],
+        commanded=(~measured).float(),
+        instruction=table.instruction[rows],
     )
+    return _Batch(rows, start_step, scene, _held_still(commands, held), held)
 
 
 def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor, " batch"]:
@@ -187,9 +180,9 @@ def _read_start(
 ) -> Reading:
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
-    The noise of each object has its own standard deviation, of up to `pose_noise_m`; that of clicks
-    is in the poses already. Poses from touch are those of takes that succeeded: where a task has
-    some, all of its episodes start from what the reader sees, or starts would tell the outcome.
+    The noise of each object has its own standard deviation; that of clicks is in the poses already.
+    Poses from touch are those of takes that succeeded: where a task has some, all of its episodes
+    start from what the reader sees, or starts would tell the outcome.
     """
     true = data.table.objects_at(rows, start_step)
     sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()
@@ -228,8 +221,7 @@ def core_loss(
     """Weighted sum of the errors in objects, touch, contact and final success.
 
     Where hands are held still without contact, the targets are no motion and no change of touch. A
-    change of it needs a new `CORE_VERSION` (`state_trainer`): finished members are not trained
-    again without.
+    change of it needs a new `CORE_VERSION` (`state_trainer`).
     """
     commands, start = batch.commands, batch.start
     table, rows = data.table, batch.rows
@@ -265,7 +257,9 @@ def core_loss(
         core.taxels(future.pattern[few, 1:]), pressed.float(), reduction="none"
     )
     felt, taxels = table.felt[rows][:, steps], table.measured_taxels[rows]
-    pads = torch.from_numpy(by_pad(taxels.float().numpy(), np.max) > 0)[:, None, None]
+    pads = torch.from_numpy(by_pad(taxels.float().numpy(), np.max, core.config.tactile_layout) > 0)[
+        :, None, None
+    ]
     pads = pads & felt.repeat_interleave(NUM_PADS // 2, dim=-1)
     taxels = taxels[few, None, None] & felt[few, ..., None]
     touch_error = (future.touch[:, 1:] - touch).square().sum(-1)

@@ -1,15 +1,15 @@
-"""Random training windows of episodes in memory, as requests and targets.
+"""Episodes of a training, of people and of robots: their windows, subsets, checks and provenance.
 
-Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
-reads nothing from disk. For data larger than memory, episodes stay on disk, and a window is read
-through the store's reader, which decodes one camera and only the span of the window.
+Episodes are read once and cut with the re-anchoring of the store's reader. For data larger than
+memory, they stay on disk, and a window is read through that reader, its span alone.
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -22,20 +22,26 @@ from dextouch.episodes import (
     EpisodeReader,
     EpisodeStore,
     Split,
+    data_hash,
     needs,
     select_episodes,
 )
-from dextouch.errors import InvalidInputError
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
+from services.world_model.checkpoints import TrainingSet
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
+from services.world_model.settings import DataSettings
 
 # What an episode must have for windows to be cut from it.
 CUT: Final = (needs.EVERY_PART, needs.EVERY_IMAGE)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
+# Chosen: half of the windows of episodes that have commanded actions have these, since policies
+# send them, and of those a third is anchored like the later chunks of a rollout.
+_COMMANDED_SHARE, _CHAINED_SHARE = 0.5, 0.3
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class EpisodeArrays:
     instruction: str
     scene: str
     images: UInt8[np.ndarray, "steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     tactile_valid: Bool[np.ndarray, "steps 2"]
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
     anchor: AnchorPoses
@@ -72,9 +78,10 @@ class EpisodeArrays:
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
-    measured_taxels: Bool[np.ndarray, "2 320"] = field(
+    measured_taxels: Bool[np.ndarray, "2 taxels"] = field(
         default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
     )
+    tactile_layout: TactileLayout = DEXTOUCH_V1
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -140,9 +147,9 @@ class Window:
 
     request: PredictionRequest
     images: UInt8[np.ndarray, "time h w 3"]
-    tactile_kpa: Float32[np.ndarray, "time 2 320"]
+    tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
     tactile_valid: Bool[np.ndarray, "time 2"]
-    measured_taxels: Bool[np.ndarray, "2 320"]
+    measured_taxels: Bool[np.ndarray, "2 taxels"]
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ class WindowBatch:
 
     requests: list[PredictionRequest]
     images: UInt8[Tensor, "batch time px px 3"]
-    tactile_kpa: Float32[Tensor, "batch time 2 320"]
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     tactile_valid: Bool[Tensor, "batch time 2"]
 
 
@@ -199,12 +206,20 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         boxes_m=boxes_m,
         interpolated=grid.interpolated if grid.interpolated.any() else None,
         measured_taxels=grid.measured_taxels,
+        tactile_layout=grid.tactile_layout,
     )
 
 
 @lru_cache(maxsize=MAX_OPEN_READERS)
 def _reader(url: str, episode_id: str) -> EpisodeReader:
     return EpisodeStore(url).open(episode_id)
+
+
+# What a stored episode has of its arrays.
+_SHARED: Final = (
+    "episode_id", "task", "scene", "action_kinds", "content_sha256", "domain", "model_rate_hz",
+    "interpolated", "tactile_layout",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -223,6 +238,7 @@ class StoredEpisode:
     model_rate_hz: float
     image_px: int | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
+    tactile_layout: TactileLayout = DEXTOUCH_V1
 
     def __len__(self) -> int:
         return self.num_steps
@@ -243,19 +259,19 @@ class StoredEpisode:
             UnknownNameError: an action kind that it does not have.
             CorruptDataError: damaged bytes.
         """
-        grid = EpisodeGrid(_reader(self.url, self.episode_id), self.image_px)
-        read = grid.reader.window(
-            place.start, place.num_steps, cameras=(), action_kind=place.action_kind
+        grid, kind = (
+            EpisodeGrid(_reader(self.url, self.episode_id), self.image_px),
+            place.action_kind,
         )
+        read = grid.reader.window(place.start, place.num_steps, cameras=(), action_kind=kind)
         actions, anchor = read.actions, read.anchor
         if place.from_command and place.action_kind == "commanded":
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
         images = grid.images(range(place.start, place.start + place.num_steps))
-        known = grid.boxed_objects(read.t_ref_ns[:1])
-        objects = (
-            None if known is None else ObjectsAtStart(known[0][0].astype(np.float64), known[1])
-        )
+        objects = None
+        if known := grid.boxed_objects(read.t_ref_ns[:1]):
+            objects = ObjectsAtStart(known[0][0].astype(np.float64), known[1])
         request = PredictionRequest(
             first_image=images[0],
             first_tactile_kpa=read.tactile_kpa[0],
@@ -287,9 +303,9 @@ class WindowSampler:
     """Samples windows uniformly over starts, and over the episodes of each domain.
 
     Windows have no interpolated step. Episodes have one of `max_steps` at least. Of windows from
-    episodes with commanded actions, the `commanded_fraction` has them, and of these the
-    `chained_fraction` is anchored like a later chunk. `human_share` is that of windows from human
-    episodes, if there are human and robot ones; None: every episode is equally likely.
+    episodes with commanded actions, half have them, and 30 % of these are anchored like a later
+    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
+    None: every episode is equally likely.
     """
 
     def __init__(
@@ -298,8 +314,6 @@ class WindowSampler:
         rng: np.random.Generator,
         *,
         max_steps: int,
-        commanded_fraction: float = 0.5,
-        chained_fraction: float = 0.3,
         human_share: float | None = None,
     ) -> None:
         short = [e.episode_id for e in episodes if not len(window_starts(e, max_steps))]
@@ -311,8 +325,6 @@ class WindowSampler:
             )
         self._episodes = list(episodes)
         self._rng = rng
-        self._commanded_fraction = commanded_fraction
-        self._chained_fraction = chained_fraction
         of: dict[Domain, list[int]] = {"human": [], "robot": []}
         for index, episode in enumerate(episodes):
             of[episode.domain].append(index)
@@ -343,13 +355,11 @@ class WindowSampler:
         episode = self._episodes[index]
         starts = window_starts(episode, num_steps)
         start = int(starts[self._rng.integers(len(starts))])
-        is_commanded = self._rng.random() < self._commanded_fraction
-        is_chained = bool(self._rng.random() < self._chained_fraction)
+        is_commanded = self._rng.random() < _COMMANDED_SHARE
+        is_chained = bool(self._rng.random() < _CHAINED_SHARE)
         if not is_commanded or "commanded" not in episode.action_kinds:
             return WindowPosition(index, start, num_steps)
-        return WindowPosition(
-            index, start, num_steps, action_kind="commanded", from_command=is_chained
-        )
+        return WindowPosition(index, start, num_steps, "commanded", from_command=is_chained)
 
 
 def load_episodes(
@@ -384,20 +394,14 @@ def index_episodes(
     for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
         # The cached reader, so that processes forked later inherit it open.
         arrays = read_episode(_reader(url, found.item_id), image_px=image_px)
+        shared: dict[str, Any] = {name: getattr(arrays, name) for name in _SHARED}
         indexed.append(
             StoredEpisode(
                 url=url,
-                episode_id=arrays.episode_id,
-                task=arrays.task,
-                scene=arrays.scene,
                 num_steps=len(arrays),
-                action_kinds=arrays.action_kinds,
-                content_sha256=arrays.content_sha256,
                 print_sha256=arrays.fingerprint(),
-                domain=arrays.domain,
-                model_rate_hz=arrays.model_rate_hz,
                 image_px=image_px,
-                interpolated=arrays.interpolated,
+                **shared,
             )
         )
     return indexed
@@ -433,3 +437,111 @@ def read_batches(
         generator=torch.Generator().manual_seed(0),
     )
     yield from loader
+
+
+# An episode of either form of the world model.
+DomainEpisode: TypeAlias = EpisodeGrid | TrainingEpisode
+D = TypeVar("D", bound=DomainEpisode)
+
+
+def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> list[D]:
+    """A number of episodes chosen by their content, in their order; None for all.
+
+    A larger subset of the same episodes contains every smaller one.
+
+    Raises:
+        InvalidInputError: there are fewer; `what` names them.
+    """
+    if count is None:
+        return list(episodes)
+    if count > len(episodes):
+        raise InvalidInputError(
+            f"training: got {count} as the number of {what} episodes, expected at most the "
+            f"{len(episodes)} there are; record more, or ask for fewer"
+        )
+
+    def place(index: int) -> str:
+        return hashlib.sha256(f"subset/{episodes[index].content_sha256}".encode()).hexdigest()
+
+    chosen = sorted(range(len(episodes)), key=place)[:count]
+    return [episodes[index] for index in sorted(chosen)]
+
+
+def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[float]) -> None:
+    """Check that the episodes of a training have one model rate, and are in one store each.
+
+    Raises:
+        ConflictError: they are not.
+    """
+    twice = [name for name, count in Counter(ids).items() if count > 1]
+    if twice or len(rates_hz) > 1:
+        raise ConflictError(
+            f"training: the episodes of {', '.join(urls)} have model rates of {sorted(rates_hz)} "
+            f"Hz, and {twice[:3]} are in two stores; expected one rate, and each episode once"
+        )
+
+
+def check_tasks(
+    episodes: Iterable[DomainEpisode], settings: DataSettings, known: Collection[str] = ()
+) -> None:
+    """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`).
+
+    `known` are those that the initial checkpoint was trained on.
+
+    Raises:
+        InvalidInputError: a task is both human and robot, or is known already.
+    """
+    tasks: dict[Domain, set[str]] = {"human": set(), "robot": set()}
+    for episode in episodes:
+        tasks[episode.domain].add(episode.task)
+    again = sorted(set(known) & (tasks["human"] | tasks["robot"]))
+    if settings.new_tasks and again:
+        raise InvalidInputError(
+            f"training: the initial checkpoint was trained on tasks {again}, expected new ones; "
+            "use other stores, or allow it with --no-new-tasks",
+            tasks=again,
+        )
+    both = sorted(tasks["human"] & tasks["robot"])
+    if settings.human and settings.disjoint_tasks and both:
+        raise InvalidInputError(
+            f"training: tasks {both} are in the human and in the robot episodes, expected disjoint "
+            "sets; use other stores, or allow it with --no-disjoint-tasks",
+            tasks=both,
+        )
+
+
+def training_sets(
+    trained: Sequence[DomainEpisode],
+    heldout: Sequence[DomainEpisode],
+    *,
+    human_share: float | None,
+    image_px: int | None,
+    inherited: Sequence[TrainingSet] = (),
+    ancestor: str | None = None,
+) -> tuple[TrainingSet, ...]:
+    """The episodes of a run by domain, after the inherited ones of its ancestors.
+
+    `ancestor` is the digest of the initial checkpoint. `human_share` of what is drawn is human;
+    None: as their number says. `image_px` is as for `data_hash`.
+    """
+    found = [
+        one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})
+        for one in inherited
+    ]
+    domains = {episode.domain for episode in trained}
+    shares: dict[Domain, float] = {}
+    if human_share is not None and len(domains) > 1:
+        shares = {"human": human_share, "robot": 1 - human_share}
+    for episodes, is_heldout in ((trained, False), (heldout, True)):
+        for domain in sorted({episode.domain for episode in episodes}):
+            mine = [episode for episode in episodes if episode.domain == domain]
+            found.append(
+                TrainingSet(
+                    domain=domain,
+                    heldout=is_heldout,
+                    tasks=dict(sorted(Counter(episode.task for episode in mine).items())),
+                    data_hash=data_hash((e.content_sha256 for e in mine), image_px=image_px),
+                    window_share=None if is_heldout else shares.get(domain),
+                )
+            )
+    return tuple(found)

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
@@ -22,7 +22,7 @@ from torch.distributed.fsdp import fully_shard
 
 from dextouch.errors import InvalidInputError
 
-Item = TypeVar("Item")
+Whole = TypeVar("Whole", Tensor, list[Any])
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,6 @@ class Processes:
                 "processes train on processors only"
             )
 
-    def part(self, batch: Sequence[Item]) -> list[Item]:
-        """This process's part of a batch."""
-        return list(batch[self.rank :: self.count])
-
     def rand(self, shape: Sequence[int], generator: torch.Generator) -> Tensor:
         """This process's part, of this shape, of uniform numbers drawn for the whole batch."""
         return self.own(torch.rand(shape[0] * self.count, *shape[1:], generator=generator))
@@ -68,8 +64,8 @@ class Processes:
         """As `rand`, of Gaussian noise."""
         return self.own(torch.randn(shape[0] * self.count, *shape[1:], generator=generator))
 
-    def own(self, whole: Tensor) -> Tensor:
-        """This process's part of a tensor of the whole batch."""
+    def own(self, whole: Whole) -> Whole:
+        """This process's part of the whole batch."""
         return whole[self.rank :: self.count]
 
     def mean(self, value: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import ActionKind
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
@@ -35,8 +36,9 @@ class Futures:
     """Images and pressures after the first step, for all windows."""
 
     images: UInt8[np.ndarray, "n steps h w 3"]
-    tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
-    measured: Bool[np.ndarray, "n steps 2 320"] | None = None
+    tactile_kpa: Float32[np.ndarray, "n steps 2 taxels"]
+    measured: Bool[np.ndarray, "n steps 2 taxels"] | None = None
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 def evaluate_prediction(
@@ -79,17 +81,17 @@ def evaluate_prediction(
             f"evaluation: got {len(episodes)} episodes without a window of "
             f"{model.config.max_steps} steps, expected at least one"
         )
-    windows = [
-        _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
-    ]
+    steps = model.config.max_steps
+    windows = [_cut(episode, start, steps, action_kind) for episode, start in places]
     truth = Futures(
         np.stack([w.images[1:] for w in windows]),
         np.stack([w.tactile_kpa[1:] for w in windows]),
         np.stack([w.tactile_valid[1:, :, None] & w.measured_taxels for w in windows]),
+        model.config.tactile_layout,
     )
     first = Futures(
-        np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
-        np.stack([w.tactile_kpa[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
+        np.stack([w.images[:1] for w in windows]).repeat(steps - 1, axis=1),
+        np.stack([w.tactile_kpa[:1] for w in windows]).repeat(steps - 1, axis=1),
     )
     requests = [window.request for window in windows]
     figures = _figures(predict_all(model, requests), truth, "")
@@ -99,13 +101,14 @@ def evaluate_prediction(
         predicted_kpa=np.zeros_like(truth.tactile_kpa),
         true_kpa=truth.tactile_kpa,
         measured=truth.measured,
+        layout=model.config.tactile_layout,
     )
     others = _actions_of_other_takes(places, requests, action_kind)
     if others:
         kept = [index for index, _ in others]
         wrong = predict_all(model, [request for _, request in others])
         measured = None if truth.measured is None else truth.measured[kept]
-        right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured)
+        right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured, truth.layout)
         figures |= _figures(wrong, right, "_other_take")
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
         still = [_standing_still(request, head_moves=head_moves) for request in requests]
@@ -134,10 +137,8 @@ def predict_all(model: JointWorldModel, requests: Sequence[PredictionRequest]) -
 
     def predicted(part: Sequence[PredictionRequest], begin: int) -> tuple[Tensor, Tensor]:
         inputs = build_inputs(part, model.config)
-        noises = [
-            model.noise(inputs.num_steps, torch.Generator().manual_seed(begin + index))
-            for index in range(len(part))
-        ]
+        generators = [torch.Generator().manual_seed(begin + index) for index in range(len(part))]
+        noises = [model.noise(inputs.num_steps, each) for each in generators]
         future = model.predict(inputs, stack_noise(noises))
         return future.images, future.tactile_kpa
 
@@ -193,9 +194,8 @@ def _actions_of_other_takes(
         num_steps = len(request.actions)
         if other is not episode and start + num_steps <= len(other):
             taken = _cut(other, start, num_steps, kind).request
-            others.append(
-                (index, replace(request, actions=taken.actions, action_kind=taken.action_kind))
-            )
+            swapped = replace(request, actions=taken.actions, action_kind=taken.action_kind)
+            others.append((index, swapped))
     return others
 
 
@@ -212,6 +212,7 @@ def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]
         "predicted_kpa": predicted.tactile_kpa,
         "true_kpa": true.tactile_kpa,
         "measured": true.measured,
+        "layout": true.layout,
     }
     return {
         f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),

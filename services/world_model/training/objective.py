@@ -1,9 +1,8 @@
 """Training losses: flow matching of video and tactile latents, and self-forcing.
 
-Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment: a rollout
-starts every chunk after the first from its own prediction, and a sampler of few steps calls the
-network with latents of its own. Training of single windows at random times has seen neither. With
-it the context of half the batches is predicted, and noisy latents are those that the sampler itself
+Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment, where a chunk
+starts from the last prediction, and a sampler calls the network with latents of its own. The
+context of half the batches is predicted, and noisy latents are those that the sampler itself
 reaches; the target is always the recorded future.
 """
 
@@ -17,9 +16,8 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TIP_TAXELS
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.dynamics.trees import combined, mapped
-from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
     add_noise,
@@ -57,11 +55,10 @@ class Losses:
 class LossOptions:
     """Options of the losses.
 
-    `context_noise` is the relative deviation of noise on the first latents, which makes the model
-    robust to starting from its own output. `touch_loss` says which tactile tokens count: all of
-    them, so that the model also learns to predict the absence of contact, or only those in contact
-    or changing, as in the paper. `precision` is that of the experts' matrix products. With
-    `own_noisy`, noisy latents are those that the model's own sampler reaches.
+    `context_noise` is the relative deviation of noise on the first latents, for starts from own
+    output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
+    learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
+    experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
     """
 
     context_noise: float = 0.0
@@ -108,7 +105,9 @@ def losses(
     valid = batch.tactile_valid.to(device)
     counted = (valid & valid[:, :1])[:, 1:, :, None]
     if options.touch_loss == "contact_or_changing":
-        tokens = contact_or_changing(tactile_kpa, clean.tactile.shape[3])
+        tokens = contact_or_changing(
+            tactile_kpa, clean.tactile.shape[3], model.config.tactile_layout
+        )
         counted = counted & tokens[:, 1:]
     weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
     error = (guess.tactile - target.tactile)[:, 1:].square() * weights
@@ -117,7 +116,9 @@ def losses(
 
 
 def contact_or_changing(
-    tactile_kpa: Float32[Tensor, "batch time 2 320"], num_tokens: int
+    tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
+    num_tokens: int,
+    layout: TactileLayout = DEXTOUCH_V1,
 ) -> Bool[Tensor, "batch time 2 tokens"]:
     """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
 
@@ -129,8 +130,8 @@ def contact_or_changing(
     taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
     if num_tokens == 1:
         return taxels.any(dim=-1, keepdim=True)
-    tips = split_axis(taxels[..., :NUM_TIP_TAXELS], -1, (num_tokens - 1, -1)).any(dim=-1)
-    return torch.cat([tips, taxels[..., NUM_TIP_TAXELS:].any(dim=-1, keepdim=True)], dim=-1)
+    pads = torch.split(taxels, [pad.num_taxels for pad in layout.pads], dim=-1)
+    return torch.stack([pad.any(dim=-1) for pad in pads], dim=-1)
 
 
 def _with_noise(
@@ -167,12 +168,8 @@ def own_context(
     middle = len(batch.requests[0].actions) // 2
     firsts = [replace(request, actions=request.actions[: middle + 1]) for request in batch.requests]
     if torch.rand((), generator=generator).item() >= OWN_CONTEXT_SHARE:
-        return WindowBatch(
-            firsts,
-            batch.images[:, : middle + 1],
-            batch.tactile_kpa[:, : middle + 1],
-            batch.tactile_valid[:, : middle + 1],
-        )
+        parts = (batch.images, batch.tactile_kpa, batch.tactile_valid)
+        return WindowBatch(firsts, *(part[:, : middle + 1] for part in parts))
     noise = mapped(
         model.noise(middle + 1, generator),
         lambda one: processes.randn([len(firsts), *one.shape[1:]], generator),
@@ -180,11 +177,9 @@ def own_context(
     inputs = build_inputs(firsts, model.config)
     future = model.predict(inputs, noise, sampling=Sampling(keep_context=False), all_images=False)
     images, touch = to_uint8(future.images[:, -1:]).cpu(), future.tactile_kpa[:, -1:].cpu()
+    each = zip(batch.requests, images, touch, strict=True)
     return WindowBatch(
-        [
-            _second(request, middle, image[0], felt[0])
-            for request, image, felt in zip(batch.requests, images, touch, strict=True)
-        ],
+        [_second(request, middle, image[0], felt[0]) for request, image, felt in each],
         torch.cat([images, batch.images[:, middle + 1 :]], dim=1),
         torch.cat([touch, batch.tactile_kpa[:, middle + 1 :]], dim=1),
         batch.tactile_valid[:, middle:],

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -76,6 +76,7 @@ def train_reader(
     reached &= is_known[:, later]
     counts = reached.sum(1)
     order = torch.argsort(~reached, dim=1, stable=True)
+    bfloat16 = uses_bfloat16(setting=settings.bfloat16)
 
     def loss() -> Tensor:
         rows = table.drawn(known, settings.batch, generator)
@@ -84,12 +85,14 @@ def train_reader(
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
         is_first &= is_known[rows, 0]
         steps = torch.where(is_first | (counts[rows] == 0), 0, amid)
-        return _loss(
-            reader,
-            (table, rows, steps),
-            generator,
-            bfloat16=uses_bfloat16(setting=settings.bfloat16),
-        )
+        first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
+        image, first = as_another_camera(first, generator)
+        guess, reading = reader.read(image, first, bfloat16=bfloat16)
+        is_posed = table.objects_known[rows, steps]
+        count = torch.tensor(config.num_objects)[first.task]
+        used = (torch.arange(MAX_OBJECTS) < count[:, None]) & is_posed
+        about = (true, table.size[rows], used, true.present * is_posed)
+        return _error(reading, *about) + _GUESS_WEIGHT * _error(guess, *about)
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
 
@@ -110,26 +113,6 @@ def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig)
             there &= table.objects_known[:, 0, slot]
             if there.any():
                 reader.height_mean[task, slot] = first[there].median()
-
-
-def _loss(
-    reader: StartReader,
-    places: tuple[SceneTable, Int64[Tensor, " batch"], Int64[Tensor, " batch"]],
-    generator: torch.Generator,
-    *,
-    bfloat16: bool,
-) -> Float32[Tensor, ""]:
-    table, rows, steps = places
-    first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
-    image, first = as_another_camera(first, generator)
-    guess, reading = reader.read(image, first, bfloat16=bfloat16)
-    size, known = table.size[rows], table.objects_known[rows, steps]
-    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
-    used &= known
-    there = true.present * known
-    return _error(reading, true, size, used, there) + _GUESS_WEIGHT * _error(
-        guess, true, size, used, there
-    )
 
 
 def _error(
@@ -230,7 +213,6 @@ def _shifted(
 
 
 def _blurred(image: Float32[Tensor, "batch 3 px px"]) -> Float32[Tensor, "batch 3 px px"]:
-    """A binomial kernel of three pixels."""
     weights = torch.tensor([0.25, 0.5, 0.25])
     kernel = (weights[:, None] * weights).expand(3, 1, 3, 3)
     return functional.conv2d(
@@ -239,7 +221,6 @@ def _blurred(image: Float32[Tensor, "batch 3 px px"]) -> Float32[Tensor, "batch 
 
 
 def _compressed(image: Float32[Tensor, "batch 3 px px"], draw: np.ndarray) -> Tensor:
-    """A share of the images after compression as JPEG."""
     low, high = _JPEG_QUALITY
     for index in np.flatnonzero(draw[:, 0] < _JPEG_SHARE):
         pixels = (image[index].permute(1, 2, 0) * 255).round().byte().numpy()
@@ -262,7 +243,10 @@ def train_averaged(
     `loss` draws a fresh batch. `on_step` is called with each step and its loss.
     """
     options = OptimizerOptions(
-        settings.learning_rate, weight_decay, warmup_steps=_WARMUP_STEPS, schedule=_to_a_hundredth
+        settings.learning_rate,
+        weight_decay,
+        warmup_steps=_WARMUP_STEPS,
+        schedule=lambda share: 0.01 + 0.99 * half_cosine(share),
     )
     budget = Budget(max_steps=settings.num_steps)
     averaged = copy.deepcopy(network)
@@ -272,8 +256,3 @@ def train_averaged(
         if on_step is not None:
             on_step(budget.step, value)
     return averaged.eval()
-
-
-def _to_a_hundredth(share: float) -> float:
-    """Half a cosine from 1 down to 0.01."""
-    return 0.01 + 0.99 * half_cosine(share)

@@ -13,7 +13,7 @@ from torch import Tensor
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import (
     FREE_KPA,
     MAX_DISTANCE_M,
@@ -61,20 +61,18 @@ class HandTable:
 class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
-    `length` is the number of an episode's own steps, of which `interpolated` ones have actions that
-    nothing measured; `objects_known` are the steps at which the pose of an object is known,
-    `measured_objects` marks episodes whose poses have the errors of a measurement, `touched` those
-    of tasks of which some have poses from touch, and `placed_sd_m` is the standard deviation of
-    positions from clicks or touch, 0 of others. `images` are those of the steps `image_steps`,
-    where `shown`; `in_contact` marks pads in contact. Taxels that are not `measured_taxels` have
-    the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at a
-    step, for want of a sample or of half of their taxels, count in no loss. `sent` are commanded
-    hands where available and measured ones elsewhere, as given by `commanded`. `human` marks
-    episodes in which a person acts, and `human_share` is their share in what is drawn, NaN if it
-    follows from their number. `labelled` marks episodes whose object poses are trained on;
-    `boxes_m` are the usual boxes of each task's objects in their frames (middle, half sizes), and
-    `size` factors of their width and height. `instruction` are the features of each episode's
-    sentence.
+    `length` is the number of an episode's own steps, of which nothing measured the actions of those
+    `interpolated`. The poses of objects are `objects_known` at a step; `measured_objects` marks
+    episodes whose poses have the errors of a measurement, `touched` those of tasks of which some
+    have poses from touch, `labelled` those whose poses are trained on; `placed_sd_m` is the
+    standard deviation of positions from clicks or touch, else 0. `images` are those of the
+    `image_steps`, where `shown`; `in_contact` marks pads. Taxels that are not `measured_taxels`
+    have the pressure of the nearest one of their pad that is, or none; hands that are not `felt` at
+    a step, for want of a sample or of half of their taxels, count in no loss. `sent` are the hands
+    as `commanded`, elsewhere measured ones. `human` marks episodes of people, and `human_share` is
+    their share in what is drawn, NaN if it follows from their number. `boxes_m` are the usual boxes
+    of each task's objects in their frames (middle, half sizes), and `size` factors of their width
+    and height. `instruction` are the features of each episode's sentence.
     """
 
     sent: HandTable
@@ -82,11 +80,11 @@ class SceneTable:
     commanded: Bool[Tensor, " episodes"]
     Ts_world_camera: Float32[Tensor, "episodes steps 4 4"]
     objects: ObjectPoses
-    tactile_kpa: Float16[Tensor, "episodes steps 2 320"]
+    tactile_kpa: Float16[Tensor, "episodes steps 2 taxels"]
     pads_kpa: Float32[Tensor, "episodes steps 12"]
     in_contact: Bool[Tensor, "episodes steps 12"]
     felt: Bool[Tensor, "episodes steps 2"]
-    measured_taxels: Bool[Tensor, "episodes 2 320"]
+    measured_taxels: Bool[Tensor, "episodes 2 taxels"]
     images: UInt8[Tensor, "episodes images px px 3"]
     shown: Bool[Tensor, "episodes images"]
     image_steps: tuple[int, ...]
@@ -198,9 +196,8 @@ class SceneTable:
             return chosen(use_measured, getattr(self.measured, name)[rows][:, steps], sent)
 
         here = self.measured
-        holding = here.points_m[rows, start][:, None, None].expand(
-            -1, 1, len(SAMPLE_OFFSETS), -1, -1, -1
-        )
+        holding = here.points_m[rows, start][:, None, None]
+        holding = holding.expand(-1, 1, len(SAMPLE_OFFSETS), -1, -1, -1)
         return Commands(
             torch.cat([holding, taken("points_m", samples)], dim=1),
             torch.cat([here.axes[rows, start][:, None], taken("axes", ends)], dim=1),
@@ -215,21 +212,22 @@ class SceneTable:
     def tensors(self) -> dict[str, Tensor]:
         """All data as named tensors, to share with other processes through a file."""
         flat = {"image_steps": torch.tensor(self.image_steps)}
-        for name in (one.name for one in fields(self) if one.name != "image_steps"):
-            flat |= by_name(getattr(self, name), name)
+        for field in fields(self):
+            if field.name != "image_steps":
+                flat |= by_name(getattr(self, field.name), field.name)
         return {name: value.contiguous() for name, value in flat.items()}
 
     @classmethod
     def from_tensors(cls, flat: dict[str, Tensor]) -> "SceneTable":
         """Inverse of `tensors`."""
         parts: dict[str, Any] = {name: part for name, part in flat.items() if "." not in name}
-        kinds: dict[str, type[Any]] = {
-            "sent": HandTable, "measured": HandTable, "objects": ObjectPoses,
-        }  # fmt: skip
-        for name, kind in kinds.items():
-            start = f"{name}."
-            inner = {key: value for key, value in flat.items() if key.startswith(start)}
-            parts[name] = kind(**{key.removeprefix(start): one for key, one in inner.items()})
+        for name, kind in (("sent", HandTable), ("measured", HandTable), ("objects", ObjectPoses)):
+            inner = {
+                key.partition(".")[2]: one
+                for key, one in flat.items()
+                if key.startswith(f"{name}.")
+            }
+            parts[name] = kind(**inner)
         return cls(**{**parts, "image_steps": tuple(flat["image_steps"].tolist())})
 
 
@@ -281,7 +279,7 @@ def scene_table(
     for one in episodes:
         measured.append(hand_motion(_filled(one.measured, one, num_steps), one.anchor))
         sent.append(hand_motion(_filled(one.sent, one, num_steps), one.anchor))
-    tactile, felt = _touch(episodes, num_steps)
+    layout, (tactile, felt) = config.tactile_layout, _touch(episodes, num_steps)
     tracked = list(zip(episodes, tracks, strict=True))
     objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
     known = np.stack([_known(e, track, num_steps) for e, track in tracked])
@@ -295,8 +293,8 @@ def scene_table(
         Ts_world_camera=torch.from_numpy(np.stack([m.Ts_world_camera for m in measured])).float(),
         objects=stacked(objects),
         tactile_kpa=torch.from_numpy(tactile),
-        pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean)),
-        in_contact=torch.from_numpy(by_pad(tactile, np.max) >= FREE_KPA),
+        pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean, layout)),
+        in_contact=torch.from_numpy(by_pad(tactile, np.max, layout) >= FREE_KPA),
         felt=torch.from_numpy(felt),
         measured_taxels=torch.from_numpy(np.stack([e.measured_taxels for e in episodes])),
         images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
@@ -336,7 +334,7 @@ def _filled(
 
 def _touch(
     episodes: Sequence[EpisodeGrid], num_steps: int
-) -> tuple[Float16[np.ndarray, "episodes steps 2 320"], Bool[np.ndarray, "episodes steps 2"]]:
+) -> tuple[Float16[np.ndarray, "episodes steps 2 taxels"], Bool[np.ndarray, "episodes steps 2"]]:
     """Pressures (kPa) at every step, those of unmeasured taxels filled, and which hands count."""
     tactile, felt = [], []
     for one in episodes:
@@ -350,29 +348,29 @@ def _touch(
 
 def filled_touch(
     episode: EpisodeGrid,
-) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
     """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
 
     They have the pressure of the nearest one of their pad that was measured, or none.
     """
     touch_kpa, is_sampled = episode.touch()
     measured = episode.measured_taxels
-    nearest = np.stack([_nearest_measured(hand) for hand in measured])
+    nearest = np.stack([_nearest_measured(hand, episode.tactile_layout) for hand in measured])
     is_known = np.take_along_axis(measured, nearest, axis=-1)
     return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known, is_sampled
 
 
-def _nearest_measured(measured: Bool[np.ndarray, "320"]) -> Int64[np.ndarray, "320"]:
+def _nearest_measured(
+    measured: Bool[np.ndarray, " taxels"], layout: TactileLayout
+) -> Int64[np.ndarray, " taxels"]:
     """For each taxel the nearest measured one in rows and columns of its pad, or itself."""
-    nearest = np.arange(NUM_TAXELS)
+    nearest = np.arange(layout.num_taxels)
     if measured.all():
         return nearest
-    tips, palm = split_pads(nearest)
-    for pad in (*tips, palm):
+    for pad in [pad for stack in layout.split(nearest) for pad in stack]:
         if measured[pad].any():
-            places = distance_transform_edt(
-                ~measured[pad], return_distances=False, return_indices=True
-            )
+            away = ~measured[pad]
+            places = distance_transform_edt(away, return_distances=False, return_indices=True)
             nearest[pad] = pad[tuple(places)]
     return nearest
 
@@ -390,8 +388,7 @@ def _known(
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
     """Latent steps with an image in at least half of the episodes that have them."""
-    num_shown = np.zeros(max(lengths), dtype=np.int64)
-    num_long = np.zeros(max(lengths), dtype=np.int64)
+    num_shown, num_long = np.zeros((2, max(lengths)), dtype=np.int64)
     for episode, length in zip(episodes, lengths, strict=True):
         own = episode.image_steps
         if not len(own) or own[0] != 0:
@@ -424,10 +421,8 @@ def usual_boxes_m(episodes: Sequence[EpisodeGrid]) -> dict[str, Float64[np.ndarr
     for episode in episodes:
         if len(episode.boxes_m):
             by_task[episode.task].append(episode.boxes_m)
-    return {
-        task: np.median(boxes, axis=0) if boxes else np.zeros((0, 6))
-        for task, boxes in by_task.items()
-    }
+    none = np.zeros((0, 6))
+    return {task: np.median(b, axis=0) if b else none for task, b in by_task.items()}
 
 
 def _size(
@@ -435,12 +430,10 @@ def _size(
 ) -> Float32[np.ndarray, "slots 2"]:
     """Width and height of an episode's objects relative to the usual ones; 1 in empty slots."""
     size = np.ones((MAX_OBJECTS, 2), dtype=np.float32)
-    if not len(episode.boxes_m):
-        return size
-    across, height = (slice(3, 5), slice(5, 6))
-    for column, part in enumerate((across, height)):
-        factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
-        size[: len(factors), column] = factors.clip(*SIZE_RANGE)
+    if len(episode.boxes_m):
+        for column, part in enumerate((slice(3, 5), slice(5, 6))):
+            factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
+            size[: len(factors), column] = factors.clip(*SIZE_RANGE)
     return size
 
 
@@ -454,7 +447,6 @@ def _padded(
 
 
 def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> list[ObjectTrack]:
-    """Object poses of the episodes, if these fit the configuration."""
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
     size_px = (config.image_px, config.image_px)

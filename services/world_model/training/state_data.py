@@ -1,8 +1,8 @@
 """Episodes that a state model is trained and evaluated on, and their provenance.
 
 Poses of their objects are those of the twin, of markers or trackers, clicked in the first image, or
-given by touch (docs/objects.md). Where others of their task have poses, episodes without are taken,
-too: touch and outcome are learned from them.
+given by touch (docs/objects.md). Where others of their task have poses, episodes without teach
+touch and outcome.
 """
 
 import hashlib
@@ -38,10 +38,11 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
-from services.world_model.checkpoints import learned_tasks, scene_digest
+from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
+from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.domains import check_stores, check_tasks, subset_by_hash
+from services.world_model.training.dataset import check_stores, check_tasks, subset_by_hash
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 
@@ -109,8 +110,8 @@ class SceneGrid(EpisodeGrid):
 
     @cached_property
     def _touched_alone(self) -> ObjectTrack | None:
-        may = self._file is not None and self._may_be_touched
-        return touched_objects(self, self._file) if may and self._file else None
+        is_held = self._file is not None and self._may_be_touched
+        return touched_objects(self, self._file) if is_held and self._file else None
 
     @property
     def _may_be_touched(self) -> bool:
@@ -185,16 +186,11 @@ def load_scene_episodes(
     without = grids.keys() - with_poses
     tasks_posed = {grids[name].task for name in with_poses}
     recordings = {_recording(grids[name]) for name in with_poses} - {None}
-    used = {
-        name
-        for name in without
-        if grids[name].task in tasks_posed
-        and grids[name].object_names
-        and _recording(grids[name]) not in recordings
-    }
+    of_task = [n for n in without if grids[n].task in tasks_posed and grids[n].object_names]
+    used = {name for name in of_task if _recording(grids[name]) not in recordings}
     if len(used) < len(without):
-        reason, count = needs.OBJECTS.lack, len(without) - len(used)
-        logger.warning("skipped_episodes", reason=f"{reason} ({needs.OBJECTS.remedy})", count=count)
+        reason = f"{needs.OBJECTS.lack} ({needs.OBJECTS.remedy})"
+        logger.warning("skipped_episodes", reason=reason, count=len(without) - len(used))
     if not used:
         return [grids[name] for name in grids if name in with_poses]
     both = replace(posed, is_met=lambda reader: reader.item_id in used | with_poses)
@@ -203,7 +199,6 @@ def load_scene_episodes(
 
 
 def _recording(grid: EpisodeGrid) -> str | None:
-    """What an episode was aligned from at a station."""
     return recording_of(grid.about) if grid.about.origin == "recorded" else None
 
 
@@ -219,18 +214,17 @@ def _grid(
         return SceneGrid(reader, image_px)
     given = clicks.episodes.get(reader.item_id)
     stored = None
+    given = stored = clicks.episodes.get(reader.item_id)
     if given is None:
         held = (store for store in stores if store.exists(reader.item_id))
         stored = next((store.clicks(reader.item_id) for store in held), None)
-    one = given or stored
-    if one is None:
+    if stored is None:
         return SceneGrid(reader, image_px, objects=clicks)
+    one = stored
     clicked = clicked_poses(about, clicks, one, may_lack_headings=given is None)
-    unfinished = [
-        each.name
-        for each, known in zip(clicked.objects, clicked.known.tolist(), strict=True)
-        if not known and each.name in one.objects and one.objects[each.name].state == "seen"
-    ]
+    each = zip(clicked.objects, clicked.known.tolist(), strict=True)
+    missing = [found.name for found, known in each if not known and found.name in one.objects]
+    unfinished = [name for name in missing if one.objects[name].state == "seen"]
     if unfinished:
         logger.warning("clicks_without_heading", episode=reader.item_id, objects=unfinished)
     return SceneGrid(reader, image_px, objects=clicks, clicked=clicked)
@@ -332,7 +326,6 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
 
 
 def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:
-    """People in scenes that are not held out of the robots' ones."""
     scenes = {episode.scene for episode in heldout}
     kept = [episode for episode in people if episode.scene not in scenes]
     if len(kept) < len(people):
@@ -406,6 +399,8 @@ def configured(
         raise InvalidInputError(
             f"state model: got episodes with images of {sorted(sides)} px, expected one size"
         )
+    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
+    usual = DynamicsConfig.model_fields["touch_channels"].default
     return DynamicsConfig(
         tasks=tasks,
         num_objects=num_objects,
@@ -413,6 +408,8 @@ def configured(
         width=settings.width,
         domains=("robot", "human") if data.has_both_domains else ("robot",),
         instructions=_instructions(episodes, settings, base),
+        touch_channels=min(usual, layout.num_taxels),
+        layout=None if layout == DEXTOUCH_V1 else layout,
     )
 
 
@@ -506,13 +503,6 @@ def seed_ranges(episodes: Sequence[EpisodeGrid], base: Base | None) -> dict[str,
         if episode.about.seed is not None:
             seeds.setdefault(episode.task, []).append(episode.about.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
-
-
-def recorded_scenes(episodes: Sequence[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
-    """Digests of the scenes without a seed, the base's included."""
-    known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
-    own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
-    return tuple(sorted(known | own))
 
 
 def heldout_share(settings: StateTrainSettings, base: Base | None) -> float | None:

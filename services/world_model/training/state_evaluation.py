@@ -10,6 +10,7 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
+from dextouch.tactile.layout import TactileLayout
 from services.world_model.dynamics.features import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, batched
 from services.world_model.training.reader_training import reader_errors
@@ -28,10 +29,9 @@ _SMALLEST_DISTANCE = 1e-3
 class StateFigures:
     """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
 
-    `figures` hold errors of readers (first member) and objects in mm, and contact F1 and error of
-    touch for each chunk of 16 steps, also for repeating the touch before the chunk. Names with
-    `from_16` refer to rollouts from the ground truth at step 16, whose chunks start there.
-    `object_mm` is the median position error of an object at the end of a chunk.
+    `figures` hold errors of readers (first member) and objects (median at the end of a chunk) in
+    mm, and contact F1 and error of touch for each chunk of 16 steps, also for repeating the touch
+    before it. Names with `from_16` are of rollouts from the ground truth at step 16.
     """
 
     figures: dict[str, float]
@@ -51,7 +51,7 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
     for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
         imagined = _imagined(dynamics, table, start)
-        figures |= _chunk_figures(imagined, table, start)
+        figures |= _chunk_figures(imagined, table, start, dynamics.config.tactile_layout)
         if start == 0:
             figures |= _episode_figures(imagined, table, dynamics)
         within = table.within(torch.arange(len(table)), start)
@@ -76,33 +76,31 @@ def chunk_peaks(
     return torch.cat([chunk.amax(1)[inside.all(1)] for chunk, inside in pairs])
 
 
-def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> dict[str, float]:
+def _chunk_figures(
+    imagined: ImaginedSteps, table: SceneTable, start: int, layout: TactileLayout
+) -> dict[str, float]:
     figures: dict[str, float] = {}
     place = "" if start == 0 else f"from_{start}_"
     for index, first in enumerate(range(start, table.num_steps - 1, CHUNK_STEPS)):
-        steps = slice(first + 1, first + 1 + CHUNK_STEPS)
         end = min(first + CHUNK_STEPS, table.num_steps - 1)
         # Of shorter episodes, chunks that go beyond their end are left out.
         whole = table.length > end
         if not whole.any():
             break
+        steps, said = (slice(k, k + CHUNK_STEPS) for k in (first + 1, first - start))
         true = table.tactile_kpa[whole, steps].float().numpy()
         measured = table.felt[whole, steps, :, None] & table.measured_taxels[whole, None]
-        said = slice(first - start, first - start + CHUNK_STEPS)
         guesses = {"": imagined.tactile_kpa[whole, said].numpy()}
         if start == 0:
             before = table.tactile_kpa[whole, first : first + 1].float().numpy()
             guesses["_of_copy"] = np.broadcast_to(before, true.shape)
-        for name, guess in guesses.items():
+        for name, guess in guesses.items() if measured.any() else ():
             chunk = f"{place}chunk_{index + 1}{name}"
-            if not measured.any():
-                continue
             pair = {"predicted_kpa": guess, "true_kpa": true, "measured": measured.numpy()}
-            figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
-            figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
-        off_mm, there = _object_errors(
-            imagined.poses.position_m[:, end - start - 1], table, start, end
-        )
+            figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair, layout=layout)
+            figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair, layout=layout)
+        position_m = imagined.poses.position_m[:, end - start - 1]
+        off_mm, there = _object_errors(position_m, table, start, end)
         if there.any():
             figures[f"object_mm_{place}chunk_{index + 1}"] = float(off_mm[there].median())
     return figures

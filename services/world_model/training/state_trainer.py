@@ -24,7 +24,12 @@ from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.checkpoints import StateBounds, StateMetadata, write_state_checkpoint
+from services.world_model.checkpoints import (
+    StateBounds,
+    StateMetadata,
+    scene_digest,
+    write_state_checkpoint,
+)
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
@@ -32,34 +37,14 @@ from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
-from services.world_model.training.core_training import (
-    CoreData,
-    start_steps,
-    touch_latents,
-    train_core,
-)
-from services.world_model.training.domains import training_sets
+from services.world_model.training import core_training, state_data
+from services.world_model.training.dataset import training_sets
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_clips,
     scene_table,
     usual_boxes_m,
-)
-from services.world_model.training.state_data import (
-    StateData,
-    check_drawable,
-    check_new,
-    configured,
-    drawn_episodes,
-    heldout_share,
-    labelled_episodes,
-    load_state_data,
-    object_sources,
-    recorded_scenes,
-    seed_ranges,
-    splits_by_task,
-    trained_splits,
 )
 from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
@@ -98,30 +83,28 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         )
     settings = _with_precision(settings)
     command = _command(settings)
-    data = load_state_data(settings)
+    data = state_data.load_state_data(settings)
     training, heldout = data.training, data.heldout
     base = None if settings.init is None else Base(settings.init)
-    config = configured(data, settings, base)
-    check_new(data, settings, base)
+    config = state_data.configured(data, settings, base)
+    state_data.check_new(data, settings, base)
     if base is not None:
         settings = _with_base(base, config, settings)
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
-    contents = (episode.content_sha256 for episode in training)
-    hashed = data_hash(contents, image_px=_unusual_px(settings))
+    hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
-    heldout_table = scene_table(heldout, config)
-    table = scene_table(
-        training,
-        config,
-        labelled=labelled_episodes(training, settings),
-        human_share=settings.share_of_human,
+    heldout_table, labelled = (
+        scene_table(heldout, config),
+        state_data.labelled_episodes(training, settings),
     )
+    share = settings.share_of_human
+    table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
-        check_drawable(drawn_episodes(data))
+        state_data.check_drawable(state_data.drawn_episodes(data))
     codec = _codec(table, config, base)
-    is_known = all(bool(table.knows_all(step).all()) for step in start_steps(table))
+    is_known = all(bool(table.knows_all(step).all()) for step in core_training.start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
@@ -143,48 +126,44 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     metadata = _metadata(work, data, bounds, measured.figures, command=command, cpu_s=cpu_s)
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
+    size = sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters()))
     return StateReport(
-        settings.output,
-        digest,
-        sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters())),
-        cpu_s,
-        len(training),
-        len(heldout),
-        measured.figures,
+        settings.output, digest, size, cpu_s, len(training), len(heldout), measured.figures
     )
 
 
 def _metadata(
     work: "_Work",
-    data: StateData,
+    data: state_data.StateData,
     bounds: StateBounds,
     metrics: dict[str, float],
     *,
     command: str,
     cpu_s: float,
 ) -> StateMetadata:
-    """Provenance and accuracy of a trained model."""
     settings, base = work.settings, work.base
+    keeps_bounds = base is not None and settings.learn != "all"
+    # Recordings have no seed.
+    scenes = {scene_digest(one.scene) for one in data.training if one.about.seed is None}
+    scenes |= set() if base is None else set(base.checkpoint.metadata.training_scenes)
     return StateMetadata(
         name=settings.name,
         dynamics=work.config,
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
-        bounds=bounds
-        if base is None or settings.learn == "all"
-        else base.checkpoint.metadata.bounds,
+        bounds=base.checkpoint.metadata.bounds if base and keeps_bounds else bounds,
         command=command,
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(data.training),
-        training_seeds=seed_ranges(data.training, base),
-        training_splits=trained_splits(settings, base),
-        task_splits=splits_by_task(data.training, settings, base),
-        heldout_share=heldout_share(settings, base),
-        training_scenes=recorded_scenes(data.training, base),
+        training_seeds=state_data.seed_ranges(data.training, base),
+        training_splits=state_data.trained_splits(settings, base),
+        task_splits=state_data.splits_by_task(data.training, settings, base),
+        heldout_share=state_data.heldout_share(settings, base),
+        training_scenes=tuple(sorted(scenes)),
         data_hash=work.data_hash,
-        object_sources=object_sources(data.training),
+        object_sources=state_data.object_sources(data.training),
         sets=training_sets(
             data.training,
             data.heldout,
@@ -223,11 +202,6 @@ class _Work:
         """Whether the initial model's readers are kept."""
         return self.settings.learn == "success"
 
-    @property
-    def keeps_renderer(self) -> bool:
-        """Whether the initial model's renderer is kept."""
-        return self.settings.learn != "all"
-
     def reader_file(self, member: int) -> Path:
         """File of a member's finished reader; its name depends on settings and data."""
         return self.parts / f"reader-{self._key(READER_VERSION, 'reader')}-{member}.safetensors"
@@ -259,7 +233,9 @@ class _Work:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _objects(data: StateData, config: DynamicsConfig, base: Base | None) -> dict[str, Any]:
+def _objects(
+    data: state_data.StateData, config: DynamicsConfig, base: Base | None
+) -> dict[str, Any]:
     """Names and usual boxes of every task's objects; of tasks without episodes the base's."""
     names = {one.task: one.object_names for one in data.episodes}
     boxes_m = {
@@ -301,7 +277,7 @@ def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
 
 def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> TouchCodec:
     """The base's touch codec, or one fitted to the training episodes."""
-    codec = TouchCodec(config.touch_channels)
+    codec = TouchCodec(config.touch_channels, config.tactile_layout.num_taxels)
     if base is None:
         touch_kpa = table.tactile_kpa[:, ::4][table.felt[:, ::4]].float()
         codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
@@ -311,14 +287,13 @@ def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> Touc
 
 
 def _train_parts(work: _Work) -> None:
-    """Train missing parts, several in parallel."""
     members = range(work.settings.num_members)
     with worker_pool(work.settings.jobs) as pool:
         orders = []
         if not (work.reads_starts or work.keeps_readers):
             orders += [pool.submit(_train_reader, work, m) for m in members]
         orders += [pool.submit(_train_core, work, m) for m in members]
-        if not (work.keeps_renderer or work.renderer_file.exists()):
+        if work.settings.learn == "all" and not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
@@ -327,13 +302,12 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = drawn_episodes(load_state_data(settings))
+    episodes = state_data.drawn_episodes(state_data.load_state_data(settings))
     rng = np.random.default_rng(settings.seed)
-    episodes = [
-        e for e, known in zip(episodes, labelled_episodes(episodes, settings), strict=True) if known
-    ]
-    chosen = rng.permutation(len(episodes))[:MAX_CLIPS]
-    clips = scene_clips([episodes[index] for index in sorted(chosen)])
+    labelled = zip(episodes, state_data.labelled_episodes(episodes, settings), strict=True)
+    known = [episode for episode, is_labelled in labelled if is_labelled]
+    chosen = rng.permutation(len(known))[:MAX_CLIPS]
+    clips = scene_clips([known[index] for index in sorted(chosen)])
     lines = ProgressLines("train renderer", has_bar=False)
 
     def on_progress(share: float, step: int, loss: float) -> None:
@@ -351,7 +325,6 @@ def _train_renderer(work: _Work) -> None:
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
-    """Write a finished part with its CPU seconds."""
     write_tensors(path, model.state_dict(), {_CPU_S: str(cpu_s)})
 
 
@@ -363,10 +336,9 @@ def _load(model: nn.Module, path: Path) -> float:
 
 
 def _table(work: _Work) -> tuple[SceneTable, TouchCodec]:
-    """The training data as kept for the processes of the parts."""
     torch.set_num_threads(1)
     flat = load_file(work.parts / "table.safetensors")
-    codec = TouchCodec(work.config.touch_channels)
+    codec = TouchCodec(work.config.touch_channels, work.config.tactile_layout.num_taxels)
     codec.load_state_dict(
         {k.removeprefix("codec/"): flat.pop(k) for k in list(flat) if k.startswith("codec/")}
     )
@@ -377,13 +349,15 @@ def _train_reader(work: _Work, member: int) -> None:
     if work.reader_file(member).exists():
         return
     table, _ = _table(work)
-    started_s = time.process_time()
-    on_step = _on_step(member, "reader")
+    started_s, base = time.process_time(), work.base
     seed = work.settings.seed * _SEED_STRIDE + member
-    settings, base = work.settings.reader, work.base
-    initial = None if base is None else base.reader(work.config, member, seed=seed)
     trained = train_reader(
-        table, work.config, settings, seed=seed, on_step=on_step, initial=initial
+        table,
+        work.config,
+        work.settings.reader,
+        seed=seed,
+        on_step=_on_step(member, "reader"),
+        initial=None if base is None else base.reader(work.config, member, seed=seed),
     )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
 
@@ -393,22 +367,25 @@ def _train_core(work: _Work, member: int) -> None:
     if work.core_file(member).exists():
         return
     readings: dict[int, Reading] = {}
-    starts_read = work.keeps_readers
-    if work.reads_starts and not starts_read:
+    if work.reads_starts and not work.keeps_readers:
         _train_reader(work, member)
     table, codec = _table(work)
     started_s = time.process_time()
-    if work.reads_starts or starts_read:
+    if work.reads_starts or work.keeps_readers:
         reader = _finished_reader(work, member)
-        readings = {step: read_step(reader, table, step) for step in start_steps(table)}
-    data = CoreData(table, touch_latents(codec, table), readings, starts_read)
+        readings = {
+            step: read_step(reader, table, step) for step in core_training.start_steps(table)
+        }
+    data = core_training.CoreData(
+        table, core_training.touch_latents(codec, table), readings, work.keeps_readers
+    )
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
     initial = None
     if work.base is not None:
         learns_all = work.settings.learn == "all"
         initial = work.base.core(work.config, member, seed=seed, learns_all=learns_all)
-    core = train_core(
+    core = core_training.train_core(
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)
@@ -423,7 +400,6 @@ def _finished_reader(work: _Work, member: int) -> StartReader:
 
 
 def _on_step(member: int, part: str) -> OnStep:
-    """Shows how far a part of a member is."""
     lines = ProgressLines(f"train member {member} {part}", has_bar=False)
 
     def on_step(step: int, loss: float) -> None:
@@ -446,7 +422,7 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
         cpu_s += _load(core, work.core_file(index))
     dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)
-    if work.base is not None and work.keeps_renderer:
+    if work.base is not None and work.settings.learn != "all":
         renderer.load_state_dict(work.base.checkpoint.renderer.state_dict())
     else:
         cpu_s += _load(renderer, work.renderer_file)
@@ -454,14 +430,13 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
 
 
 def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
-    """Weights of cores of one member each as those of one core with all members."""
+    """One core's weights from cores of one member each."""
     weights = [dict(core.named_parameters()) for core in cores]
     shared = dict(cores[0].named_buffers())
     return shared | {name: torch.cat([each[name] for each in weights]) for name in weights[0]}
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """Command that repeats a run, as its checkpoint records it."""
     command = "adapt" if isinstance(settings, StateAdaptSettings) else "world-model"
     places = ("episodes", "human", "heldout", "init", "clicks")
     left_out = {"output", "jobs", "json_path"}

@@ -24,29 +24,19 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from services.networks.optimizer import (
-    Budget,
-    OptimizerLoop,
-    OptimizerOptions,
-    floored_cosine,
-    update_average,
-)
-from services.networks.principal_axes import root_pressure
-from services.world_model.checkpoints import (
-    Reconstruction,
-    StoredTokenizer,
-    TokenizerMetadata,
-    read_tokenizer,
-    write_tokenizer,
-)
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout, common_layout
+from services.networks import optimizer
+from services.world_model import checkpoints
+from services.world_model.dynamics.features import root_pressure
 from services.world_model.network.tactile import LearnedTokenizer, TactileTokenizer, build_tokenizer
 from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
 from services.world_model.training.scene_table import filled_touch
 
-_EVALUATION_BATCH = 1000
-_TIMING_ROUNDS = 5
-OnEvaluation = Callable[[float, Reconstruction], None]
+_EVALUATION_BATCH, _TIMING_ROUNDS = 1000, 5
+# Chosen: decay of the averaged weights, for runs of some thousand steps.
+_EMA_DECAY = 0.99
+OnEvaluation = Callable[[float, checkpoints.Reconstruction], None]
 # By scene: the touch of each episode, and its content.
 _Side = dict[str, list[tuple[np.ndarray, str]]]
 
@@ -58,9 +48,10 @@ class TactileHands:
     `data_hash` is that of their episodes.
     """
 
-    tactile_kpa: Float32[np.ndarray, "hands 320"]
+    tactile_kpa: Float32[np.ndarray, "hands taxels"]
     scenes: tuple[str, ...]
     data_hash: str
+    layout: TactileLayout = DEXTOUCH_V1
 
 
 def load_hands(
@@ -72,12 +63,14 @@ def load_hands(
     not measured are filled.
 
     Raises:
-        InvalidInputError: either side has no scene.
+        InvalidInputError: either side has no scene, or the episodes are of several gloves.
         NotFoundError, ConflictError: as `select_episodes`.
     """
     sides: tuple[_Side, _Side] = ({}, {})
+    layouts = []
     for reader in select_episodes([EpisodeStore(url) for url in urls], splits=splits):
         grid = EpisodeGrid(reader)
+        layouts.append(grid.tactile_layout)
         touch_kpa, is_measured = filled_touch(grid)
         side = sides[scene_fraction(grid.scene) < heldout_share]
         side.setdefault(grid.scene, []).append((touch_kpa[is_measured], grid.content_sha256))
@@ -86,13 +79,15 @@ def load_hands(
             f"tokenizer: got {len(sides[0])} scenes to train on and {len(sides[1])} held out, "
             "expected at least one each; add episodes or change --heldout-share"
         )
-    training, heldout = (_hands(side) for side in sides)
+    layout = common_layout(layouts, what="tokenizer: episodes")
+    training, heldout = (_hands(side, layout) for side in sides)
     return training, heldout
 
 
-def _hands(side: _Side) -> TactileHands:
+def _hands(side: _Side, layout: TactileLayout) -> TactileHands:
     touch_kpa, contents = zip(*chain(*side.values()), strict=True)
-    return TactileHands(np.concatenate(touch_kpa), tuple(sorted(side)), data_hash(contents))
+    together = np.concatenate(touch_kpa)
+    return TactileHands(together, tuple(sorted(side)), data_hash(contents), layout)
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,7 @@ class TokenizerReport:
     """Result of a run; times are medians of encoding and decoding on this machine."""
 
     checkpoint: Path
-    metadata: TokenizerMetadata
+    metadata: checkpoints.TokenizerMetadata
     digest: str
     ms_per_1000_hands: float
 
@@ -121,10 +116,10 @@ def train_tokenizer(
     )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        tokenizer = build_tokenizer(settings.network())
+        tokenizer = build_tokenizer(settings.network().with_layout(training.layout))
     tokenizer.fit(torch.from_numpy(training.tactile_kpa)[:, None].expand(-1, 2, -1))
-    budget = Budget(settings.cpu_budget_s, settings.max_steps)
-    curve: list[Reconstruction] = []
+    budget = optimizer.Budget(settings.cpu_budget_s, settings.max_steps)
+    curve: list[checkpoints.Reconstruction] = []
 
     def evaluate(current: TactileTokenizer) -> None:
         with budget.paused():
@@ -134,7 +129,7 @@ def train_tokenizer(
 
     if isinstance(tokenizer, LearnedTokenizer):
         tokenizer = _learn(tokenizer, training, settings, budget, evaluate)
-    metadata = TokenizerMetadata(
+    metadata = checkpoints.TokenizerMetadata(
         tokenizer=settings.tokenizer,
         palm_channels=settings.palm_channels,
         tactile_channels=settings.tactile_channels,
@@ -147,16 +142,19 @@ def train_tokenizer(
         num_heldout_hands=len(heldout.tactile_kpa),
         train_scenes=training.scenes,
         data_hash=training.data_hash,
+        layout=None if training.layout == DEXTOUCH_V1 else training.layout,
         curve=(
-            Reconstruction(step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0),
+            checkpoints.Reconstruction(
+                step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0
+            ),
         ),
     )
-    write_tokenizer(settings.output, tokenizer, metadata)
+    checkpoints.write_tokenizer(settings.output, tokenizer, metadata)
     # Evaluate the weights as stored, then store them again with the curve.
-    stored = read_tokenizer(settings.output).tokenizer
+    stored = checkpoints.read_tokenizer(settings.output).tokenizer
     evaluate(stored)
     metadata = metadata.model_copy(update={"curve": tuple(curve)})
-    digest = write_tokenizer(settings.output, stored, metadata)
+    digest = checkpoints.write_tokenizer(settings.output, stored, metadata)
     return TokenizerReport(settings.output, metadata, digest, _ms_per_1000_hands(stored, heldout))
 
 
@@ -164,7 +162,7 @@ def _learn(
     tokenizer: LearnedTokenizer,
     training: TactileHands,
     settings: TrainTokenizerSettings,
-    budget: Budget,
+    budget: optimizer.Budget,
     evaluate: Callable[[TactileTokenizer], None],
 ) -> LearnedTokenizer:
     """The moving average of the weights after training, evaluated at equal shares of the run."""
@@ -178,36 +176,30 @@ def _learn(
     generator = torch.Generator().manual_seed(settings.seed + 1)
     averaged = copy.deepcopy(tokenizer).eval().requires_grad_(requires_grad=False)
     given = settings.optimizer
-    options = OptimizerOptions(
-        learning_rate=given.learning_rate,
-        weight_decay=given.weight_decay,
-        max_gradient_norm=given.max_gradient_norm,
-        warmup_steps=given.warmup_steps,
-        schedule=floored_cosine,
+    options = optimizer.OptimizerOptions(
+        given.learning_rate, 0.0, warmup_steps=given.warmup_steps, schedule=optimizer.floored_cosine
     )
 
     def loss() -> Tensor:
-        drawn = torch.randint(len(touched), (given.batch,), generator=generator)
-        return reconstruction_loss(
-            tokenizer, touched[drawn], contact_weight=settings.contact_weight
-        )
+        drawn = touched[torch.randint(len(touched), (given.batch,), generator=generator)]
+        return reconstruction_loss(tokenizer, drawn, contact_weight=settings.contact_weight)
 
     evaluate(averaged)
     num_evaluated = 0
-    for _ in OptimizerLoop(tokenizer, options, budget).run(loss):
-        update_average(averaged, tokenizer, decay=given.ema_decay, num_updates=budget.step - 1)
-        if (
-            num_evaluated + 1
-            <= budget.share() * settings.num_evaluations
-            < settings.num_evaluations
-        ):
+    for _ in optimizer.OptimizerLoop(tokenizer, options, budget).run(loss):
+        optimizer.update_average(averaged, tokenizer, decay=_EMA_DECAY, num_updates=budget.step - 1)
+        due = budget.share() * settings.num_evaluations
+        if num_evaluated + 1 <= due < settings.num_evaluations:
             evaluate(averaged)
             num_evaluated += 1
     return averaged
 
 
 def reconstruction_loss(
-    tokenizer: LearnedTokenizer, tactile_kpa: Float32[Tensor, "hands 320"], *, contact_weight: float
+    tokenizer: LearnedTokenizer,
+    tactile_kpa: Float32[Tensor, "hands taxels"],
+    *,
+    contact_weight: float,
 ) -> Float32[Tensor, ""]:
     """Weighted mean squared error of root pressures (kPa).
 
@@ -220,33 +212,32 @@ def reconstruction_loss(
 
 
 def reconstruction(
-    tokenizer: TactileTokenizer, hands: TactileHands, budget: Budget
-) -> Reconstruction:
+    tokenizer: TactileTokenizer, hands: TactileHands, budget: optimizer.Budget
+) -> checkpoints.Reconstruction:
     """Accuracy of a tokenizer on hands, at this point of a run."""
     decoded = [
         _through(tokenizer, hands.tactile_kpa[begin : begin + _EVALUATION_BATCH])
         for begin in range(0, len(hands.tactile_kpa), _EVALUATION_BATCH)
     ]
-    predicted, true = np.concatenate(decoded), hands.tactile_kpa
-    return Reconstruction(
+    pair = {"predicted_kpa": np.concatenate(decoded), "true_kpa": hands.tactile_kpa}
+    return checkpoints.Reconstruction(
         step=budget.step,
         cpu_s=round(budget.cpu_s, 2),
-        mse_kpa2=tactile_metrics.mse(predicted_kpa=predicted, true_kpa=true),
-        mae_kpa=tactile_metrics.mae(predicted_kpa=predicted, true_kpa=true),
-        contact_iou=tactile_metrics.contact_iou(predicted_kpa=predicted, true_kpa=true),
-        contact_f1=tactile_metrics.contact_f1(predicted_kpa=predicted, true_kpa=true),
+        mse_kpa2=tactile_metrics.mse(**pair, layout=hands.layout),
+        mae_kpa=tactile_metrics.mae(**pair, layout=hands.layout),
+        contact_iou=tactile_metrics.contact_iou(**pair, layout=hands.layout),
+        contact_f1=tactile_metrics.contact_f1(**pair, layout=hands.layout),
     )
 
 
 @torch.no_grad()
 def _through(
-    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands 320"]
-) -> Float32[np.ndarray, "hands 320"]:
+    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands taxels"]
+) -> Float32[np.ndarray, "hands taxels"]:
     return tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa))).numpy()
 
 
 def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> float:
-    """Median CPU time of encoding and decoding a batch of 1000 hands."""
     batch = np.resize(hands.tactile_kpa, (1000, hands.tactile_kpa.shape[1]))
     times_ms = []
     for _ in range(_TIMING_ROUNDS):
@@ -256,7 +247,9 @@ def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> floa
     return float(np.median(times_ms))
 
 
-def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:
+def with_tokenizer(
+    settings: TrainSettings,
+) -> tuple[TrainSettings, checkpoints.StoredTokenizer | None]:
     """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
 
     Raises:
@@ -280,13 +273,13 @@ def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokeni
             "training: got --init and --tokenizer, expected one of them; the initial checkpoint "
             "holds the tokenizer that its latents come from"
         )
-    stored = read_tokenizer(settings.tokenizer)
+    stored = checkpoints.read_tokenizer(settings.tokenizer)
     network = stored.metadata.network(settings.network)
     return settings.model_copy(update={"network": network}), stored
 
 
 def split_unseen(
-    episodes: Sequence[E], stored: StoredTokenizer, *, heldout_percent: int
+    episodes: Sequence[E], stored: checkpoints.StoredTokenizer, *, heldout_percent: int
 ) -> tuple[list[E], list[E]]:
     """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
 
@@ -310,7 +303,7 @@ def split_unseen(
     )
 
 
-def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:
+def check_unseen(heldout: Sequence[TrainingEpisode], stored: checkpoints.StoredTokenizer) -> None:
     """Raise if the tokenizer was trained on the scene of a held-out episode."""
     seen = set(stored.metadata.train_scenes)
     both = [episode.episode_id for episode in heldout if episode.scene in seen]

@@ -15,65 +15,20 @@ from pydantic import JsonValue
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
-from services.networks.optimizer import (
-    Budget,
-    OptimizerLoop,
-    OptimizerOptions,
-    floored_cosine,
-    update_average,
-)
+from dextouch.tactile.layout import common_layout
+from services.networks import optimizer
 from services.networks.weight_files import on_device
-from services.world_model.checkpoints import (
-    Checkpoint,
-    CheckpointMetadata,
-    StoredTokenizer,
-    learned_tasks,
-    read_checkpoint,
-    read_tokenizer,
-    write_checkpoint,
-)
+from services.world_model import checkpoints
 from services.world_model.network.configuration import WanFiles
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.paper_settings import TrainSettings, command_line
 from services.world_model.pretrained_video import initial_model, share_texts
-from services.world_model.training.dataset import (
-    E,
-    EpisodeArrays,
-    StoredEpisode,
-    TrainingEpisode,
-    WindowBatch,
-    WindowPosition,
-    WindowSampler,
-    index_episodes,
-    load_episodes,
-    read_batches,
-)
+from services.world_model.training import dataset, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.domains import (
-    check_stores,
-    check_tasks,
-    subset_by_hash,
-    training_sets,
-)
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import LossOptions, losses, own_context
-from services.world_model.training.tokenizer_trainer import (
-    check_unseen,
-    split_unseen,
-    with_tokenizer,
-)
-from services.world_model.training.training_state import (
-    RunFacts,
-    StateFiles,
-    TrainingState,
-    identity_of,
-    moments_like,
-    optimizer_tensors,
-    part_of,
-    restore_optimizer,
-)
 
 LOG_EVERY_STEPS = 20
 
@@ -100,7 +55,7 @@ class TrainingRun:
 
     def __init__(
         self,
-        episodes: Sequence[TrainingEpisode],
+        episodes: Sequence[dataset.TrainingEpisode],
         settings: TrainSettings,
         processes: Processes = ALONE,
     ) -> None:
@@ -108,7 +63,7 @@ class TrainingRun:
         self.settings = settings
         self.episodes = episodes
         self.processes = processes
-        self.budget = Budget(settings.cpu_budget_s, settings.max_steps)
+        self.budget = optimizer.Budget(settings.cpu_budget_s, settings.max_steps)
         self.log: list[TrainingProgress] = []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -123,24 +78,14 @@ class TrainingRun:
         # Generator states after the windows trained on, and after those read ahead.
         self._window_numbers = json.dumps(self._rng.bit_generator.state)
         self._drawn: deque[str] = deque()
-        windows = settings.windows
-        self._sampler = WindowSampler(
+        self._sampler = dataset.WindowSampler(
             episodes,
             self._rng,
             max_steps=self._window_steps(settings.network.max_steps),
-            commanded_fraction=windows.commanded_fraction,
-            chained_fraction=windows.chained_fraction,
             human_share=settings.share_of_human,
         )
-        options = OptimizerOptions(
-            learning_rate=settings.optimizer.learning_rate,
-            weight_decay=settings.optimizer.weight_decay,
-            max_gradient_norm=settings.optimizer.max_gradient_norm,
-            warmup_steps=settings.optimizer.warmup_steps,
-            schedule=floored_cosine,
-            betas=(0.9, 0.95),
-        )
-        self.loop = OptimizerLoop(self.model, options, self.budget)
+        options = settings.optimizer.options()
+        self.loop = optimizer.OptimizerLoop(self.model, options, self.budget)
 
     @torch.no_grad()
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
@@ -170,20 +115,20 @@ class TrainingRun:
             on_device(model, self.settings.device)
         self.averaged.load_state_dict(model.state_dict())
 
-    def start_from(self, checkpoint: Checkpoint) -> None:
+    def start_from(self, checkpoint: checkpoints.Checkpoint) -> None:
         """Take over the weights and codecs of a checkpoint.
 
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
         """
-        sampling = {"sampling_steps", "sampler", "sampling_time_shift"}
+        common_layout(
+            [checkpoint.metadata.network.tactile_layout, self.settings.network.tactile_layout],
+            what="--init and the training episodes",
+        )
+        sampling = {"sampling_steps", "sampler", "sampling_time_shift", "layout"}
         requested = self.settings.network.model_dump(exclude=sampling)
         there = checkpoint.metadata.network.model_dump(exclude=sampling)
-        others = {
-            name: (there[name], requested[name])
-            for name in requested
-            if there[name] != requested[name]
-        }
+        others = {n: (there[n], value) for n, value in requested.items() if there[n] != value}
         if others:
             raise ConflictError(
                 "training: the initial checkpoint has other network settings (stored, "
@@ -205,26 +150,26 @@ class TrainingRun:
         share_texts(self.model, model)
         return model
 
-    def state(self, identity: dict[str, JsonValue]) -> TrainingState:
+    def state(self, identity: dict[str, JsonValue]) -> training_state.TrainingState:
         """Tensors and metadata that the next steps depend on."""
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
         tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
-        tensors |= optimizer_tensors(self.loop.optimizer)
+        tensors |= training_state.optimizer_tensors(self.loop.optimizer)
         tensors["generator"] = self._generator.get_state()
-        facts = RunFacts(
+        facts = training_state.RunFacts(
             identity=identity,
             step=self.budget.step,
             cpu_s=self.budget.cpu_s,
             window_numbers=self._window_numbers,
             log=tuple(astuple(entry) for entry in self.log),
         )
-        return TrainingState(tensors, facts)
+        return training_state.TrainingState(tensors, facts)
 
-    def restore(self, state: TrainingState) -> None:
+    def restore(self, state: training_state.TrainingState) -> None:
         """Continue from `state`."""
-        self.model.load_state_dict(part_of(state.tensors, "model."))
-        self.averaged.load_state_dict(part_of(state.tensors, "averaged."))
-        restore_optimizer(self.loop.optimizer, state.tensors)
+        self.model.load_state_dict(training_state.part_of(state.tensors, "model."))
+        self.averaged.load_state_dict(training_state.part_of(state.tensors, "averaged."))
+        training_state.restore_optimizer(self.loop.optimizer, state.tensors)
         self._generator.set_state(state.tensors["generator"])
         self._window_numbers = state.facts.window_numbers
         self._rng.bit_generator.state = json.loads(self._window_numbers)
@@ -249,9 +194,8 @@ class TrainingRun:
             budget.advance()
             budget.cpu_s = self.processes.mean(torch.tensor(budget.cpu_s)).item()
             if budget.step % LOG_EVERY_STEPS == 0 or budget.share() >= 1.0:
-                progress = TrainingProgress(
-                    budget.step, min(budget.share(), 1.0), loss_video, loss_tactile
-                )
+                share = min(budget.share(), 1.0)
+                progress = TrainingProgress(budget.step, share, loss_video, loss_tactile)
                 self.log.append(progress)
                 if on_progress is not None:
                     on_progress(progress)
@@ -259,47 +203,43 @@ class TrainingRun:
                 on_step(self)
         return self.log
 
-    def learn(self, batch: WindowBatch) -> tuple[float, float]:
+    def learn(self, batch: dataset.WindowBatch) -> tuple[float, float]:
         """One optimizer step; returns the video and tactile losses."""
         settings = self.settings.optimizer
         if self.settings.self_forcing:
             batch = own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
+        noise, is_own = self.settings.windows.context_noise, self.settings.self_forcing
+        options = LossOptions(noise, settings.touch_loss, settings.precision, own_noisy=is_own)
         loss = losses(
             self.model,
             batch,
             generator=self._generator,
-            options=LossOptions(
-                self.settings.windows.context_noise,
-                settings.touch_loss,
-                settings.precision,
-                own_noisy=self.settings.self_forcing,
-            ),
+            options=options,
             processes=self.processes,
         )
         total = loss.video + settings.tactile_weight * loss.tactile
         self.loop.learn(total, video=loss.video, touch=loss.tactile)
-        update_average(
+        optimizer.update_average(
             self.averaged, self.model, decay=settings.ema_decay, num_updates=self.budget.step
         )
         video, tactile = self.processes.mean(torch.stack([loss.video, loss.tactile])).tolist()
         return video, tactile
 
-    def _batches(self) -> Iterator[WindowBatch]:
-        """Endless iterator over the windows of each step."""
+    def _batches(self) -> Iterator[dataset.WindowBatch]:
         if self.settings.streaming:
             workers = self.settings.loader_workers
-            return read_batches(self.episodes, self._noted_places(), num_workers=workers)
+            return dataset.read_batches(self.episodes, self._noted_places(), num_workers=workers)
         return map(self._sampler.cut, self._noted_places())
 
-    def _noted_places(self) -> Iterator[list[WindowPosition]]:
+    def _noted_places(self) -> Iterator[list[dataset.WindowPosition]]:
         """`places`, recording the generator state after each, since readers fetch ahead."""
         for places in self.places():
             self._drawn.append(json.dumps(self._rng.bit_generator.state))
-            yield self.processes.part(places)
+            yield self.processes.own(places)
 
-    def places(self) -> Iterator[list[WindowPosition]]:
+    def places(self) -> Iterator[list[dataset.WindowPosition]]:
         """Endless iterator over the places of the windows of each step."""
         while True:
             num_steps = self._window_steps(self._num_steps())
@@ -347,23 +287,24 @@ def train(
 
 
 def train_on(
-    trained: Sequence[TrainingEpisode],
-    heldout: Sequence[EpisodeArrays],
+    trained: Sequence[dataset.TrainingEpisode],
+    heldout: Sequence[dataset.EpisodeArrays],
     settings: TrainSettings,
     on_progress: OnProgress | None = None,
     processes: Processes = ALONE,
 ) -> TrainingReport | None:
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
-    settings, tokenizer = with_tokenizer(settings)
+    settings, tokenizer = tokenizer_trainer.with_tokenizer(settings)
+    settings = _with_layout(settings, (*trained, *heldout), tokenizer)
     if tokenizer is not None:
-        check_unseen(heldout, tokenizer)
+        tokenizer_trainer.check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
-    ancestor = None if settings.init is None else read_checkpoint(settings.init)
+    ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
     if ancestor is not None:
-        known_tasks = {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
-    check_tasks((*trained, *heldout), settings, known_tasks)
+        known_tasks = {*ancestor.metadata.tasks, *checkpoints.learned_tasks(ancestor.metadata.sets)}
+    dataset.check_tasks((*trained, *heldout), settings, known_tasks)
     prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
@@ -376,7 +317,7 @@ def train_on(
     averaged = run.whole_average()
     if averaged is None:
         return None
-    metadata = CheckpointMetadata(
+    metadata = checkpoints.CheckpointMetadata(
         name=settings.name,
         network=settings.network,
         tasks=tuple(sorted({episode.task for episode in trained})),
@@ -389,7 +330,7 @@ def train_on(
         data_hash=_data_hash(trained, settings, ancestor),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
-        sets=training_sets(
+        sets=dataset.training_sets(
             trained,
             heldout,
             human_share=settings.share_of_human,
@@ -399,16 +340,16 @@ def train_on(
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
     )
-    write_checkpoint(settings.output, averaged, metadata)
+    checkpoints.write_checkpoint(settings.output, averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
-    stored = on_device(read_checkpoint(settings.output).model, settings.device)
+    stored = on_device(checkpoints.read_checkpoint(settings.output).model, settings.device)
     metrics = evaluate_prediction(
         stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride
     )
-    digest = write_checkpoint(
+    digest = checkpoints.write_checkpoint(
         settings.output, stored, metadata.model_copy(update={"metrics": metrics})
     )
-    StateFiles(settings.output, processes).remove()
+    training_state.StateFiles(settings.output, processes).remove()
     return TrainingReport(
         checkpoint=settings.output,
         digest=digest,
@@ -422,8 +363,28 @@ def train_on(
     )
 
 
+def _with_layout(
+    settings: TrainSettings,
+    episodes: Sequence[dataset.TrainingEpisode],
+    tokenizer: checkpoints.StoredTokenizer | None,
+) -> TrainSettings:
+    """The settings with a network for the taxels of all episodes.
+
+    Raises:
+        InvalidInputError: episodes of several gloves, or a tokenizer of another one.
+    """
+    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
+    if tokenizer is not None:
+        known = settings.network.tactile_layout
+        common_layout([known, layout], what="--tokenizer and the training episodes")
+    network = settings.network.with_layout(layout)
+    return settings.model_copy(update={"network": network})
+
+
 def _data_hash(
-    episodes: Sequence[TrainingEpisode], settings: TrainSettings, ancestor: Checkpoint | None
+    episodes: Sequence[dataset.TrainingEpisode],
+    settings: TrainSettings,
+    ancestor: checkpoints.Checkpoint | None,
 ) -> str:
     """Hash of the episodes, and of those that the initial checkpoint was trained on."""
     return data_hash(
@@ -433,7 +394,9 @@ def _data_hash(
     )
 
 
-def _tokenizer_digest(ancestor: Checkpoint | None, tokenizer: StoredTokenizer | None) -> str | None:
+def _tokenizer_digest(
+    ancestor: checkpoints.Checkpoint | None, tokenizer: checkpoints.StoredTokenizer | None
+) -> str | None:
     if tokenizer is not None:
         return tokenizer.digest
     return None if ancestor is None else ancestor.metadata.tokenizer_digest
@@ -441,21 +404,21 @@ def _tokenizer_digest(ancestor: Checkpoint | None, tokenizer: StoredTokenizer | 
 
 def _run_or_resume(
     run: "TrainingRun",
-    ancestor: Checkpoint | None,
-    tokenizer: StoredTokenizer | None,
+    ancestor: checkpoints.Checkpoint | None,
+    tokenizer: checkpoints.StoredTokenizer | None,
     on_progress: OnProgress | None,
 ) -> list[TrainingProgress]:
     """Run from the start or resume an interrupted run; saves its state regularly."""
     settings = run.settings
-    files = StateFiles(settings.output, run.processes)
-    identity = identity_of(
+    files = training_state.StateFiles(settings.output, run.processes)
+    identity = training_state.identity_of(
         settings,
         data_hash=_data_hash(run.episodes, settings, None),
         init_digest=None if ancestor is None else ancestor.digest,
         tokenizer_digest=None if tokenizer is None else tokenizer.digest,
     )
     if settings.resume and files.exists():
-        like = {**moments_like(run.loop.optimizer), **run.state(identity).tensors}
+        like = {**training_state.moments_like(run.loop.optimizer), **run.state(identity).tensors}
         run.restore(files.read(identity, like))
     elif ancestor is not None:
         run.start_from(ancestor)
@@ -472,41 +435,49 @@ def _run_or_resume(
     return run.run(on_progress, keep)
 
 
-def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+def load_split(
+    settings: TrainSettings,
+) -> tuple[Sequence[dataset.TrainingEpisode], list[dataset.EpisodeArrays]]:
     """Training and held-out episodes of the settings' stores; held-out ones are in memory.
 
     Robot episodes are split before a subset of them is taken, so that every subset has the same
     held-out episodes. These are never human if human stores are given.
     """
     px = settings.network.image_px
-    how = index_episodes if settings.streaming else load_episodes
+    how = dataset.index_episodes if settings.streaming else dataset.load_episodes
     read = partial(how, splits=settings.splits, image_px=px)
     domain: Domain | None = "robot" if settings.human else None
-    trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
+    trained: Sequence[dataset.TrainingEpisode] = read(settings.episodes, domain=domain)
     if settings.heldout is not None:
-        heldout = load_episodes(settings.heldout, domain=domain, image_px=px)
+        heldout = dataset.load_episodes(settings.heldout, domain=domain, image_px=px)
     else:
         trained, stored = _split(trained, settings)
-        heldout = [one.load() if isinstance(one, StoredEpisode) else one for one in stored]
-    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
-    people: list[TrainingEpisode] = []
+        heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
+    trained = dataset.subset_by_hash(trained, settings.robot_episodes, what="robot")
+    people: list[dataset.TrainingEpisode] = []
     for url in settings.human if settings.human_episodes != 0 else ():
         people += read(url, domain="human")
-    together = [*trained, *subset_by_hash(people, settings.human_episodes, what="human")]
+    together = [*trained, *dataset.subset_by_hash(people, settings.human_episodes, what="human")]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     ids = [episode.episode_id for episode in together]
-    check_stores([settings.episodes, *settings.human], ids, rates_hz)
+    dataset.check_stores([settings.episodes, *settings.human], ids, rates_hz)
     return together, heldout
 
 
-def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
+def _split(
+    episodes: Sequence[dataset.E], settings: TrainSettings
+) -> tuple[list[dataset.E], list[dataset.E]]:
     if settings.tokenizer is None:
         return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
-    stored = read_tokenizer(settings.tokenizer)
-    return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
+    stored = checkpoints.read_tokenizer(settings.tokenizer)
+    return tokenizer_trainer.split_unseen(
+        episodes, stored, heldout_percent=settings.heldout_percent
+    )
 
 
-def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
+def check_disjoint(
+    trained: Sequence[dataset.TrainingEpisode], heldout: Sequence[dataset.TrainingEpisode]
+) -> None:
     """Raise if a held-out episode, or its scene, is also trained on."""
     prints = {episode.fingerprint() for episode in trained}
     scenes = {episode.scene for episode in trained}

@@ -2,9 +2,8 @@
 
 It is one safetensors file of the weights, their moving average, the optimizer and the random state,
 with the counters as JSON in its metadata. Under torchrun it is a folder with a folder for each
-state, in which every process has a file; the counters, in a JSON file beside them, name the newest
-complete one, and any number of processes can resume. A crash at any time leaves the last complete
-state, which is removed when the run has ended.
+state, with a file of every process; the counters, in a JSON file beside them, name the newest
+complete one, and any number of processes can resume. A crash leaves the last complete state.
 """
 
 import json
@@ -48,8 +47,7 @@ class RunFacts(FrozenModel):
     """Metadata of a state.
 
     `identity` holds the settings and data of the run, `window_numbers` the state of the generator
-    that draws windows after the last completed step, as JSON. `log` has rows of step, completed
-    fraction of the run, and the video and tactile losses.
+    of windows, as JSON. `log` has rows of step, completed fraction, and video and tactile losses.
     """
 
     identity: dict[str, JsonValue]
@@ -111,9 +109,8 @@ class StateFiles:
                 tensors, notes = read_tensors(self._file, where)
             except CorruptDataError as error:
                 raise CorruptDataError(f"{error.message}; remove it to start over") from error
-            return TrainingState(
-                tensors, checked_facts(notes.get(METADATA_KEY, ""), identity, where)
-            )
+            facts = checked_facts(notes.get(METADATA_KEY, ""), identity, where)
+            return TrainingState(tensors, facts)
         where = f"training state {self._folder.name}"
         facts = checked_facts((self._folder / FACTS).read_text(), identity, where)
         reader = HuggingFaceStorageReader(str(self._of_step(facts.step)))
@@ -188,8 +185,7 @@ def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> R
     names = facts.identity.keys() | expected.keys()
     others = sorted(n for n in names if saved.get(n) != expected.get(n))
     if others:
-        was = {name: saved.get(name) for name in others}
-        now = {name: expected.get(name) for name in others}
+        was, now = ({name: some.get(name) for name in others} for some in (saved, expected))
         raise ConflictError(
             f"{where}: saved by a run with {was}, got {now}; use the settings and episodes of that "
             "run, or omit --resume to start over"

@@ -1,7 +1,4 @@
-"""A state model that a training starts from, and its parts as a training continues them.
-
-Which parts are trained and which are kept is decided in `state_trainer`, by `--learn`.
-"""
+"""A state model that a training starts from, and its parts as a training continues them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
+from dextouch.tactile.layout import common_layout
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
 from services.world_model.dynamics.features import DynamicsConfig
@@ -38,9 +36,13 @@ class Base:
         With `keeps_tasks`, they stay the base's, of which the episodes have some.
 
         Raises:
-            InvalidInputError: images of another size.
+            InvalidInputError: images of another size, or another glove.
         """
         own = self.checkpoint.metadata.dynamics
+        common_layout(
+            [own.tactile_layout, config.tactile_layout],
+            what=f"--init {self._path.name} and the episodes",
+        )
         if own.image_px != config.image_px:
             raise InvalidInputError(
                 f"--init {self._path.name}: reads images of {own.image_px} px, the episodes have "
@@ -59,9 +61,8 @@ class Base:
     def has_tasks_of(self, config: DynamicsConfig) -> bool:
         """Whether the base has all of these tasks, with as many objects."""
         own = self.checkpoint.metadata.dynamics
-        counts = dict(zip(own.tasks, own.num_objects, strict=True))
-        wanted = zip(config.tasks, config.num_objects, strict=True)
-        return all(counts.get(task) == count for task, count in wanted)
+        counts = set(zip(own.tasks, own.num_objects, strict=True))
+        return counts >= set(zip(config.tasks, config.num_objects, strict=True))
 
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
         """A member's reader; weights of tasks that the base does not know are fresh."""
@@ -126,8 +127,7 @@ def _with_new_inputs(
 ) -> dict[str, Tensor]:
     """Weights of a core for one that also tells people from robots, or reads an instruction.
 
-    The new inputs have no effect at first, and people feel as robots do. The last inputs are
-    whether a person acts, and then the instruction.
+    The new inputs, the last ones, have no effect at first, and people feel as robots do.
     """
     shapes = {name: value.shape for name, value in core.named_parameters()}
     known = dict(kept)
@@ -135,14 +135,10 @@ def _with_new_inputs(
     for name, value in kept.items():
         missing = shapes[name][1] - value.shape[1] if value.ndim == 3 else 0
         if missing:
-            sentence = value[:, value.shape[1] - own.instruction_size :]
-            before = functional.pad(
-                value[:, : value.shape[1] - own.instruction_size],
-                (0, 0, 0, missing - new_sentence),
-            )
-            known[name] = functional.pad(
-                torch.cat([before, sentence], dim=1), (0, 0, 0, new_sentence)
-            )
+            others = value.shape[1] - own.instruction_size
+            before = functional.pad(value[:, :others], (0, 0, 0, missing - new_sentence))
+            both = torch.cat([before, value[:, others:]], dim=1)
+            known[name] = functional.pad(both, (0, 0, 0, new_sentence))
     for name in shapes:
         robots = name.removeprefix("human.")
         if name not in kept and robots in kept:

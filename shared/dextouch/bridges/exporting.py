@@ -11,20 +11,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from dextouch.episodes import (
-    GOP_IMAGES,
-    EpisodeReader,
-    RecordingReader,
-    disk_errors,
-)
+from dextouch.episodes import GOP_IMAGES, EpisodeReader, RecordingReader, disk_errors
 from dextouch.errors import ConflictError
-from dextouch.streams import (
-    ENCODED_UNITS,
-    H264_UNIT,
-    NO_DEVICE_TIME,
-    NO_SEQUENCE,
-    encoded_values,
-)
+from dextouch.streams import ENCODED_UNITS, H264_UNIT, NO_DEVICE_TIME, NO_SEQUENCE, encoded_values
 
 BLOCK_IMAGES: Final = 32
 Reader = EpisodeReader | RecordingReader
@@ -57,9 +46,9 @@ def exported_samples(reader: Reader, name: str) -> Int64[np.ndarray, " kept"]:
 
 
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
-    """Iterate over a stream in order, about one second per block; encoded images stay encoded.
+    """Iterate over `exported_samples` in order, about a second per block.
 
-    Only `exported_samples` are among them.
+    Encoded images stay encoded.
     """
     descriptor, t_ns = reader.streams[name], reader.stamps_ns(name)
     t_device_ns, sequence = np.full_like(t_ns, NO_DEVICE_TIME), np.full_like(t_ns, NO_SEQUENCE)
@@ -84,12 +73,8 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
 def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Context manager with a temporary path, renamed to `path` when the block succeeds.
 
-    Args:
-        path: of the finished file; its folder is created.
-        overwrite: whether an existing file is replaced.
-
     Raises:
-        ConflictError: `path` exists and `overwrite` is false.
+        ConflictError: `path` exists, and is a folder or not to be overwritten.
         StorageError: the write failed.
     """
     if path.is_dir() or (path.exists() and not overwrite):

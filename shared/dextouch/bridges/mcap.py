@@ -28,7 +28,15 @@ from dextouch.bridges.mcap_messages import (
     descriptor_set,
     raw_encoding,
 )
-from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, disk_errors
+from dextouch.episodes import (
+    Attributes,
+    EpisodeReader,
+    EpisodeStore,
+    EpisodeWriter,
+    attributes_id,
+    disk_errors,
+    kind_of,
+)
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -53,28 +61,19 @@ _BLOCK_BYTES: Final = 1 << 24
 MAX_RECORD_BYTES: Final = 1 << 28
 MAGIC: Final = b"\x89MCAP0\r\n"
 _WANTED = (Attachment, Channel, DataEnd, Message, Metadata, Schema)
-Attributes = EpisodeAttributes | RecordingAttributes
 
 
 def export_mcap(
     reader: Reader, path: Path, *, overwrite: bool = False, jpeg_quality: int | None = None
 ) -> int:
-    """Write one episode or recording as MCAP.
+    """Write one episode or recording as MCAP and return the number of messages.
 
     `log_time` is t_ref_ns (episode) or t_host_ns (recording), `publish_time` the device's stamp
-    where there is one. Encoded images are copied unchanged.
-
-    Args:
-        reader: of the episode or recording.
-        path: of the new file.
-        overwrite: whether an existing file is replaced.
-        jpeg_quality: 1 … 100 encodes `rgb8` images as JPEG, which is lossy; None keeps raw pixels.
-
-    Returns:
-        Number of messages.
+    where there is one. Encoded images are copied unchanged; `jpeg_quality` 1 … 100 encodes `rgb8`
+    images as JPEG, which is lossy, None keeps raw pixels.
 
     Raises:
-        ConflictError: the file exists.
+        ConflictError: the file exists, and is not to be overwritten.
         InvalidInputError: a quality outside 1 … 100.
         StorageError: the write failed.
     """
@@ -86,8 +85,6 @@ def export_mcap(
 
 
 class _Export:
-    """One file that is being written."""
-
     def __init__(self, reader: Reader, writer: Writer, jpeg_quality: int | None) -> None:
         self._reader, self._writer, self._quality = reader, writer, jpeg_quality
         self._is_episode = isinstance(reader, EpisodeReader)
@@ -103,9 +100,8 @@ class _Export:
 
     def _as_sent(self, stream: StreamDescriptor) -> StreamDescriptor:
         is_raw = stream.kind == "image" and stream.unit not in ENCODED_UNITS
-        if self._quality is None or not is_raw or raw_encoding(stream) != "rgb8":
-            return stream
-        return stream.model_copy(update={"unit": "jpeg"})
+        to_jpeg = self._quality is not None and is_raw and raw_encoding(stream) == "rgb8"
+        return stream.model_copy(update={"unit": "jpeg"}) if to_jpeg else stream
 
     def run(self) -> int:
         """Write schemas, channels, attachments and messages, in this order."""
@@ -216,14 +212,7 @@ class _Export:
 
 
 def import_mcap(path: Path, store: EpisodeStore) -> str:
-    """Import an MCAP file written by `export_mcap` into a store.
-
-    Args:
-        path: of the file; it may come from anywhere.
-        store: where the episode or recording appears under the id that it had.
-
-    Returns:
-        The id.
+    """Import an MCAP file of `export_mcap` into a store, under the id that it had; returns the id.
 
     Raises:
         NotFoundError: no such file.
@@ -233,7 +222,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
         ConflictError: the id is in the store already.
     """
     attributes, counts = _about(path)
-    kind: Kind = "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+    kind = kind_of(attributes)
     with store.writer(kind=kind, attributes=attributes) as writer:
         streams = {
             f"/{stream.name}": _Stream(MessageCodec(stream), writer, is_episode=kind == "episode")
@@ -248,9 +237,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
                     f"{path}: {topic} holds {stream.num_samples} messages, expected {expected}; "
                     "the file was cut or filtered after the export"
                 )
-    if isinstance(attributes, EpisodeAttributes):
-        return attributes.episode_id
-    return attributes.recording_id
+    return attributes_id(attributes)
 
 
 def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
@@ -300,7 +287,6 @@ class _Stream:
         self._sent: list[Sent] = []
 
     def add(self, data: bytes) -> None:
-        """Add one message."""
         self._sent.append(self.codec.decode(data))
         self.num_samples += 1
         self._num_bytes += len(data)
@@ -308,7 +294,6 @@ class _Stream:
             self.flush()
 
     def flush(self) -> None:
-        """Write the buffered samples."""
         sent, descriptor = self._sent, self.codec.descriptor
         self._sent, self._num_bytes = [], 0
         if not sent:
@@ -365,11 +350,7 @@ class _Bounded:
 def records(path: Path) -> Iterator[McapRecord]:
     """Schemas, channels, messages, attachments and metadata in the order of the file.
 
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not an MCAP file, or an unsupported compression.
-        CorruptDataError: truncated, or a checksum mismatch.
-        LimitExceededError: a record exceeds the size limit.
+    Raises as `import_mcap`; InvalidInputError also for an unsupported compression.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")

@@ -131,10 +131,9 @@ class MessageCodec:
         return np.dtype(ARRAYS[self.descriptor.dtype][2])
 
     def decode(self, data: bytes) -> Sent:
-        """Decode a message; a missing device field becomes 0.
+        """Decode a message; raises CorruptDataError for bytes that are none of this stream.
 
-        Raises:
-            CorruptDataError: bytes that are not a message of this stream.
+        A missing device field becomes 0.
         """
         most_bytes = self._num_elements * _MAX_BYTES_PER_ELEMENT + _MAX_OTHER_BYTES
         if len(data) > most_bytes and not self._is_encoded:

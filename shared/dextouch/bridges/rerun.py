@@ -16,9 +16,9 @@ from dextouch.bridges.exporting import Block, Reader, blocks, new_file
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
-from dextouch.streams import HEAD_CAMERA, StreamDescriptor
-from dextouch.tactile import colour, hand_canvas
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, select_taxels
+from dextouch.streams import HEAD_CAMERA, TAXEL_UNIT, StreamDescriptor
+from dextouch.tactile import colour
+from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 APPLICATION: Final = "dextouch"
 FULL_SCALE_KPA: Final = 40.0
@@ -29,20 +29,12 @@ _Columns = Callable[[Block], dict[str, Any]]
 
 
 def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
-    """Write one episode or recording for the Rerun viewer.
+    """Write one episode or recording for the Rerun viewer, and return the number of samples.
 
     The timeline is `t_ref` (episode) or `t_host` (recording). Encoded images are not decoded.
 
-    Args:
-        reader: of the episode or recording.
-        path: of the new file.
-        overwrite: whether an existing file is replaced.
-
-    Returns:
-        Number of samples.
-
     Raises:
-        ConflictError: the file exists.
+        ConflictError: the file exists, and is not to be overwritten.
         InvalidInputError: a stream that Rerun cannot display.
         StorageError: the write failed.
     """
@@ -82,10 +74,6 @@ def entity_of(descriptor: StreamDescriptor) -> str:
     return f"tactile/{name}" if descriptor.kind == "tactile" else f"numbers/{name}"
 
 
-def _names(reader: Reader, kind: str) -> list[str]:
-    return [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
-
-
 def _blueprint(reader: Reader) -> rrb.Blueprint:
     """Viewer layout: 3D view and plots on the left, cameras in the middle, touch on the right."""
     columns = [
@@ -95,7 +83,8 @@ def _blueprint(reader: Reader) -> rrb.Blueprint:
         )
     ]
     for kind in ("image", "tactile"):
-        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in _names(reader, kind)]
+        entities = [entity_of(stream) for stream in reader.streams.values() if stream.kind == kind]
+        views = [rrb.Spatial2DView(origin=e, name=e.split("/")[1]) for e in entities]
         if views:
             columns.append(rrb.Vertical(*views))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)
@@ -115,7 +104,6 @@ def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
 
 
 def _log(stream: rr.RecordingStream, reader: Reader, descriptor: StreamDescriptor) -> int:
-    """Log one stream; returns its number of samples."""
     entity, kind, num_samples = entity_of(descriptor), descriptor.kind, 0
     if kind == "image":
         columns = _images(stream, entity, descriptor)
@@ -177,11 +165,17 @@ def _touch(
     stream: rr.RecordingStream, entity: str, reader: Reader, descriptor: StreamDescriptor
 ) -> _Columns:
     full_scale = FULL_SCALE_KPA
-    if descriptor.unit != "kPa":
+    if descriptor.unit != TAXEL_UNIT:
         # Raw counts have no absolute scale; the strongest reading of the take is the brightest.
         largest = [block.values.max() for block in blocks(reader, descriptor.name)]
         full_scale = float(max(largest, default=1)) or 1.0
-    draw = partial(heat_map, side=_side(descriptor) or "left", full_scale=full_scale)
+    draw = partial(
+        heat_map,
+        side=_side(descriptor) or "left",
+        full_scale=full_scale,
+        layout=descriptor.tactile_layout,
+        is_raw=_is_raw(descriptor),
+    )
     _log_format(stream, entity, draw(np.zeros(descriptor.shape)).shape)
     return lambda block: {entity: _pixels(np.stack([draw(row) for row in block.values]))}
 
@@ -220,21 +214,36 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
     return {entity: columns.partition([rows.shape[1]] * len(block))}
 
 
-def heat_map(row: np.ndarray, *, side: Side, full_scale: float) -> UInt8[np.ndarray, "28 26 3"]:
+def heat_map(
+    row: np.ndarray,
+    *,
+    side: Side,
+    full_scale: float,
+    layout: TactileLayout = DEXTOUCH_V1,
+    is_raw: bool = False,
+) -> UInt8[np.ndarray, "rows columns 3"]:
     """One reading of a glove as a small RGB picture of the hand.
 
     Args:
-        row: 320 taxels or the 360 raw cells.
+        row: taxels, or the raw cells.
         side: of the hand.
         full_scale: reading shown at full brightness, in the unit of the row.
+        layout: of the glove.
+        is_raw: whether the row holds raw cells.
     """
-    taxels = select_taxels(row, side=side) if row.shape == (NUM_RAW_TAXELS,) else row
-    return colour(hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
+    taxels = layout.select(row, side=side) if is_raw else row
+    return colour(layout.hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
+
+
+def _is_raw(descriptor: StreamDescriptor) -> bool:
+    return descriptor.unit != TAXEL_UNIT and descriptor.shape == (
+        descriptor.tactile_layout.num_raw_cells,
+    )
 
 
 def _side(descriptor: StreamDescriptor) -> Side | None:
     """Side of a tactile stream; None if it cannot be drawn as a hand."""
-    if descriptor.shape not in {(NUM_TAXELS,), (NUM_RAW_TAXELS,)}:
+    if not (_is_raw(descriptor) or descriptor.shape == (descriptor.tactile_layout.num_taxels,)):
         return None
     if descriptor.side is not None:
         return descriptor.side

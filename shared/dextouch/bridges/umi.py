@@ -47,19 +47,11 @@ NUMBERS: Final[dict[str, str]] = {
 
 
 def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool = False) -> int:
-    """Write episodes one after another on the model grid.
-
-    Args:
-        readers: of episodes with the same cameras and image sizes; each is read once.
-        path: of the new zip file.
-        overwrite: whether an existing file is replaced.
-
-    Returns:
-        Number of steps.
+    """Write episodes one after another on the model grid to a zip, and return the number of steps.
 
     Raises:
-        ConflictError: the file exists.
-        InvalidInputError: no episode, or one that is inconsistent with the first.
+        ConflictError: the file exists, and is not to be overwritten.
+        InvalidInputError: no episode, or one whose cameras and image sizes are not the first one's.
         StorageError: the write failed.
     """
     with (
@@ -156,7 +148,6 @@ def _append_episode(group: zarr.Group, reader: EpisodeReader, cameras: tuple[str
 
 
 def _numbers(reader: EpisodeReader) -> dict[str, np.ndarray]:
-    """Rows of the arrays in `NUMBERS`."""
     data = reader.read("action")
     arrays = {"data/t_ref_ns": data.t_ref_ns, "data/action": data.values}
     if "action_commanded" in reader.streams:

@@ -3,7 +3,7 @@ from .episode_store import EpisodeStoreClient as EpisodeStoreClient
 from .http_link import HttpLink as HttpLink
 from .http_link import Reply as Reply
 from .openpi import OpenPiPolicy as OpenPiPolicy
-from .policy import Policy as Policy
-from .policy import PolicyStart as PolicyStart
+from .rollouts import Policy as Policy
+from .rollouts import PolicyStart as PolicyStart
 from .rollouts import Rollout as Rollout
 from .rollouts import RolloutClient as RolloutClient

@@ -45,11 +45,7 @@ DEFAULT_TIMEOUT_S = 30.0
 class EpisodeStoreClient:
     """Client of one store service. Every call may be repeated after UnavailableError.
 
-    Args:
-        url: of the service.
-        api_key: if the service requires one.
-        timeout_s: of one request.
-        transport: httpx transport, for example an application in this process.
+    `timeout_s` is of one request; `transport` may be an application in this process.
     """
 
     def __init__(
@@ -145,18 +141,15 @@ class EpisodeStoreClient:
     def confirm_removal(self, removed: ConfirmRemoval) -> None:
         """Say that a station holds no deleted takes any more, except those that it names.
 
-        Raises:
-            ConflictError: there was another deletion since `removed.revision`.
+        Raises ConflictError if there was another deletion since `removed.revision`.
         """
         path, body = "/v1/deletions/confirm", removed.model_dump_json()
         self._model(DeletionsRevision, "POST", path, content=body)
 
     def recordings(self, **wanted: Scalar | Sequence[str] | None) -> RecordingList:
-        """Finished recordings that match every given filter.
+        """Finished recordings that match every given filter, as in docs/wire_format.md.
 
-        Args:
-            wanted: filters and page, as in docs/wire_format.md, such as
-                `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
+        Such as `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
         """
         return self._model(RecordingList, "GET", "/v1/recordings", query=wanted)
 
@@ -280,11 +273,7 @@ class EpisodeStoreClient:
             headers["content-type"] = "application/octet-stream" if binary else "application/json"
         try:
             response = self._http.request(
-                method,
-                path,
-                params=httpx.QueryParams(given),
-                content=content,
-                headers=headers,
+                method, path, params=httpx.QueryParams(given), content=content, headers=headers
             )
         except httpx.TransportError as error:
             raise UnavailableError(

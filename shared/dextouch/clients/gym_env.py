@@ -37,23 +37,15 @@ ResultT = TypeVar("ResultT")
 
 
 class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
-    """One task in one served world.
+    """One task in one served world; an action is `chunk_steps` model steps.
 
-    The observation is that of the newest step: `tactile_kpa` [2, 320], `action_reached` [67] and
+    The observation is that of the newest step: `tactile_kpa` [2, taxels], `action_reached` [67] and
     one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends the
     episode, `max_chunks` truncates it. A world without a success check never terminates. A world
     that cannot continue a rollout truncates it: the observation is then the last one again, and
     `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
     `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far, and the numbers that the
     world reports about the chunk.
-
-    Args:
-        client: of the service.
-        world: its name at the service.
-        task: one of the world's.
-        instruction: in words.
-        chunk_steps: model steps of an action, a multiple of the world's chunk.
-        max_chunks: number of chunks after which the episode is truncated.
     """
 
     def __init__(
@@ -87,11 +79,9 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[SeenNow, dict[str, Any]]:
-        """Start a new rollout.
+        """Start a new rollout; without a seed of the start and the world's noise one is drawn.
 
-        Args:
-            seed: of the start and the world's noise; None draws one.
-            options: {"init": (observation, anchor, K_head)} starts from an observation.
+        The options {"init": (observation, anchor, K_head)} start from an observation.
         """
         super().reset(seed=seed)
         unknown = sorted(set(options or {}) - {"init"})
@@ -146,11 +136,9 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
 
     Autoreset is disabled: once an episode has ended, its environment must be reset before the next
     step, by `options={"reset_mask": terminations | truncations}`. If a reset or a step raises, some
-    environments may have done it and others not; reset all of them.
-
-    Args:
-        envs: of equal spaces, each with a client of its own, since a client is not thread-safe.
-            They are closed with this one; their clients stay open.
+    environments may have done it and others not; reset all of them. Spaces are equal, and each has
+    a client of its own, which is not thread-safe; they are closed with this one, their clients are
+    not.
     """
 
     def __init__(self, envs: Sequence[WorldEnv]) -> None:
@@ -180,12 +168,10 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[SeenNow, dict[str, Any]]:
-        """Start new rollouts.
+        """Start new rollouts; the seed of the first counts up for the others, or each has its own.
 
-        Args:
-            seed: one for each environment, or that of the first, counted up for the others.
-            options: {"reset_mask": bool array [num_envs]} leaves the others as they are;
-                {"inits": sequence} starts each from its own (observation, anchor, K_head).
+        The options {"reset_mask": bool array [num_envs]} leave the others as they are; {"inits":
+        sequence} start each from its own (observation, anchor, K_head).
         """
         rest = dict(options or {})
         chosen = self._chosen(rest.pop("reset_mask", None))
@@ -240,7 +226,6 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         self._threads.shutdown()
 
     def _chosen(self, mask: object) -> list[int]:
-        """Indices of the environments to reset."""
         if mask is None:
             return list(range(self.num_envs))
         array = np.asarray(mask)
@@ -270,7 +255,8 @@ def _observation_space(description: WorldDescription) -> spaces.Space[SeenNow]:
     parts: dict[str, spaces.Space[Any]] = {
         camera: spaces.Box(0, 255, shape, np.uint8) for camera in description.cameras
     }
-    parts["tactile_kpa"] = spaces.Box(-MAX_TACTILE_KPA, MAX_TACTILE_KPA, (2, 320), np.float32)
+    touch = (2, description.num_taxels)
+    parts["tactile_kpa"] = spaces.Box(-MAX_TACTILE_KPA, MAX_TACTILE_KPA, touch, np.float32)
     parts["action_reached"] = spaces.Box(-MAX_REACHED, MAX_REACHED, (ACTION_DIM,), np.float64)
     return spaces.Dict(parts)
 

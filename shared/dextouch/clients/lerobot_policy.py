@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients.rollouts import PolicyStart
 from dextouch.errors import DexTouchError, InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import Observation
@@ -39,17 +39,13 @@ SERVED_NAMES: Final = {
 class LeRobotPolicy:
     """A LeRobot policy with its processors, which acts as in LeRobot's own control loop.
 
-    It must have been trained on an export of episodes: its inputs are among `observation.state`,
-    `observation.tactile` and `observation.images.CAMERA`, its actions have 67 numbers.
+    `path` is the folder of its checkpoint (`pretrained_model`). It must have been trained on an
+    export of episodes: its inputs are among `observation.state`, `observation.tactile` and
+    `observation.images.CAMERA`, its actions have 67 numbers. `chunk_steps` must divide its
+    `n_action_steps`: it is asked at the start of a chunk, when there is a new observation.
 
-    Args:
-        path: folder of the checkpoint (`pretrained_model`), with its processors.
-        chunk_steps: rows of an action chunk. It must divide the policy's `n_action_steps`, so that
-            the policy is asked at the start of a chunk, when there is a new observation.
-
-    Raises:
-        InvalidInputError: a policy that needs other inputs, or several observations at once.
-        ShapeError: actions of another width.
+    Raises InvalidInputError for a policy that needs other inputs, or several observations at once,
+    ShapeError for actions of another width.
     """
 
     looks = "last"

@@ -8,7 +8,7 @@ import numpy as np
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients.rollouts import PolicyStart
 from dextouch.errors import InvalidInputError, ShapeError, UnavailableError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import Observation
@@ -23,8 +23,8 @@ class OpenPiPolicy:
 
     Each request holds the newest step: images (uint8 [h, w, 3]) under the names in `images`,
     `observation/state` (float64 [67], the reached poses and joint angles, relative to the rollout's
-    step 0), `observation/tactile` (float32 [2, 320] in kPa), and the instruction as `prompt`. The
-    server answers with `actions`, rows of 67 numbers that are commands relative to step 0.
+    step 0), `observation/tactile` (float32 [2, taxels] in kPa), and the instruction as `prompt`.
+    The server answers with `actions`, rows of 67 numbers that are commands relative to step 0.
 
     Args:
         url: of the server, such as `ws://127.0.0.1:8000`.

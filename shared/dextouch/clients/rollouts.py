@@ -1,4 +1,4 @@
-"""HTTP client of served worlds: start a rollout, step it by action chunks, fork it.
+"""Protocol of policies, which act in any world, and HTTP client of served worlds.
 
 with RolloutClient("http://127.0.0.1:8100") as client:
     with client.start(world="twin", task="stand_bottle", seed=3, instruction="…") as rollout:
@@ -8,7 +8,8 @@ with RolloutClient("http://127.0.0.1:8100") as client:
 
 from contextlib import nullcontext, suppress
 from copy import copy
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 from urllib.parse import quote, urlencode
 
 import numpy as np
@@ -49,14 +50,10 @@ InitialObservation = tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]
 class RolloutClient:
     """A connection to a service of worlds; not thread-safe (open one per thread).
 
-    Args:
-        url: of the service.
-        api_key: with the scope `rollout`; None where the service requires none.
-        timeout_s: for one response.
-        patience_s: how long a service that has ever responded may be full or away, as while
-            another worker takes over; requests are repeated meanwhile.
-        selector: cameras and steps to return for every rollout of this client.
-        name: shown to those who watch its rollouts, such as the policy's.
+    The key needs the scope `rollout`. A service that has ever responded may be full or away for
+    `patience_s`, as while another worker takes over; requests are repeated meanwhile. `selector`
+    says which cameras and steps its rollouts return; `name`, such as the policy's, is shown to
+    those who watch.
     """
 
     def __init__(
@@ -97,8 +94,8 @@ class RolloutClient:
     ) -> "Rollout":
         """Start a rollout from a task and seed, or from an observation made elsewhere.
 
-        A connection that is lost meanwhile may leave a second, unused rollout at the service; it
-        expires there by itself.
+        A connection that is lost meanwhile may leave an unused rollout at the service, which
+        expires there.
 
         Raises:
             UnknownNameError: world, task or action kind (the valid ones are listed).
@@ -169,19 +166,13 @@ class Rollout:
         selector: ReturnSelector | None = None,
         validated: bool = False,
     ) -> Observation:
-        """Advance by one action chunk.
+        """Advance by one action chunk, and return the observation of its K steps.
 
-        If this raises UnavailableError, the same call may be made again: a chunk that the service
-        already applied is not applied twice; its response is repeated.
-
-        Args:
-            actions: [K, 67], K a multiple of the world's chunk; row i is the pose at step i+1 of
-                the chunk, relative to the rollout's step 0.
-            selector: of this chunk alone; None for the client's.
-            validated: `check_actions` has returned these actions, and they need no second look.
-
-        Returns:
-            The observation of the K steps (of the last one if the selector says so).
+        Row i of `actions` [K, 67], K a multiple of the world's chunk, is the pose at step i+1 of
+        the chunk, relative to the rollout's step 0. `selector` is of this chunk alone, None the
+        client's; with `validated` they come from `check_actions`. If this raises UnavailableError,
+        the same call may be made again: a chunk that the service already applied is not applied
+        twice.
 
         Raises:
             EndedError: the world cannot continue this rollout, for the `reason` given; the last
@@ -240,3 +231,40 @@ def _parsed(model: type[ModelT], reply: Reply) -> ModelT:
         raise UnavailableError(
             f"answer: {first_problems(error)}; is a DexTouch service of this version there?"
         ) from error
+
+
+@dataclass(frozen=True)
+class PolicyStart:
+    """Information that a policy gets before its first observation.
+
+    `anchor` are the absolute poses of the rollout's step 0, which all actions are relative to;
+    `seed` is for the policy's own random numbers.
+    """
+
+    task: str
+    instruction: str
+    seed: int
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
+
+    A policy with an attribute `looks` that is False gets no images after the first step, so that
+    worlds need not render them. With `looks = "last"` it may get nothing but the last step of each
+    chunk. `tasks` names those it supports; `python -m benchmarks evaluator` skips all others.
+    """
+
+    def reset(self, start: PolicyStart) -> None:
+        """Reset all state for a new rollout."""
+        ...
+
+    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+        """The next action chunk, given the observations since the last call (the last step is now).
+
+        Rows are poses and joint angles as commands, relative to the rollout's step 0; their
+        number is a multiple of the world's chunk.
+        """
+        ...

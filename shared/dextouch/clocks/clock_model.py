@@ -134,15 +134,11 @@ class ClockModel:
     def to_host_ns(
         self, t_device_ns: np.ndarray, t_host_ns: np.ndarray | None = None
     ) -> Int64[np.ndarray, " n"]:
-        """Host times of device times [n], on the host's clock at the smallest path delay.
+        """Host times of unwrapped device times [n], on the host's clock at the smallest path delay.
 
-        Args:
-            t_device_ns: unwrapped device stamps, int64.
-            t_host_ns: arrival of each, needed only if the device's clock went back, to select the
-                segment. No sample is dated after its arrival.
-
-        Raises:
-            InvalidInputError: the device's clock went back and no arrivals are given.
+        Their arrivals are needed only if the device's clock went back, to select the segment; no
+        sample is dated after its arrival. Raises InvalidInputError where they are needed and
+        missing.
         """
         t_device_ns = np.asarray(t_device_ns, dtype=np.int64)
         if t_host_ns is None and self.is_ambiguous:
@@ -171,10 +167,8 @@ class ClockModel:
 def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
     """Fit a clock model to a whole take by the lower convex hull, non-causally.
 
-    Args:
-        t_device_ns: unwrapped device stamps [n], in order of arrival. Steps and restarts of the
-            device's clock are detected, and segments fitted separately.
-        t_host_ns: arrivals [n] on the host's monotonic clock.
+    Unwrapped device stamps and arrivals on the host's monotonic clock [n] are in order of arrival.
+    Steps and restarts of the device's clock are detected, and segments fitted separately.
 
     Raises:
         ClockFitError: `details["cause"]` is "too_few" (below 10 samples), "not_finite" (no
@@ -213,11 +207,7 @@ def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
     """Minimum of arrival minus fitted time within five seconds, the largest of the take.
 
     Queueing, bursts and stalls let some samples through promptly; only with a wrong fit or a
-    lasting delay are all of them late.
-
-    Args:
-        residual_ns: arrival minus fitted time of every sample.
-        host: their arrivals, in order; a slow stream's seconds are ten periods long.
+    lasting delay are all of them late. A slow stream's seconds are ten periods long.
     """
     if len(host) < MIN_PROMPT_SAMPLES:
         return 0.0
@@ -392,13 +382,10 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
 def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
     """Replace one or two wrong stamps in a row by whole periods from the right ones beside them.
 
-    Stamps of a regular device are wrong if those beside them are whole periods apart and they are
-    not whole periods from these. The number of periods is that of the arrivals where samples are
-    missing. Stamps of irregular devices stay as they are.
-
-    Args:
-        t_device_ns: unwrapped device stamps [n].
-        t_host_ns: their arrivals [n].
+    Unwrapped device stamps and arrivals are [n]. Stamps of a regular device are wrong if those
+    beside them are whole periods apart and they are not whole periods from these. The number of
+    periods is that of the arrivals where samples are missing. Stamps of irregular devices stay as
+    they are.
     """
     device, host = np.array(t_device_ns, dtype=np.int64), np.asarray(t_host_ns)
     if len(device) < MIN_SAMPLES or not (stamps := _Stamps(device)).is_regular:

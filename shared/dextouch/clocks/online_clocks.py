@@ -49,14 +49,11 @@ def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
 def unwrap_counter(
     raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
 ) -> Int64[np.ndarray, " n"]:
-    """Unwrap a counter that wraps at `modulus`.
+    """Unwrap integer counts [n] in 0 … modulus - 1 of a counter that wraps at `modulus`, 2 … 2**62.
 
-    Args:
-        raw: integer counts [n], each in 0 … modulus - 1.
-        modulus: count at which the counter starts again from zero, 2 … 2**62.
-        hint: another clock in the same unit [n] (arrival times). It gives the number of wraps in a
-            gap longer than a wrap; without it a step of more than half a modulus counts as one
-            wrap, a smaller step back as a step back.
+    `hint` is another clock in the same unit [n] (arrival times). It gives the number of wraps in a
+    gap longer than a wrap; without it a step of more than half a modulus counts as one wrap, a
+    smaller step back as a step back.
 
     Raises:
         ShapeError: not one axis of integers, or a hint of another length.
@@ -83,11 +80,9 @@ def unwrap_counter(
 
 
 def count_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> int:
-    """Number of samples that are missing from a stream's sequence; none where it restarts.
+    """Number of samples that are missing from a stream's sequence [n]; none where it restarts.
 
-    Args:
-        sequence: numbers [n] as the device sent them.
-        bits: width of the device's counter, 8 … 64 (64 never wraps in practice).
+    The device's counter has 8 … 64 bits (64 never wraps in practice).
     """
     if not 8 <= bits <= 64:
         raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
@@ -102,11 +97,8 @@ class OnlineClock:
     The line under the (device time, apparent offset) points of the last minute, as in `fit_clock`,
     but causal (`RunningEnvelope`). Without device time, or where it is very coarse, the sequence
     number times the nominal period is the device's clock; without either, the arrival itself is
-    returned (`CountingClock` is more accurate for such samples, with a delay).
-
-    Args:
-        descriptor: the stream's descriptor; needed for wrapping or coarse stamps and for streams
-            that have only a sequence number.
+    returned (`CountingClock` is more accurate for such samples, with a delay). Wrapping or coarse
+    stamps, and streams that have only a sequence number, need the stream's descriptor.
     """
 
     def __init__(self, descriptor: StreamDescriptor | None = None) -> None:
@@ -150,14 +142,10 @@ class OnlineClock:
     ) -> int:
         """Corrected host time of one sample, strictly increasing.
 
-        Args:
-            t_host_ns: arrival on the host's monotonic clock.
-            t_device_ns: the device's raw stamp (wrapping as in the descriptor); None or -1 if the
-                device has none.
-            sequence: the device's sequence number; None or -1 likewise.
+        The arrival is on the host's monotonic clock; the device's raw stamp (wrapping as in the
+        descriptor) and sequence number are None or -1 if it has none.
 
-        Raises:
-            InvalidInputError: a stamp or number that earlier samples had is missing.
+        Raises InvalidInputError if a stamp or number that earlier samples had is missing.
         """
         device_ns = self._counter.straighten(t_host_ns, t_device_ns, sequence)
         estimate_ns = t_host_ns if device_ns is None else self._estimate(device_ns, t_host_ns)
@@ -258,13 +246,8 @@ class CountedSample(NamedTuple):
 class CountingClock:
     """Estimates the times of samples of a steady device without stamps and sequence numbers.
 
-    Times are available ten samples later, or once a queue has drained.
-
-    Args:
-        period_ns: nominal sample period, accurate within a few percent.
-
-    Attributes:
-        num_lost: lost samples, up to the last final time.
+    Times are available ten samples later, or once a queue has drained. The nominal period is
+    accurate within a few percent; `num_lost` counts lost samples up to the last final time.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -303,8 +286,7 @@ class CountingClock:
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
         """Add one arrival on the host's monotonic clock; returns the samples decided by it.
 
-        Raises:
-            InvalidInputError: it precedes the last arrival.
+        Raises InvalidInputError if it precedes the last arrival.
         """
         if self._waiting and t_host_ns < self._waiting[-1]:
             raise InvalidInputError(
@@ -387,14 +369,9 @@ class CountedTake:
 
 
 def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
-    """Estimate the sample times of a steady device from its arrivals alone.
+    """Estimate the sample times of a steady device from its arrivals [n] alone, which are in order.
 
-    Args:
-        t_host_ns: arrivals [n] in order, int64.
-        period_ns: nominal sample period, accurate within a few percent.
-
-    Raises:
-        InvalidInputError: arrivals out of order.
+    The nominal period is accurate within a few percent. Raises InvalidInputError as `advance`.
     """
     clock = CountingClock(period_ns)
     counted: list[CountedSample] = []

@@ -77,15 +77,9 @@ class RoundTripClock:
     """Estimates the offset between the local clock and a remote one that replies to requests.
 
     Used for devices (stamps against the host's clock) and for other hosts (their clock against the
-    station's reference clock). A step of the remote clock by more than the band is detected at once
-    and restarts the estimate; memory is bounded.
-
-    Args:
-        resolution_ns: of the remote stamps.
-
-    Attributes:
-        num_steps: steps of the remote clock.
-        num_exchanges: exchanges since the last step.
+    station's reference clock). A step of the remote clock by more than the band, counted in
+    `num_steps`, is detected at once and restarts the estimate, of `num_exchanges` exchanges since;
+    memory is bounded. `resolution_ns` is that of the remote stamps.
     """
 
     def __init__(self, *, resolution_ns: int = 1) -> None:
@@ -102,8 +96,7 @@ class RoundTripClock:
     def add(self, exchange: RoundTrip) -> None:
         """Add one exchange, in order of the requests.
 
-        Raises:
-            InvalidInputError: a reply before its request, or out of order.
+        Raises InvalidInputError for a reply before its request, or out of order.
         """
         if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
             raise InvalidInputError(
@@ -137,23 +130,20 @@ class RoundTripClock:
     ) -> ClockOffset:
         """Offset at a local time; by default at the last exchange.
 
-        Args:
-            at_local_ns: any local time.
-            skew: estimate from another source, used if more accurate than that of the exchanges.
+        `skew`, of another source, is used if it is more accurate than that of the exchanges.
 
-        Raises:
-            ClockFitError: no exchange yet (`details["cause"]` is "too_few").
+        Raises ClockFitError without an exchange (`details["cause"]` is "too_few").
         """
         if self._reference is None:
             raise ClockFitError("round trip clock: no exchange yet", cause="too_few")
         at_local_ns = self._last_ns if at_local_ns is None else at_local_ns
         x_s = self._x_s(at_local_ns)
-        slope, doubt = self._slope()
-        if skew is not None and skew.sigma_ppm * 1e3 < doubt:
-            slope, doubt = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
+        slope, uncertainty = self._slope()
+        if skew is not None and skew.sigma_ppm * 1e3 < uncertainty:
+            slope, uncertainty = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
         high_ns, low_ns, age_s = self._band(x_s, slope)
         width_ns = max(0.0, high_ns - low_ns)
-        drift_ns = doubt * age_s
+        drift_ns = uncertainty * age_s
         return ClockOffset(
             at_local_ns=at_local_ns,
             offset_ns=self._reference[1] + round((high_ns + low_ns) / 2),
@@ -167,10 +157,7 @@ class RoundTripClock:
     ) -> PathLatency:
         """Path latency that is still contained in a device's corrected times.
 
-        Args:
-            t_remote_ns: a sample's device time.
-            t_estimated_ns: the same sample's time by `OnlineClock` or `fit_clock`.
-            skew: of the remote clock, as estimated from samples.
+        It comes from a sample's device time, and its time by `OnlineClock` or `fit_clock`.
         """
         offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns
@@ -198,7 +185,7 @@ class RoundTripClock:
 
     def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
         """Whether an exchange lies entirely outside the band of the others."""
-        slope, doubt = self._slope()
+        slope, uncertainty = self._slope()
         band_high_ns, band_low_ns, age_s = self._band(x_s, slope)
-        slack_ns = 2 * doubt * age_s + self._resolution_ns
+        slack_ns = 2 * uncertainty * age_s + self._resolution_ns
         return high_ns < band_low_ns - slack_ns or low_ns > band_high_ns + slack_ns

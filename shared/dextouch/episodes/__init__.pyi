@@ -9,11 +9,13 @@ from .files import replace_file as replace_file
 from .format import COMMIT_FILE as COMMIT_FILE
 from .format import GOP_IMAGES as GOP_IMAGES
 from .format import KINDS as KINDS
+from .format import Attributes as Attributes
 from .format import Kind as Kind
+from .format import attributes_id as attributes_id
 from .format import check_id as check_id
+from .format import kind_of as kind_of
 from .format import shard_path as shard_path
 from .format import stream_arrays as stream_arrays
-from .h264_headers import first_gap as first_gap
 from .image_codecs import FULL_FORM as FULL_FORM
 from .image_codecs import GopEncoder as GopEncoder
 from .image_codecs import ImageForm as ImageForm
@@ -21,6 +23,7 @@ from .image_codecs import VideoSettings as VideoSettings
 from .image_codecs import check_group as check_group
 from .image_codecs import check_video_size as check_video_size
 from .image_codecs import decoder_of_this_thread as decoder_of_this_thread
+from .image_codecs import first_gap as first_gap
 from .image_codecs import is_keyframe as is_keyframe
 from .image_codecs import parameter_sets as parameter_sets
 from .object_poses import ClickedPoses as ClickedPoses
@@ -54,7 +57,6 @@ from .splits import split_of_scene as split_of_scene
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
 from .store import write_rollout as write_rollout
-from .stream_writer import ContentDigest as ContentDigest
 from .table import TRUE_ORIGINS as TRUE_ORIGINS
 from .table import EpisodeGrid as EpisodeGrid
 from .table import data_hash as data_hash
@@ -68,4 +70,5 @@ from .validity import interpolated_actions as interpolated_actions
 from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions
 from .validity import measured_taxels as measured_taxels
+from .writer import ContentDigest as ContentDigest
 from .writer import EpisodeWriter as EpisodeWriter

@@ -28,13 +28,9 @@ MAX_METADATA_BYTES = 1 << 24
 
 @contextmanager
 def disk_errors(what: str, *, advice: str = "free space and try again") -> Iterator[None]:
-    """Context manager that maps OSError to DexTouch errors, naming the operation `what`.
+    """Context manager that maps OSError to StorageError; a full disk or quota to StorageFullError.
 
-    `advice` ends the message about a full disk.
-
-    Raises:
-        StorageFullError: no space, quota or file size left.
-        StorageError: any other I/O error.
+    `what` names the operation; `advice` ends the message about a full disk.
     """
     try:
         yield
@@ -181,11 +177,7 @@ class GroupFiles(Protocol):
 class OpenedGroup:
     """The committed group that a reader has opened, to tell its deletion from damage.
 
-    Attributes:
-        files: of the group.
-        commit_name: name of its commit record.
-        commit_sha256: hash of the commit record when it was opened.
-        what: names the group in errors.
+    `commit_sha256` is the hash of its commit record then; `what` names the group in errors.
     """
 
     files: GroupFiles
@@ -194,11 +186,7 @@ class OpenedGroup:
     what: str
 
     def check_present(self, error: StorageError | None = None) -> None:
-        """Refuse a group that was deleted or replaced, of which `error` is the consequence.
-
-        Raises:
-            NotFoundError: its commit record is gone, or another one.
-        """
+        """Raise NotFoundError if the group was deleted or replaced, and so caused `error`."""
         try:
             commit = self.files.get_now(self.commit_name)
         except StorageError:
@@ -208,18 +196,6 @@ class OpenedGroup:
             raise NotFoundError(
                 f"{self.what}: was {change} while it was read; list the store again"
             ) from error
-
-
-def _mapped(path: Path) -> memoryview | None:
-    """The memory-mapped bytes of a file; None if it is missing."""
-    try:
-        status = path.stat()
-        if status.st_size == 0:
-            return memoryview(b"")
-        return memoryview(_map(str(path), status.st_ino, status.st_size, status.st_mtime_ns))
-    except (FileNotFoundError, NotADirectoryError):
-        # Also if it was removed after its size was read.
-        return None
 
 
 # Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
@@ -248,7 +224,14 @@ class LocalFile:
 
     def _bytes(self) -> memoryview | None:
         try:
-            return _mapped(self.path)
+            status = self.path.stat()
+            if status.st_size == 0:
+                return memoryview(b"")
+            identity = (status.st_ino, status.st_size, status.st_mtime_ns)
+            return memoryview(_map(str(self.path), *identity))
+        except (FileNotFoundError, NotADirectoryError):
+            # Also if it was removed after its size was read.
+            return None
         except OSError:
             # Entered only on a miss: on every read it would cost as much as the lookup.
             with disk_errors(f"read {self.path}"):
@@ -256,11 +239,10 @@ class LocalFile:
 
 
 class LocalGroup:
-    """The files of a group in a local folder, all of which must lie inside it.
+    """The files of a group in a local folder.
 
-    Raises:
-        CorruptDataError: the folder, a file or a folder between is a symbolic link, or a small file
-            is larger than any metadata.
+    Reading raises CorruptDataError for a symbolic link at or below the folder, and for a small file
+    that is larger than any metadata.
     """
 
     def __init__(self, folder: Path) -> None:

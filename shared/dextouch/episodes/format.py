@@ -10,12 +10,7 @@ from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    ID_PATTERN,
-    EpisodeAttributes,
-    RecordingAttributes,
-    StreamContent,
-)
+from dextouch.schemas import ID_PATTERN, EpisodeAttributes, RecordingAttributes, StreamContent
 from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
 Kind = Literal["episode", "recording"]
@@ -79,8 +74,7 @@ class CommitRecord(FrozenModel):
 def check_id(text: str, *, kind: str = "id") -> str:
     """Validate and return an id: lower-case letters, digits, `-` and `_`.
 
-    Raises:
-        InvalidInputError: any other character, including path separators and dots.
+    Raises InvalidInputError for any other character, including path separators and dots.
     """
     if not re.fullmatch(ID_PATTERN, text):
         raise InvalidInputError(
@@ -218,12 +212,7 @@ def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
 
 
 def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
-    """Inverse of `encode_commit`.
-
-    Raises:
-        StorageError: written by another version of the format.
-        CorruptDataError: not a valid commit record.
-    """
+    """Inverse of `encode_commit`; raises CorruptDataError, or StorageError for another version."""
     try:
         outer = json.loads(data)
         plain, digest = outer["record"], outer["sha256"]

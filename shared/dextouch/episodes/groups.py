@@ -71,13 +71,10 @@ class GroupContents(Generic[A]):
     def inspect_array(
         self, name: str, *, progress: Callable[[int], None] = lambda _: None
     ) -> Iterator[tuple[int | None, StorageError]]:
-        """Read an array of a committed group and iterate over its damage.
+        """Iterate over the damage of an array: number of a storage chunk (None for all) and error.
 
-        Damage is the number of a storage chunk, None for the whole array, and its error. `progress`
-        gets the size of every intact storage chunk, encoded, in bytes.
-
-        Raises:
-            NotFoundError: the group was deleted or replaced since it was opened.
+        `progress` gets the size of every intact storage chunk, encoded, in bytes. Raises
+        NotFoundError if the group was deleted or replaced since it was opened.
         """
         for number, error in self._inspect_array(name, progress):
             self.opened.check_present(error)
@@ -115,10 +112,8 @@ class GroupContents(Generic[A]):
 def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes | memoryview:
     """Bytes of a storage chunk that enter its array's hash.
 
-    Images are decoded, since intact bytes of a damaged image are damage, too.
-
-    Raises:
-        CorruptDataError: it does not contain the expected rows, or an image cannot be decoded.
+    Images are decoded, since intact bytes of a damaged image are damage, too. Raises
+    CorruptDataError for other rows than expected, or an image that cannot be decoded.
     """
     where = f"{what}: storage chunk {number}"
     num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
@@ -135,10 +130,8 @@ def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> b
 def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     """Open a committed group; arrays are read lazily.
 
-    Raises:
-        CorruptDataError: the commit record or the attributes are damaged.
-        NotFoundError: it was deleted or replaced while it was opened.
-        StorageError: written by another version of the format.
+    Raises CorruptDataError for a damaged commit record or attributes, StorageError for another
+    version of the format, NotFoundError if the group was deleted or replaced meanwhile.
     """
     kind: Kind = "episode" if issubclass(model, EpisodeAttributes) else "recording"
     what = f"{kind} {files.item_id}"
@@ -244,26 +237,16 @@ class GroupReader(Generic[A]):
     def values(self, name: str, start: int, stop: int) -> np.ndarray:
         """Values of samples start … stop−1; images come decoded.
 
-        Raises:
-            UnknownNameError: no such stream.
-            InvalidInputError: samples outside the stream.
-            CorruptDataError: damaged bytes.
+        Raises UnknownNameError without the stream, InvalidInputError for samples outside of it,
+        CorruptDataError for damaged bytes.
         """
         self._check_span("samples", name, start, stop)
         return self._values(name, start, stop)
 
     def images(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Images start … stop−1 of a camera, uint8 [n, h, w, channels].
+        """Images start … stop−1 (None for all) of a camera, uint8 [n, h, w, channels].
 
-        Args:
-            name: of an image stream.
-            start: first image.
-            stop: one past the last; None for all.
-
-        Raises:
-            UnknownNameError: no such stream.
-            InvalidInputError: images outside the stream, or a stream without images.
-            CorruptDataError: damaged bytes.
+        Raises as `values`, and InvalidInputError for a stream without images.
         """
         stop = self.num_samples(name) if stop is None else stop
         self._check_span("images", name, start, stop)
@@ -281,7 +264,11 @@ class GroupReader(Generic[A]):
         if len(indices):
             self._check_span("images", name, int(indices[0]), int(indices[-1]) + 1)
         if codec_of(descriptor) == "zstd":
-            return self._pick_plain(descriptor, indices, form)
+            first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
+            images = self._contents.shard(name).read(first, stop)
+            if not np.array_equal(indices, np.arange(first, stop)):
+                images = images[indices - first]
+            return images if form == FULL_FORM else transform_pixels(images, form)
         unique, places = np.unique(indices, return_inverse=True)
         images = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
         self._decode_images(descriptor, unique, form, images)
@@ -290,9 +277,8 @@ class GroupReader(Generic[A]):
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
         """Encoded images start … stop−1 of a `jpeg` or `h264` stream.
 
-        Raises:
-            InvalidInputError: a stream of another unit, or images outside the stream.
-            CorruptDataError: damaged bytes.
+        Raises InvalidInputError for another unit or images outside the stream, CorruptDataError for
+        damage.
         """
         descriptor = self._stream(name)
         if codec_of(descriptor) == "zstd":
@@ -317,18 +303,12 @@ class GroupReader(Generic[A]):
     def damaged_images(
         self, name: str, indices: np.ndarray | None = None
     ) -> Int64[np.ndarray, " damaged"]:
-        """Those of a camera's images that cannot be decoded: decodes the chunks they are in.
+        """Those of a camera's images (None for all) that cannot be decoded: decodes their chunks.
 
-        What a decoder would fill in is no image: readers by time treat such an image, and those
-        of its H.264 group that depend on it, as images that were never recorded.
-
-        Args:
-            name: of the stream; one without encoded images has none.
-            indices: which images to look at; None for all.
-
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: the store's bytes are damaged (`dextouch store verify`).
+        What a decoder would fill in is no image: readers by time treat such an image, and those of
+        its H.264 group that depend on it, as images that were never recorded. A stream without
+        encoded images has none. Raises CorruptDataError if the store's bytes are damaged (`dextouch
+        store verify`).
         """
         descriptor = self._stream(name)
         if indices is None:
@@ -346,10 +326,7 @@ class GroupReader(Generic[A]):
     def nearest_images(self, name: str, t_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
         """Index of the image nearest to each time, of those that can be decoded.
 
-        Raises:
-            UnknownNameError: no such stream.
-            NotFoundError: no image that can be decoded.
-            CorruptDataError: the store's bytes are damaged.
+        Raises NotFoundError without any, and as `damaged_images`.
         """
         stamps, usable = self.stamps_ns(name), np.arange(self.num_samples(name))
         while len(usable):
@@ -363,11 +340,8 @@ class GroupReader(Generic[A]):
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record, up to the first damage.
 
-        `dextouch.episodes.care` finds all damage, for `store verify` and `store repair`.
-
-        Raises:
-            CorruptDataError: the first damaged array, by name.
-            StorageError: the storage cannot be read.
+        `dextouch.episodes.care` finds all damage, for `store verify` and `store repair`. Raises
+        CorruptDataError for the first damaged array, StorageError if the storage cannot be read.
         """
         contents = self._contents
         sizes: list[int] = []
@@ -442,15 +416,6 @@ class GroupReader(Generic[A]):
         entry = self._contents.entries[descriptor.name]
         what = f"{self._what}: array {descriptor.name!r}"
         return ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
-
-    def _pick_plain(
-        self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm
-    ) -> np.ndarray:
-        first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
-        images = self._contents.shard(descriptor.name).read(first, stop)
-        if not np.array_equal(indices, np.arange(first, stop)):
-            images = images[indices - first]
-        return images if form == FULL_FORM else transform_pixels(images, form)
 
     def _decode_images(
         self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm, out: np.ndarray

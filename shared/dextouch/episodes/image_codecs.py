@@ -5,8 +5,9 @@ u32 number of images, u32 length of each access unit, the access units; little e
 unit is one image; without B-frames their order is that of the input, so image k of a group needs
 exactly its first k + 1 access units. No other module of the store uses PyAV.
 
-A decoder fills in what is missing of a damaged image; such an image is refused here, and so are
-the images of its group that depend on it.
+A decoder fills in what is missing of a damaged image, and the place of a lost reference picture;
+such an image is refused here, and so are the images of its group that depend on it. The headers of
+access units (ITU-T H.264, 7.3) say where one is missing.
 """
 
 import struct
@@ -22,15 +23,6 @@ import numpy as np
 from pydantic import Field
 
 from dextouch.episodes.format import GOP_IMAGES, Codec
-from dextouch.episodes.h264_headers import (
-    IDR_SLICE,
-    PICTURE_PARAMETERS,
-    SEQUENCE_PARAMETERS,
-    SLICE,
-    START_CODE,
-    first_gap,
-    nal_units,
-)
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import check_jpeg, decode_jpeg
@@ -89,11 +81,7 @@ def parameter_sets(access_unit: bytes) -> bytes:
 
 
 def check_video_size(height: int, width: int) -> None:
-    """Refuse image sizes that 4:2:0 H.264 cannot encode.
-
-    Raises:
-        InvalidInputError: an odd or empty side.
-    """
+    """Raise InvalidInputError for sides that 4:2:0 H.264 cannot encode: odd or empty ones."""
     if height % 2 or width % 2 or not height or not width:
         raise InvalidInputError(
             f"H.264: got images of {height} x {width} pixels, expected even numbers; "
@@ -102,14 +90,9 @@ def check_video_size(height: int, width: int) -> None:
 
 
 class GopEncoder:
-    """Persistent encoder of one camera; every `group_images`-th access unit begins a group.
+    """Persistent encoder of one camera with images of even sides, in groups of pictures.
 
-    Args:
-        height: of the images, even.
-        width: of the images, even.
-        rate_hz: nominal, for players of the stream.
-        settings: quality and speed.
-        group_images: of the store by default, which takes no others.
+    `rate_hz` is nominal, for players of the stream; the store takes only its own `group_images`.
 
     Raises:
         InvalidInputError: an invalid size or invalid settings.
@@ -188,12 +171,9 @@ class GopDecoder:
     def decode(
         self, access_units: list[bytes], wanted: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Decode images of a group into `out`, uint8 [len(wanted), *form.shape].
+        """Decode images of a group into `out`, uint8 [n, *form.shape]; raises as `frames`.
 
-        `access_units` go up to the last requested image, `wanted` are ascending indices.
-
-        Raises:
-            CorruptDataError: invalid access units, or another number or size of images.
+        `access_units` go up to the last requested image, `wanted` are n ascending indices.
         """
         rows = {place: row for row, place in enumerate(wanted)}
         for place, frame in enumerate(self.frames(access_units)):
@@ -305,11 +285,7 @@ def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
 
 
 def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None:
-    """Decode a group of pictures, or its first images, and discard them.
-
-    Raises:
-        CorruptDataError: as `GopDecoder.frames`.
-    """
+    """Decode a group of pictures, or its first images, and discard them; raises as `frames`."""
     for _ in decoder_of_this_thread(*size_px).frames(access_units):
         pass
 
@@ -337,8 +313,7 @@ class ImageChunks:
     def unpack(self, payload: bytes, number: int) -> list[bytes]:
         """Split storage chunk `number` into its encoded images, the inverse of `pack_chunk`.
 
-        Raises:
-            CorruptDataError: an invalid storage chunk.
+        Raises CorruptDataError if it is invalid.
         """
         if self.codec == "jpeg":
             return [payload]
@@ -358,10 +333,7 @@ class ImageChunks:
         """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
 
         `places` are the ascending indices of the requested images in the chunk, `out` is uint8
-        [len(places), *form.shape(shape)].
-
-        Raises:
-            CorruptDataError: invalid image data.
+        [len(places), *form.shape(shape)]. Raises CorruptDataError for invalid image data.
         """
         images = self.unpack(payload, number)
         if places[-1] >= len(images):
@@ -379,9 +351,8 @@ class ImageChunks:
     def check(self, payload: bytes, number: int) -> None:
         """Decode storage chunk `number` by the rule of `decode`, and discard the images.
 
-        Raises:
-            CorruptDataError: an invalid storage chunk; or an image that cannot be decoded, and then
-                `place` in the details is the first such image of the chunk.
+        Raises CorruptDataError if it is invalid, or for an image that cannot be decoded: then
+        `place` in the details is the first such image of the chunk.
         """
         images, size_px = self.unpack(payload, number), (self.shape[0], self.shape[1])
         with self._located(number):
@@ -427,3 +398,140 @@ def transform_pixels(images: np.ndarray, form: ImageForm) -> np.ndarray:
         blocks = even.reshape(n, height // 2, 2, width // 2, 2, channels)
         images = np.rint(blocks.mean(axis=(2, 4), dtype=np.float32)).astype(np.uint8)
     return images
+
+
+START_CODE = b"\x00\x00\x01"
+SLICE, IDR_SLICE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS = 1, 5, 7, 8
+# Profiles whose parameter sets begin with the chroma format (7.3.2.1.1).
+_CHROMA_PROFILES = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
+# More than enough for the fields of a slice header up to its frame number.
+_HEADER_BYTES = 32
+
+
+@dataclass(frozen=True)
+class _SequenceParameters:
+    """How slices of a sequence number their pictures."""
+
+    number_bits: int
+    has_colour_planes: bool
+    may_skip_numbers: bool
+
+
+class _Bits:
+    """Reader of the bits of a NAL unit, without its first byte."""
+
+    def __init__(self, nal: bytes) -> None:
+        # Bytes that keep the content from looking like a start code (7.4.1.1).
+        payload = nal[1:].replace(b"\x00\x00\x03", b"\x00\x00")
+        self._value, self._left = int.from_bytes(payload, "big"), 8 * len(payload)
+
+    def read(self, count: int) -> int:
+        self._left -= count
+        if self._left < 0:
+            raise CorruptDataError("H.264: a header is cut off")
+        return (self._value >> self._left) & ((1 << count) - 1)
+
+    def unsigned(self) -> int:
+        """The next Exp-Golomb code (9.1)."""
+        zeros = 0
+        while not self.read(1):
+            zeros += 1
+        return (1 << zeros) - 1 + self.read(zeros)
+
+    def skip_codes(self, count: int) -> None:
+        for _ in range(count):
+            self.unsigned()
+
+    def skip_scaling_list(self, size: int) -> None:
+        """Skip a scaling list (7.3.2.1.1.1)."""
+        last = following = 8
+        for _ in range(size):
+            if following:
+                code = self.unsigned()
+                delta = (code + 1) // 2 if code % 2 else -(code // 2)
+                following = (last + delta) % 256
+            last = following or last
+
+
+def nal_units(access_unit: bytes) -> Iterator[bytes]:
+    """The NAL units of an access unit (Annex B), without start codes."""
+    start = access_unit.find(START_CODE)
+    while 0 <= start < len(access_unit) - 3:
+        stop = access_unit.find(START_CODE, start + 3)
+        yield access_unit[start + 3 : stop if stop >= 0 else len(access_unit)]
+        start = stop
+
+
+def first_gap(access_units: Sequence[bytes]) -> int | None:
+    """Index of the first access unit of a group before which a reference picture is missing.
+
+    None where there is none, or where the encoder may skip numbers. A picture is numbered one
+    higher than the last reference picture before it (7.4.3, frame_num), and an IDR picture 0.
+    Raises CorruptDataError without a readable header or a slice; `place` in its details is the
+    index.
+    """
+    parameters = _parameters(access_units[0])
+    if parameters.may_skip_numbers:
+        return None
+    last_reference = 0
+    for index, access_unit in enumerate(access_units):
+        try:
+            nal = _first_slice(access_unit)
+            number = _frame_number(nal, parameters)
+        except CorruptDataError as error:
+            raise CorruptDataError(error.message, place=index) from error
+        expected = (last_reference + 1) % (1 << parameters.number_bits) if index else 0
+        if number != expected:
+            return index
+        if nal[0] & 0x60:
+            last_reference = number
+    return None
+
+
+def _first_slice(access_unit: bytes) -> bytes:
+    for nal in nal_units(access_unit):
+        if nal[0] & 0x1F in {SLICE, IDR_SLICE}:
+            return nal[:_HEADER_BYTES]
+    raise CorruptDataError("H.264: an access unit has no slice of a picture")
+
+
+def _frame_number(nal: bytes, parameters: _SequenceParameters) -> int:
+    bits = _Bits(nal)
+    bits.skip_codes(3)  # first_mb_in_slice, slice_type, pic_parameter_set_id
+    if parameters.has_colour_planes:
+        bits.read(2)
+    return bits.read(parameters.number_bits)
+
+
+def _parameters(access_unit: bytes) -> _SequenceParameters:
+    found = (nal for nal in nal_units(access_unit) if nal[0] & 0x1F == SEQUENCE_PARAMETERS)
+    nal = next(found, None)
+    if nal is None:
+        raise CorruptDataError("H.264: first image of a group has no parameter sets")
+    bits = _Bits(nal)
+    profile = bits.read(24) >> 16
+    bits.skip_codes(1)  # seq_parameter_set_id
+    has_colour_planes = profile in _CHROMA_PROFILES and _skip_chroma(bits)
+    number_bits = bits.unsigned() + 4
+    order = bits.unsigned()  # pic_order_cnt_type
+    if order == 0:
+        bits.skip_codes(1)
+    elif order == 1:
+        bits.read(1)
+        bits.skip_codes(2)
+        bits.skip_codes(bits.unsigned())
+    bits.skip_codes(1)  # max_num_ref_frames
+    return _SequenceParameters(number_bits, has_colour_planes, bool(bits.read(1)))
+
+
+def _skip_chroma(bits: _Bits) -> bool:
+    """Skip chroma format, bit depths and scaling lists; whether colour planes are separate."""
+    chroma = bits.unsigned()
+    has_colour_planes = chroma == 3 and bool(bits.read(1))
+    bits.skip_codes(2)
+    bits.read(1)
+    if bits.read(1):
+        for number in range(12 if chroma == 3 else 8):
+            if bits.read(1):
+                bits.skip_scaling_list(16 if number < 6 else 64)
+    return has_colour_planes

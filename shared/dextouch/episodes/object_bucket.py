@@ -104,9 +104,8 @@ class ObjectAddress:
 def parse_address(url: str, storage_options: Mapping[str, str]) -> ObjectAddress:
     """Parse a URL; explicit options take precedence over those in the URL.
 
-    Raises:
-        InvalidInputError: no bucket, secrets in the URL, or an invalid option value.
-        UnknownNameError: an unknown option.
+    Raises InvalidInputError without a bucket, for secrets in the URL, or for an invalid value,
+    UnknownNameError for an unknown option.
     """
     parts = urlsplit(url)
     where = f"{parts.scheme}://{parts.hostname or ''}{parts.path}"
@@ -248,9 +247,7 @@ class Bucket:
     def read(self, facts: ObjectFacts, start: int, stop: int) -> bytes:
         """Bytes start … stop−1 of an object, which must be unchanged since `facts` was read.
 
-        Raises:
-            StorageError: it was deleted or replaced.
-            CorruptDataError: it is shorter.
+        Raises StorageError if it was deleted or replaced, CorruptDataError if it is shorter.
         """
         try:
             with self._errors("read", facts.key):
@@ -299,9 +296,8 @@ class Bucket:
     def _errors(self, word: str, key: str) -> Iterator[None]:
         """Map obstore's exceptions to ours; FileNotFoundError and PreconditionError pass through.
 
-        Raises:
-            StorageError: refused because of credentials, bucket or permissions.
-            UnavailableError: no answer, or the service is overloaded.
+        StorageError is a refusal because of credentials, bucket or permissions, UnavailableError no
+        answer, or an overloaded service.
         """
         _refuse_forks(self.url(key))
         try:

@@ -104,13 +104,9 @@ def object_track(
     """Poses of an episode's objects at given times, in the order of its `object_names`.
 
     They come from the stream `object_poses` or else from the streams `object_NAME`, which have
-    samples only where the object was seen.
+    samples only where the object was seen; None if the episode has neither.
 
-    Returns:
-        None if the episode has neither.
-
-    Raises:
-        CorruptDataError: damaged bytes.
+    Raises CorruptDataError for damaged bytes.
     """
     if OBJECT_POSES in reader.streams:
         return ObjectTrack.of_one_source("twin", *_all_at_once(reader, t_ref_ns))
@@ -120,15 +116,11 @@ def object_track(
     each = [_one(reader, object_stream(name), t_ref_ns) for name in names]
     poses = np.stack([one[0] for one in each], axis=1).astype(np.float32)
     known = np.stack([one[1] for one in each], axis=1)
-    sources = tuple(
-        _measured_by(reader, name) if known[:, index].any() else "none"
-        for index, name in enumerate(names)
-    )
-    return ObjectTrack(poses, known, sources, np.zeros(len(names), dtype=np.float32))
-
-
-def _measured_by(reader: EpisodeReader, name: str) -> ObjectSource:
-    return "markers" if reader.streams[object_stream(name)].device == HEAD_CAMERA else "tracker"
+    sources: list[ObjectSource] = ["none"] * len(names)
+    for index in np.flatnonzero(known.any(axis=0)).tolist():
+        by_camera = reader.streams[object_stream(names[index])].device == HEAD_CAMERA
+        sources[index] = "markers" if by_camera else "tracker"
+    return ObjectTrack(poses, known, tuple(sources), np.zeros(len(names), dtype=np.float32))
 
 
 def has_object_poses(reader: EpisodeReader) -> bool:
@@ -219,9 +211,7 @@ def first_camera(
 def listed_objects(about: EpisodeAttributes, objects: SceneObjects) -> tuple[SceneObject, ...]:
     """The objects that a file lists for an episode's task.
 
-    Raises:
-        UnknownNameError: the file does not have the task.
-        InvalidInputError: the episode has other objects.
+    Raises UnknownNameError without the task, InvalidInputError if the episode has other objects.
     """
     if about.task not in objects.tasks:
         raise UnknownNameError("task of the objects", about.task, list(objects.tasks))
@@ -244,14 +234,8 @@ def clicked_poses(
 ) -> ClickedPoses:
     """Poses of an episode's objects at its first step.
 
-    Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away.
-
-    Args:
-        about: the episode.
-        objects: of the tasks, with the height of the table.
-        clicks: on objects of this episode.
-        may_lack_headings: whether an object whose second click is missing counts as unknown,
-            and is not refused.
+    Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away. If
+    they `may_lack_headings`, an object whose second click is missing is unknown, and not refused.
 
     Raises:
         UnknownNameError: a task or an object that the file of objects does not have.

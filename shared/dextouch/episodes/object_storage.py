@@ -78,11 +78,7 @@ class ObjectFile:
         return None if facts is None else facts.size
 
     def read(self, offset: int, length: int) -> bytes:
-        """Bytes offset … offset + length − 1; fewer where the object ends before.
-
-        Raises:
-            StorageError, UnavailableError: see `Bucket.read`.
-        """
+        """Bytes offset … offset + length − 1, fewer at the end; raises as `Bucket.read`."""
         with self._guard:
             facts = self._look()
             if facts is None:
@@ -186,10 +182,7 @@ class UploadingWriter(EpisodeWriter):
 class ObjectStorage:
     """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
 
-    Opening one does not contact the service.
-
-    Raises:
-        InvalidInputError, UnknownNameError: an invalid address or option.
+    Opening one does not contact the service; raises as `parse_address`.
     """
 
     def __init__(self, url: str, storage_options: Mapping[str, str]) -> None:
@@ -201,12 +194,9 @@ class ObjectStorage:
     def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
         """Writer of a new group.
 
-        Raises:
-            ConflictError: the id exists already.
-            InvalidInputError: the work folder belongs to another address.
-            UnavailableError: an earlier upload of this id is pending, or the bucket cannot be
-                reached; nothing was written.
-            StorageError: the bucket refused.
+        Raises ConflictError for an id that exists, InvalidInputError if the work folder belongs to
+        another address, StorageError if the bucket refused, and UnavailableError if an earlier
+        upload of this id is pending, or the bucket cannot be reached; nothing was written.
         """
         item_id = attributes_id(attributes)
         self._own_work_folder()
@@ -357,12 +347,10 @@ def group_key(kind: Kind, item_id: str) -> str:
 
 
 def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
-    """Upload a committed group and remove its local folder; may be repeated after a failure.
+    """Upload a committed group and remove its local folder, which a failure keeps; repeatable.
 
-    Raises:
-        ConflictError: the id has other content there; the folder is kept.
-        UnavailableError: no connection, or another writer uses the id; the folder is kept.
-        StorageError: the upload failed; the folder is kept.
+    Raises ConflictError if the id has other content there, UnavailableError without a connection or
+    if another writer uses the id, StorageError if the upload failed.
     """
     group, name = group_key(kind, folder.name), f"{kind} {folder.name!r}"
     with disk_errors(f"upload {name}"):

@@ -25,7 +25,7 @@ from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import SceneObject, SceneObjects, TouchedAt
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import SIDES, split_pads
+from dextouch.tactile.layout import SIDES
 
 # Standard deviation of a position on each axis of the table: chosen, from errors of 3 to 10 mm over
 # nine objects of four tasks of the twin (`python -m benchmarks objects`).
@@ -61,7 +61,6 @@ class _Hold:
 
     @property
     def lets_go(self) -> bool:
-        """Whether the contact ends before the episode does."""
         return self.end + 1 < len(self.Ts_world_wrist)
 
     @cached_property
@@ -73,13 +72,11 @@ class _Hold:
 def touched_objects(grid: EpisodeGrid, objects: SceneObjects) -> ObjectTrack:
     """Poses of an episode's objects as touch gives them; unknown where it does not.
 
-    Args:
-        grid: the episode; one without success gives no poses, as hands may have missed.
-        objects: of the tasks; those with `touch` get poses.
+    An episode without success gives no poses, as hands may have missed; objects with `touch` get
+    them.
 
-    Raises:
-        UnknownNameError: the file does not have the task.
-        InvalidInputError: the episode has other objects, or no outcome.
+    Raises UnknownNameError without the task in the file, InvalidInputError if the episode has other
+    objects, or no outcome.
     """
     listed = listed_objects(grid.about, objects)
     track = ObjectTrack.unknown(len(grid), len(listed))
@@ -120,9 +117,8 @@ class PadContacts:
         tips_m, knuckles_m = chains_m[..., 3, :], chains_m[..., 0, :]
         palm_m = 0.5 * knuckles_m[:, :, 1:].mean(axis=2, keepdims=True)
         taxels_kpa, is_sampled = grid.touch()
-        tips_kpa, palm_kpa = split_pads(taxels_kpa)
-        peaks = [tips_kpa.max(axis=(-1, -2)), palm_kpa.max(axis=(-1, -2))[..., None]]
-        touches = np.greater_equal(np.concatenate(peaks, axis=-1), CONTACT_THRESHOLD_KPA)
+        peaks_kpa = grid.tactile_layout.by_part(taxels_kpa, np.max)
+        touches = np.greater_equal(peaks_kpa, CONTACT_THRESHOLD_KPA)
         # Where a glove has no sample, it touches as it did before.
         steps = np.arange(len(touches))[:, None]
         newest = np.maximum.accumulate(np.where(is_sampled, steps, 0), axis=0)

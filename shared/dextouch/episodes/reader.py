@@ -3,16 +3,18 @@
 Windows also have a form on the wire (msgpack).
 """
 
+import json
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args, overload
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
-from dextouch.episodes.format import STAMPS, stream_arrays, stream_content
+from dextouch.episodes.format import MALFORMED, STAMPS, stream_arrays, stream_content
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
 from dextouch.episodes.validity import measured_actions, measured_taxels
@@ -21,7 +23,7 @@ from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes, StreamContent
 from dextouch.streams import HEAD_CAMERA, SampleBatch, pack, unpack
-from dextouch.tactile.layout import NUM_TAXELS, SIDES
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout, common_layout
 
 R = TypeVar("R")
 # Half a step, for a free-running camera at the model rate, plus some jitter.
@@ -33,9 +35,9 @@ MAX_CAMERA_THREADS = 8
 # Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
-# Type and shape of the fields that are one array each; -1 is the number of steps.
+# Type and shape of the fields that are one array each; -1 is the number of steps, -2 of taxels.
 _WINDOW_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "tactile_kpa": ("float32", (-1, 2, 320)),
+    "tactile_kpa": ("float32", (-1, 2, -2)),
     "tactile_valid": ("bool", (-1, 2)),
     "actions": ("float64", (-1, 67)),
     "t_ref_ns": ("int64", (-1,)),
@@ -45,7 +47,7 @@ _WINDOW_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 _RARE_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "K_head": ("float64", (3, 3)),
     "actions_measured": ("bool", (-1, 67)),
-    "taxels_measured": ("bool", (2, 320)),
+    "taxels_measured": ("bool", (2, -2)),
 }
 
 
@@ -69,12 +71,13 @@ class Window:
     (t−1, t]; where `tactile_valid` is false there was none, and the row is zero. `actions` are
     relative to the *measured* poses of the first step, whose absolute poses are `anchor`; where
     `actions_measured` is false, alignment interpolated them, or no such part was recorded. Taxels
-    that are not `taxels_measured` are zero. `K_head` is in pixels, None if unknown.
+    that are not `taxels_measured` are zero; `tactile_layout` says where they are. `K_head` is in
+    pixels, None if unknown.
     """
 
     images: dict[str, UInt8[np.ndarray, "n h w c"]]
     image_dt_ns: dict[str, Int64[np.ndarray, " n"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
     tactile_valid: Bool[np.ndarray, "n 2"]
     actions: Float64[np.ndarray, "n 67"]
     action_kind: ActionKind
@@ -83,7 +86,8 @@ class Window:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"] | None
     actions_measured: Bool[np.ndarray, "n 67"]
-    taxels_measured: Bool[np.ndarray, "2 320"]
+    taxels_measured: Bool[np.ndarray, "2 taxels"]
+    tactile_layout: TactileLayout = DEXTOUCH_V1
 
     def __len__(self) -> int:
         return len(self.t_ref_ns)
@@ -107,13 +111,8 @@ def step_ranges(
     """Sample ranges [low, high) with t−1 < stamp ≤ t for grid steps start … stop-1.
 
     Step 0 has no predecessor: it takes the first sample of the stream, if that lies within half a
-    step of it. A range is empty if there is no sample.
-
-    Args:
-        stamps_ns: of the samples, strictly increasing.
-        grid_ns: of all steps of the episode.
-        start: first step.
-        stop: one past the last step.
+    step of it. A range is empty if there is no sample. Stamps of the samples are strictly
+    increasing; `grid_ns` are those of all steps of the episode.
     """
     edges = np.searchsorted(stamps_ns, grid_ns[max(0, start - 1) : stop] + SAME_INSTANT_NS, "right")
     if start > 0:
@@ -130,9 +129,7 @@ def mean_over_ranges(
 ) -> tuple[Float32[np.ndarray, "n taxels"], Bool[np.ndarray, " n"]]:
     """Means of rows [low, high) in float32, and a mask of non-empty ranges.
 
-    Args:
-        values: rows, indexed by `ranges`.
-        ranges: [n, 2].
+    Ranges are [n, 2].
     """
     valid = ranges[:, 1] > ranges[:, 0]
     means = np.zeros((len(ranges), *values.shape[1:]), dtype=np.float32)
@@ -155,7 +152,13 @@ def encode_window(window: Window) -> bytes:
     for camera, images in window.images.items():
         arrays[_IMAGES + camera] = images
         arrays[_IMAGE_DT + camera] = window.image_dt_ns[camera]
-    return pack({"action_kind": window.action_kind, "instruction": window.instruction}, arrays)
+    fields: dict[str, object] = {
+        "action_kind": window.action_kind,
+        "instruction": window.instruction,
+    }
+    if window.tactile_layout != DEXTOUCH_V1:
+        fields["tactile_layout"] = window.tactile_layout.model_dump(mode="json")
+    return pack(fields, arrays)
 
 
 def decode_window(data: bytes, *, max_bytes: int) -> Window:
@@ -167,7 +170,8 @@ def decode_window(data: bytes, *, max_bytes: int) -> Window:
     """
     fields, arrays = unpack(data, max_bytes=max_bytes)
     cameras = [name.removeprefix(_IMAGES) for name in arrays if name.startswith(_IMAGES)]
-    _check_arrays(arrays, cameras)
+    layout = _layout_of(fields.get("tactile_layout"))
+    _check_arrays(arrays, cameras, layout.num_taxels)
     action_kind, instruction = fields.get("action_kind"), fields.get("instruction")
     if action_kind not in get_args(ActionKind) or not isinstance(instruction, str):
         raise InvalidInputError(
@@ -188,14 +192,26 @@ def decode_window(data: bytes, *, max_bytes: int) -> Window:
         image_dt_ns={camera: arrays[_IMAGE_DT + camera] for camera in cameras},
         action_kind=fields["action_kind"],
         instruction=instruction,
+        tactile_layout=layout,
         **plain,
     )
 
 
-def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
+def _layout_of(field: object) -> TactileLayout:
+    """The layout that a window names; `dextouch_v1` where it names none."""
+    if field is None:
+        return DEXTOUCH_V1
+    try:
+        return TactileLayout.model_validate_json(json.dumps(field))
+    except MALFORMED as error:
+        raise InvalidInputError(f"window: 'tactile_layout' is not a layout ({error})") from error
+
+
+def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str], num_taxels: int) -> None:
     n = len(arrays["t_ref_ns"]) if "t_ref_ns" in arrays and arrays["t_ref_ns"].ndim else 0
+    sizes = {-1: n, -2: num_taxels}
     expected = {
-        name: (dtype, tuple(n if size < 0 else size for size in shape))
+        name: (dtype, tuple(sizes.get(size, size) for size in shape))
         for name, (dtype, shape) in (_WINDOW_ARRAYS | _RARE_ARRAYS).items()
         if name in _WINDOW_ARRAYS or name in arrays
     }
@@ -237,9 +253,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
     ) -> SampleBatch:
         """Samples with start_ns ≤ t_host_ns < stop_ns; images come decoded, damaged ones never.
 
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
+        Raises UnknownNameError without the stream, CorruptDataError for damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
         kept, values = self._without_damaged(name, low, high)
@@ -258,12 +272,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         return found
 
     def stamps(self, name: str) -> SampleBatch:
-        """All stamps of a stream, without the values (which are [n, 0] here).
-
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
-        """
+        """All stamps of a stream, without the values (which are [n, 0] here); raises as `read`."""
         t_host_ns = self.stamps_ns(name).copy()
         # Not cached like the first column, since they are read once.
         t_device_ns, sequence = (
@@ -275,6 +284,22 @@ class RecordingReader(GroupReader[RecordingAttributes]):
 class EpisodeReader(GroupReader[EpisodeAttributes]):
     """Reader of an episode: streams on one reference clock, actions on the model grid."""
 
+    @cached_property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels of both hands; `dextouch_v1` where no stream names another one.
+
+        Raises:
+            InvalidInputError: the two hands have different ones.
+        """
+        named = [self.streams.get(f"tactile_{side}") for side in SIDES]
+        layouts = [stream.tactile_layout for stream in named if stream is not None]
+        return common_layout(layouts, what=self._what)
+
+    @property
+    def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
+        """Taxels that were measured; the others, which alignment refused, are zero throughout."""
+        return measured_taxels(self.attributes.calibration, self.tactile_layout.num_taxels)
+
     @property
     def num_steps(self) -> int:
         """Steps of the model grid: the rows of `action`; 0 without that stream."""
@@ -285,9 +310,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> StreamData:
         """Samples with start_ns ≤ t_ref_ns < stop_ns; images come decoded, damaged ones never.
 
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damaged bytes.
+        Raises UnknownNameError without the stream, CorruptDataError for damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
         kept, values = self._without_damaged(name, low, high)
@@ -363,7 +386,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             anchor=self.anchor(start),
             K_head=self._K_head(),
             actions_measured=measured_actions(self.attributes, steps_ns, action_kind),
-            taxels_measured=measured_taxels(self.attributes.calibration),
+            taxels_measured=self.measured_taxels,
+            tactile_layout=self.tactile_layout,
         )
 
     def _K_head(self) -> Float64[np.ndarray, "3 3"] | None:  # noqa: N802 (K is the camera matrix)
@@ -371,7 +395,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
 
     def touch(
         self, start: int, num_steps: int
-    ) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+    ) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
         """Mean pressures (kPa) of steps, and where there was a sample; as in `window`."""
         self._check_steps(start, num_steps)
         left, right = (self._tactile(side, start, start + num_steps) for side in SIDES)
@@ -382,9 +406,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> Float64[np.ndarray, "n 67"]:
         """Actions of steps, relative to the measured poses of the first one; as in `window`.
 
-        Raises:
-            InvalidInputError: steps outside the episode.
-            UnknownNameError: an action kind that the episode does not have.
+        Raises InvalidInputError for steps outside the episode, UnknownNameError without the action
+        kind.
         """
         self._check_steps(start, num_steps)
         if kind not in ACTION_STREAMS:
@@ -434,15 +457,9 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
         """Steps that have an image at most 0.6 steps away, and the index of that image.
 
-        Images that cannot be decoded do not count: those that are chosen are decoded once.
-
-        Args:
-            camera: of an image stream.
-            steps: increasing steps to look at; None for all.
-
-        Raises:
-            UnknownNameError: no such camera.
-            NotFoundError: none of its images can be decoded.
+        Images that cannot be decoded do not count: those that are chosen are decoded once. Steps to
+        look at are increasing, None for all. Raises UnknownNameError without the camera,
+        NotFoundError if none of its images can be decoded.
         """
         self._check_cameras((camera,))
         stamps, grid_ns = self.stamps_ns(camera), self.stamps_ns("action")
@@ -457,21 +474,16 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def has_every_image(self, camera: str) -> bool:
         """Whether nearly every step has an image of its own; one in twenty may have been dropped.
 
-        Raises:
-            UnknownNameError: no such camera.
+        Raises as `shown_steps`.
         """
         num_missing = self.num_steps - len(self.shown_steps(camera)[0])
         return num_missing <= MAX_UNSHOWN_SHARE * self.num_steps
 
     def require_images(self, camera: str) -> None:
-        """Check that nearly every step of the episode has an image of its own.
+        """Raise InvalidInputError unless the episode `has_every_image` of a camera.
 
         `window` returns the nearest image whatever its time: where only every N-th step was
         rendered, that is the image of another step.
-
-        Raises:
-            InvalidInputError: more than a twentieth of the steps have no image of their own.
-            UnknownNameError: no such camera.
         """
         if not self.has_every_image(camera):
             num_missing = self.num_steps - len(self.shown_steps(camera)[0])
@@ -486,8 +498,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w c"]]:
         """Indices of the images nearest to non-decreasing times, and these images.
 
-        Raises:
-            NotFoundError: no image, or none that can be decoded.
+        Raises NotFoundError without an image, or one that can be decoded.
         """
         if not self.num_samples(camera):
             raise NotFoundError(f"{self._what}: {camera!r} holds no image")
@@ -515,7 +526,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def _tactile(self, side: str, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         name = f"tactile_{side}"
         if name not in self.streams:
-            empty = np.zeros((stop - start, NUM_TAXELS), dtype=np.float32)
+            empty = np.zeros((stop - start, self.tactile_layout.num_taxels), dtype=np.float32)
             return empty, np.zeros(stop - start, dtype=bool)
         stamps, grid_ns = self._column(f"{name}_t_ref_ns"), self._column("action_t_ref_ns")
         ranges = step_ranges(stamps, grid_ns, start, stop)

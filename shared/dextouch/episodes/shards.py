@@ -53,11 +53,9 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(frame: bytes, *, size: int, what: str) -> bytes:
-    """Decompress a single zstd frame of exactly `size` bytes.
+    """Decompress a single zstd frame of exactly `size` bytes; `what` names it in errors.
 
-    Raises:
-        CorruptDataError: another size or trailing data, or more than MAX_CHUNK_BYTES; `what` names
-            the frame in errors.
+    Raises CorruptDataError for another size or trailing data, or more than MAX_CHUNK_BYTES.
     """
     if size > MAX_CHUNK_BYTES:
         raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
@@ -97,12 +95,8 @@ def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -
 class ShardReader:
     """Reads rows or storage chunks of one array; the index is cached.
 
-    Args:
-        source: the shard file.
-        entry: dtype, shape and codec of the array.
-        what: names the array in errors.
-        index: (offset, length) of each storage chunk, for a file whose own index is damaged.
-        group: that the file belongs to; without it, its deletion cannot be told from damage.
+    `what` names the array in errors. `index` is (offset, length) of each storage chunk, for a file
+    whose own index is damaged; without its `group` a file's deletion cannot be told from damage.
     """
 
     def __init__(
@@ -125,10 +119,8 @@ class ShardReader:
     def read(self, start: int = 0, stop: int | None = None) -> Shaped[np.ndarray, "n ..."]:
         """Rows start … stop-1; only the storage chunks that contain them are read and decoded.
 
-        Raises:
-            InvalidInputError: rows outside the array.
-            CorruptDataError: a checksum mismatch, or missing bytes.
-            NotFoundError: the group was deleted or replaced since it was opened.
+        Raises InvalidInputError for rows outside the array, CorruptDataError for missing bytes or a
+        checksum mismatch, NotFoundError if the group was deleted or replaced since it was opened.
         """
         try:
             return self._read(start, stop)
@@ -161,12 +153,7 @@ class ShardReader:
         return rows.view(self._dtype).reshape(stop - start, *self._entry.shape[1:])
 
     def payload(self, number: int) -> bytes:
-        """The encoded bytes of one storage chunk, verified, without the checksum.
-
-        Raises:
-            CorruptDataError: a checksum does not hold, or bytes are missing.
-            NotFoundError: the group was deleted or replaced since it was opened.
-        """
+        """The encoded bytes of one storage chunk, verified, without checksum; raises as `read`."""
         what = f"{self._what}: storage chunk {number}"
         try:
             offset, length = self._checked_index()[number].tolist()
@@ -194,12 +181,9 @@ class ShardReader:
             places = places[count:]
 
     def check_index(self) -> np.ndarray:
-        """Read and validate the (offset, length) of every storage chunk, cached.
+        """Read and validate the (offset, length) of every storage chunk, cached; raises as `read`.
 
-        Raises:
-            CorruptDataError: a missing file; storage chunks that are not contiguous up to the
-                index, or too short for the rows in the commit record.
-            NotFoundError: the group was deleted or replaced since it was opened.
+        They must be contiguous up to the index, and long enough for the rows in the commit record.
         """
         try:
             return self._checked_index()
@@ -216,7 +200,14 @@ class ShardReader:
             size = self._source.size()
             if size is None:
                 raise CorruptDataError(f"{self._what}: its shard file is missing")
-            index = self._read_index(size)
+            index_bytes = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
+            if size < index_bytes:
+                raise CorruptDataError(
+                    f"{self._what}: file is too short for its index of {index_bytes} bytes"
+                )
+            data = self._source.read(size - index_bytes, index_bytes)
+            body = _without_crc(data, 0, index_bytes, f"{self._what}: shard index")
+            index = np.frombuffer(body, dtype="<u8").reshape(-1, 2)
             self._check_follows(index, size - len(index) * INDEX_ENTRY_BYTES - CRC_BYTES)
             self._check_claim(index)
             self._index = index
@@ -246,27 +237,14 @@ class ShardReader:
                 f"{needed[bad[0]]} bytes, got one of {lengths[bad[0]]}"
             )
 
-    def _read_index(self, file_size: int) -> np.ndarray:
-        size = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
-        start = file_size - size
-        if start < 0:
-            raise CorruptDataError(f"{self._what}: file is too short for its index of {size} bytes")
-        body = _without_crc(self._source.read(start, size), 0, size, f"{self._what}: shard index")
-        return np.frombuffer(body, dtype="<u8").reshape(-1, 2)
-
 
 def _row_layout(entry: ArrayEntry) -> tuple[np.dtype[Any], int]:
-    """Type and number of bytes of a row of a `zstd` array."""
     dtype = np.dtype(entry.dtype).newbyteorder("<")
     return dtype, math.prod(entry.shape[1:]) * dtype.itemsize
 
 
 def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.ndarray, "n ..."]:
-    """Decode the rows of one `zstd` storage chunk, padding included.
-
-    Raises:
-        CorruptDataError: another number of rows.
-    """
+    """The rows of one `zstd` storage chunk, padding included; raises as `decompress`."""
     dtype, row_bytes = _row_layout(entry)
     data = decompress(payload, size=entry.chunk_rows * row_bytes, what=what)
     return np.frombuffer(data, dtype=dtype).reshape(entry.chunk_rows, *entry.shape[1:])
@@ -275,10 +253,8 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 class ShardWriter:
     """Appends rows to a new shard of a stage; buffers at most one storage chunk.
 
-    The entry of the array has 0 rows and no hash yet.
-
-    Raises:
-        StorageError: the file cannot be created.
+    The entry of the array has 0 rows and no hash yet. Raises StorageError if a file cannot be
+    created, StorageFullError without space; nothing can be appended afterwards.
     """
 
     def __init__(self, stage: Path, name: str, entry: ArrayEntry) -> None:
@@ -300,11 +276,7 @@ class ShardWriter:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
 
     def append(self, rows: np.ndarray) -> None:
-        """Append rows [n, *row_shape] of the array's dtype (checked by the caller).
-
-        Raises:
-            StorageFullError: no space; nothing can be appended afterwards.
-        """
+        """Append rows [n, *row_shape] of the array's dtype (checked by the caller)."""
         self.num_rows += len(rows)
         while len(rows):
             taken = rows[: len(self._chunk) - self._num_pending]
@@ -315,17 +287,13 @@ class ShardWriter:
                 self._write_rows()
 
     def append_encoded(self, payload: bytes, num_rows: int) -> None:
-        """Append one encoded storage chunk of an image codec; raises as `append`."""
+        """Append one encoded storage chunk of an image codec."""
         self.num_rows += num_rows
         self._sha256.update(payload)
         self._write_chunk(payload)
 
     def finish(self) -> ArrayEntry:
-        """Complete the shard and return the array's entry of the commit record.
-
-        Raises:
-            StorageFullError: no space; the shard stays incomplete.
-        """
+        """Complete the shard and return the array's entry of the commit record."""
         if self._num_pending:
             self._chunk[self._num_pending :] = 0
             self._write_rows()

@@ -38,8 +38,11 @@ def scene_of(attributes: "EpisodeAttributes") -> str:
     """
     if attributes.seed is not None:
         return f"{attributes.task}/{attributes.seed}"
-    recording = recording_of(attributes)
-    return f"{attributes.task}/{recording or _first_episode(attributes)}"
+    found = recording_of(attributes)
+    if not found and attributes.origin == "imagined":
+        # Of the episode that this one was imagined from.
+        found = next((entry.id for entry in attributes.lineage if entry.kind == "episode"), None)
+    return f"{attributes.task}/{found or attributes.episode_id}"
 
 
 def recording_of(attributes: "EpisodeAttributes") -> str | None:
@@ -66,12 +69,7 @@ def is_in(attributes: "EpisodeAttributes", splits: Collection[Split]) -> bool:
 
 
 def scene_fraction(scene: str, *, salt: str = "") -> float:
-    """A number in 0 … 1 for every scene, evenly spread over scenes: a hash of its name.
-
-    Args:
-        scene: name, from `scene_of`.
-        salt: another one gives other numbers.
-    """
+    """A number in 0 … 1 for every name of a scene, evenly spread: a hash of it, and of the salt."""
     digest = hashlib.sha256(f"{salt}{scene}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
 
@@ -81,13 +79,9 @@ def split_by_scene(
 ) -> tuple[list[InSceneT], list[InSceneT]]:
     """Training and held-out items; all of a scene are on one side, whatever else there is.
 
-    Args:
-        items: episodes, or what was made of them.
-        held_out_share: share of the scenes to hold out.
-        salt: another one holds out other scenes.
+    `held_out_share` is that of the scenes; another salt holds out other ones.
 
-    Raises:
-        InvalidInputError: an empty side.
+    Raises InvalidInputError for an empty side.
     """
     training: list[InSceneT] = []
     held_out: list[InSceneT] = []
@@ -105,12 +99,3 @@ def split_by_scene(
 def _split_of(scene: str) -> Split:
     digest = hashlib.sha256(f"split/{scene}".encode()).digest()
     return SPLITS[int.from_bytes(digest[:8], "big") % len(SPLITS)]
-
-
-def _first_episode(attributes: "EpisodeAttributes") -> str:
-    """Id of the episode that this one was imagined from, or its own."""
-    if attributes.origin == "imagined":
-        for entry in attributes.lineage:
-            if entry.kind == "episode":
-                return entry.id
-    return attributes.episode_id

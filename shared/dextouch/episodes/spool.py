@@ -59,9 +59,8 @@ class SpoolReader:
     The log is scanned on first access; records appended later are not visible. A closed spool must
     be as it was when it was closed.
 
-    Raises:
-        NotFoundError: no spool there.
-        CorruptDataError: its attributes are damaged, or it is closed and has changed since.
+    Raises NotFoundError without a spool, CorruptDataError for damaged attributes, or if it is
+    closed and has changed since.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,18 +86,15 @@ class SpoolReader:
     def num_samples(self, stream_name: str) -> int:
         """Number of samples of a stream when the log was scanned.
 
-        Raises:
-            UnknownNameError: no such stream.
-            CorruptDataError: damage other than a torn tail.
+        Raises UnknownNameError without the stream, CorruptDataError for damage other than a torn
+        tail.
         """
         return int(self._stream_rows(stream_name)["num_samples"].sum())
 
     def read(self, stream_name: str, start: int = 0, stop: int | None = None) -> SampleBatch:
         """Samples start … stop-1 of a stream, verified.
 
-        Raises:
-            InvalidInputError: outside the stream.
-            CorruptDataError: a payload does not match its checksum.
+        Raises InvalidInputError outside the stream, CorruptDataError for a checksum mismatch.
         """
         stop = self.num_samples(stream_name) if stop is None else stop
         rows, skipped = self._span(stream_name, start, stop)
@@ -117,12 +113,7 @@ class SpoolReader:
         return body[ends[skipped] : ends[skipped + stop - start]]
 
     def appended(self, stream_name: str, number: int) -> bytes:
-        """The bytes of one append, numbered from 0.
-
-        Raises:
-            InvalidInputError: no such append.
-            CorruptDataError: they do not match their checksum.
-        """
+        """The bytes of one append, numbered from 0; raises as `read`."""
         rows = self._stream_rows(stream_name)
         if not 0 <= number < len(rows):
             raise InvalidInputError(
@@ -142,8 +133,7 @@ class SpoolReader:
     def is_empty(self) -> bool:
         """Whether nothing was ever appended.
 
-        Raises:
-            CorruptDataError: something was, but no sample of it is whole.
+        Raises CorruptDataError if something was, but no sample of it is whole.
         """
         records = trusted_records(self.path, self.scan())
         if not len(records.rows) and records.num_bytes > len(LOG_MAGIC):
@@ -213,7 +203,6 @@ class SpoolReader:
 
 
 def _num_samples(rows: np.ndarray, names: list[str]) -> dict[str, int]:
-    """Samples by stream in records of a log."""
     return {
         name: int(rows["num_samples"][rows["stream"] == number].sum())
         for number, name in enumerate(names)
@@ -221,12 +210,7 @@ def _num_samples(rows: np.ndarray, names: list[str]) -> dict[str, int]:
 
 
 def read_attributes(path: Path) -> RecordingAttributes:
-    """Attributes of a spool's recording.
-
-    Raises:
-        NotFoundError: no spool there.
-        CorruptDataError: attributes that cannot be read.
-    """
+    """Attributes of a spool's recording; raises as `SpoolReader`."""
     return decode_attributes(read_recording_file(path), what=f"spool {path.name!r}")
 
 
@@ -244,14 +228,8 @@ class SpoolWriter:
     """Appends batches to the streams of one recording.
 
     After `append` returns, the samples survive a crash of the process; after `flush` with `sync`,
-    also a power loss.
-
-    Args:
-        path: new folder.
-        attributes: of the recording; `streams` names all streams.
-        sync: whether `flush` waits for the disk.
-        resume: continue an existing folder (see the class method).
-        notes: further small files of a new folder, by name.
+    also a power loss. `attributes.streams` names all streams; `notes` are further small files of a
+    new folder, by name.
 
     Raises:
         ConflictError: the folder exists; continue it with `SpoolWriter.resume`.
@@ -292,23 +270,16 @@ class SpoolWriter:
     def resume(cls, path: Path, *, sync: bool = True) -> "SpoolWriter":
         """Continue after the last valid record of a spool that was closed or crashed.
 
-        What is cut off is in `torn_bytes`, and in `lost_samples` where its stream is known.
-
-        Raises:
-            NotFoundError: no spool there.
-            ConflictError: another process is writing it.
-            CorruptDataError: damage other than a torn tail, or a closed spool that has changed.
+        What is cut off is in `torn_bytes`, and in `lost_samples` where its stream is known. Raises
+        as `SpoolReader`, and ConflictError if another process is writing it.
         """
         return cls(path, read_attributes(path), sync=sync, resume=True)
 
     def append(self, stream_name: str, batch: SampleBatch) -> None:
         """Append consecutive samples of a stream; cheap enough for every arrival.
 
-        Args:
-            stream_name: one of the recording's streams.
-            batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
-                and `h264` streams are an object array of bytes, one per image
-                (`dextouch.streams.encoded_values`).
+        `t_host_ns` never decreases. Values of `jpeg` and `h264` streams are an object array of
+        bytes, one per image (`dextouch.streams.encoded_values`).
 
         Raises:
             UnknownNameError: no such stream.
@@ -320,13 +291,9 @@ class SpoolWriter:
             self.append_record(record)
 
     def encode(self, stream_name: str, batch: SampleBatch) -> EncodedBatch | None:
-        """Encode a batch for `append_record`; None for an empty one.
+        """Encode a batch for `append_record`; None for an empty one. Raises as `append`.
 
         It does not change the writer: threads may call it while another one appends.
-
-        Raises:
-            UnknownNameError: no such stream.
-            InvalidInputError: a batch that does not fit the stream.
         """
         descriptor = self.attributes.streams[self._stream(stream_name).number]
         if len(batch):
@@ -335,16 +302,7 @@ class SpoolWriter:
         return None
 
     def append_record(self, record: EncodedBatch, *, flush: bool = False) -> None:
-        """Append an encoded batch, as `append` does.
-
-        Args:
-            record: of a stream of this recording.
-            flush: keep the batch only if `flush` succeeds too.
-
-        Raises:
-            InvalidInputError: it begins before the last sample of its stream.
-            StorageFullError: no space; everything appended before stays.
-        """
+        """Append an encoded batch as `append` does; with `flush` it is kept only if synced, too."""
         stream = self._stream(record.stream_name)
         check_follows(record.stream_name, record.first_t_host_ns, stream.last_t_host_ns)
         place = self._log.append(record, stream=stream.number, first_sample=stream.num_samples)
@@ -374,10 +332,9 @@ class SpoolWriter:
         self._is_dirty = False
 
     def set_attributes(self, attributes: RecordingAttributes) -> None:
-        """Replace attributes of the recording (ledger, success); id and streams must not change.
+        """Replace attributes of the recording (ledger, success).
 
-        Raises:
-            InvalidInputError: another id or other streams.
+        Raises InvalidInputError for another id or other streams.
         """
         ours = self.attributes
         if (attributes.recording_id, attributes.streams) != (ours.recording_id, ours.streams):
@@ -391,8 +348,7 @@ class SpoolWriter:
     def close(self) -> None:
         """Flush and seal the complete recording; closing twice does nothing.
 
-        Raises:
-            StorageError: the disk refused, and the spool is still open; try again or abandon it.
+        Raises StorageError if the disk refused; the spool is open: try again or abandon it.
         """
         if self._lock < 0:
             return

@@ -116,11 +116,7 @@ class LogBytes:
 
 @contextmanager
 def open_log(folder: Path) -> Iterator[LogBytes]:
-    """Open a spool's log for reading.
-
-    Raises:
-        CorruptDataError: the log is missing.
-    """
+    """Open a spool's log for reading; raises CorruptDataError if it is missing."""
     with disk_errors(f"read log of spool {folder.name!r}"):
         if not (folder / LOG_FILE).is_file():
             raise CorruptDataError(f"spool {folder.name!r}: {LOG_FILE} is missing")
@@ -131,9 +127,7 @@ def open_log(folder: Path) -> Iterator[LogBytes]:
 def find_records(data: LogBytes) -> LogRecords:
     """Find all records of a log, continuing after damage.
 
-    Raises:
-        CorruptDataError: the bytes are not a log.
-        StorageError: a log of another version of the format.
+    Raises CorruptDataError for other bytes, StorageError for another version of the format.
     """
     magic = data.read(0, len(LOG_MAGIC))
     # Written and synced before the spool appears, so that no crash leaves less of it.
@@ -164,9 +158,7 @@ def find_records(data: LogBytes) -> LogRecords:
 def read_records(folder: Path) -> LogRecords:
     """The records of a spool's log; a torn tail is ignored.
 
-    Raises:
-        CorruptDataError: damage other than a torn tail, or a missing or foreign log.
-        StorageError: a log of another version of the format.
+    Raises as `find_records`, and CorruptDataError for damage other than a torn tail.
     """
     with open_log(folder) as data:
         records = find_records(data)
@@ -198,8 +190,7 @@ def body_at(data: LogBytes, row: np.void) -> bytes | None:
 def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
     """Iterate over the bodies of records of one stream.
 
-    Raises:
-        CorruptDataError: a body does not match its checksum.
+    Raises CorruptDataError if one does not match its checksum.
     """
     with open_log(folder) as data:
         for row in rows:
@@ -215,8 +206,7 @@ def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
 def read_batch(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
     """The samples in consecutive records of one stream, verified.
 
-    Raises:
-        CorruptDataError: a body does not match its checksum, or is that of another stream.
+    Raises as `read_bodies`, and CorruptDataError for a body of another stream.
     """
     where, counts = f"spool {folder.name!r}", rows["num_samples"].tolist()
     bodies = read_bodies(folder, rows)
@@ -240,12 +230,10 @@ def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
 
 
 class SpoolLogWriter:
-    """Appends records to a spool's log; each append is one write.
+    """Appends records to a spool's log, each by one write; `end` is its length in bytes.
 
-    It continues after `records`, where the file is truncated; `end` is its length in bytes.
-
-    Raises:
-        StorageError: the file cannot be opened.
+    It continues after `records`, where the file is truncated. Raises StorageError if it cannot be
+    opened.
     """
 
     def __init__(self, folder: Path, records: LogRecords) -> None:
@@ -260,8 +248,7 @@ class SpoolLogWriter:
     def append(self, batch: EncodedBatch, *, stream: int, first_sample: int) -> int:
         """Append a batch atomically and return its offset, for `undo`.
 
-        Raises:
-            StorageFullError: no space; the file is unchanged.
+        Raises StorageFullError without space; the file is unchanged.
         """
         place, length = self.end, len(batch.body)
         counts = (first_sample, stream, batch.num_samples, length, batch.body_crc32c)
@@ -346,8 +333,7 @@ def encode_attributes(attributes: RecordingAttributes) -> bytes:
 def decode_attributes(text: bytes, *, what: str) -> RecordingAttributes:
     """Inverse of `encode_attributes`; files of earlier releases have no checksum.
 
-    Raises:
-        CorruptDataError: damaged bytes.
+    Raises CorruptDataError for damaged bytes.
     """
     found = _CHECKSUM.search(text)
     if found is not None:
@@ -365,9 +351,7 @@ def decode_attributes(text: bytes, *, what: str) -> RecordingAttributes:
 def read_recording_file(path: Path) -> bytes:
     """The bytes of a spool's `recording.json`.
 
-    Raises:
-        NotFoundError: there is no spool.
-        CorruptDataError: there is its log alone.
+    Raises NotFoundError without a spool, CorruptDataError if there is its log alone.
     """
     with disk_errors(f"open spool {path.name}"):
         if not (path / RECORDING_FILE).is_file():
@@ -383,9 +367,7 @@ def read_recording_file(path: Path) -> bytes:
 def read_seal(path: Path) -> Seal | None:
     """The seal of a closed spool; None for an empty file, which earlier releases wrote.
 
-    Raises:
-        FileNotFoundError: the spool is not closed.
-        CorruptDataError: the seal is damaged.
+    Raises FileNotFoundError if the spool is not closed, CorruptDataError if the seal is damaged.
     """
     text = (path / CLOSED_FILE).read_bytes()
     try:

@@ -57,7 +57,7 @@ from dextouch.schemas import (
     Review,
 )
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor, StreamKind
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile.layout import SIDES, TactileLayout
 
 if TYPE_CHECKING:
     from dextouch.episodes.object_storage import ObjectStorage
@@ -72,14 +72,10 @@ class EpisodeStore:
     Concurrent use from several processes is safe: committed groups are immutable, and uncommitted
     ones are invisible.
 
-    Args:
-        url: local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
-            `region` and others of `dextouch.episodes.object_bucket` after a `?`.
-        storage_options: of an `s3://…` store; credentials belong here or in the usual AWS_*
-            environment, which obstore reads.
-
-    `url` is the address as given; `root` is the local folder of unfinished groups: the store itself
-    if that is a folder, otherwise the work folder.
+    `url` is a local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
+    `region` and others of `dextouch.episodes.object_bucket` after a `?`; its credentials are
+    storage options, or in the usual AWS_* environment, which obstore reads. `root` is the local
+    folder of unfinished groups: the store itself if that is a folder, otherwise the work folder.
     """
 
     def __init__(self, url: str | Path, storage_options: Mapping[str, str] | None = None) -> None:
@@ -95,9 +91,8 @@ class EpisodeStore:
     def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
 
-        Raises:
-            ConflictError: the id exists already.
-            InvalidInputError: attributes of the other kind.
+        Raises ConflictError for an id that exists, InvalidInputError for attributes of the other
+        kind.
         """
         model = ATTRIBUTES[_check_kind(kind)]
         if not isinstance(attributes, model):
@@ -110,9 +105,8 @@ class EpisodeStore:
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
 
-        Raises:
-            NotFoundError: no such episode.
-            CorruptDataError, StorageError: damaged, or of a newer format.
+        Raises NotFoundError without it, CorruptDataError or StorageError if it is damaged, or of a
+        newer format.
         """
         return EpisodeReader(self._read("episode", episode_id, EpisodeAttributes))
 
@@ -130,11 +124,7 @@ class EpisodeStore:
             raise
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
-        """The raw files of a committed group, for inspection and repair.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """The raw files of a committed group, for inspection and repair; raises as `revision`."""
         return self._storage.group(*_check(kind, item_id))
 
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
@@ -144,8 +134,7 @@ class EpisodeStore:
     def revision(self, item_id: str, *, kind: Kind = "episode") -> int:
         """A number that changes when an id is deleted and written again.
 
-        Raises:
-            NotFoundError: no such id.
+        Raises NotFoundError without the id.
         """
         return self._storage.revision(*_check(kind, item_id))
 
@@ -160,9 +149,7 @@ class EpisodeStore:
     def review(self, item_id: str, *, kind: Kind = "episode") -> Review | None:
         """The review of an item; None if nobody reviewed it.
 
-        Raises:
-            NotFoundError: no such id.
-            CorruptDataError: its review cannot be read.
+        Raises NotFoundError without the id, CorruptDataError if its review cannot be read.
         """
         group = self._storage.group(*_check(kind, item_id))
         return read_remark(group, REVIEW_FILE, Review, what=f"{kind} {item_id!r}")
@@ -170,8 +157,7 @@ class EpisodeStore:
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
         """Keep the review of an item in place of an earlier one; None removes it.
 
-        Raises:
-            NotFoundError: no such id.
+        Raises NotFoundError without the id.
         """
         self._set_remark(kind, item_id, REVIEW_FILE, review)
 
@@ -192,12 +178,9 @@ class EpisodeStore:
         self._storage.set_remark(kind, item_id, name, content)
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
-        """Move an episode or recording to the trash, or delete it `for_good`.
+        """Move an item to the trash, or delete it `for_good`, as always in object storage.
 
-        Object storage has no trash, so there it is always for good.
-
-        Raises:
-            NotFoundError: no such id.
+        Raises NotFoundError without the id.
         """
         self._storage.group(*_check(kind, item_id))
         if for_good or not isinstance(self._storage, _LocalStorage):
@@ -218,11 +201,7 @@ class EpisodeStore:
         return purge_trash(self._trash_root(), older_than_s=older_than_s)
 
     def require_trash(self) -> None:
-        """Check that deleted items can be restored.
-
-        Raises:
-            InvalidInputError: a store in a bucket, which has no trash.
-        """
+        """Raise InvalidInputError for a store in a bucket, which has no trash to restore from."""
         self._trash_root()
 
     def _trash_root(self) -> Path:
@@ -236,11 +215,9 @@ class EpisodeStore:
     def complete_uploads(self) -> tuple[tuple[Kind, str], ...]:
         """Upload groups whose upload was interrupted after their commit; their kinds and ids.
 
-        Only a store in a bucket has any: what is committed in a folder is in its place.
-
-        Raises:
-            StorageError, UnavailableError: an upload failed, others are completed; try again later.
-                Notes name what was uploaded, and other failures.
+        Only a store in a bucket has any: what is committed in a folder is in its place. Raises
+        StorageError or UnavailableError if an upload failed; others are completed, and notes name
+        them.
         """
         if isinstance(self._storage, _LocalStorage):
             return ()
@@ -279,7 +256,6 @@ def _open_storage(
 
 
 def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
-    """Validate a kind and an id."""
     return _check_kind(kind), check_id(item_id, kind=f"{kind} id")
 
 
@@ -292,8 +268,7 @@ def _check_kind(kind: Kind) -> Kind:
 def local_folder(url: str | Path) -> Path:
     """Local folder of a store's URL: a path, or `file:///…`.
 
-    Raises:
-        InvalidInputError: an address of another scheme, or of another host.
+    Raises InvalidInputError for another scheme or host.
     """
     if isinstance(url, Path):
         return url
@@ -391,6 +366,8 @@ def write_rollout(
     attributes: EpisodeAttributes,
     observations: Sequence[Observation],
     commanded: np.ndarray,
+    *,
+    layout: TactileLayout | None = None,
 ) -> None:
     """Write a rollout as an episode on the model grid.
 
@@ -403,6 +380,7 @@ def write_rollout(
         attributes: of the episode, without `streams`.
         observations: of step 0 and of every chunk; at least one has images of the head camera.
         commanded: [T, 67] actions, row 0 the poses of step 0.
+        layout: of the taxels, as the world describes it; None of `dextouch_v1`.
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])
@@ -434,6 +412,7 @@ def write_rollout(
                         "unit": unit,
                         "nominal_rate_hz": rate_hz,
                         "frame": "world" if kind == "pose" else None,
+                        "layout": layout if kind == "tactile" else None,
                     }
                 )
             )

@@ -27,6 +27,7 @@ from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
 from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import TactileLayout
 
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 
@@ -36,10 +37,10 @@ logger = structlog.get_logger(__name__)
 def is_rejected(
     store: EpisodeStore, about: EpisodeAttributes, *, others: Iterable[EpisodeStore] = ()
 ) -> bool:
-    """Whether an episode must not be trained on.
+    """Whether an episode must not be trained on, by its own review.
 
-    An episode is rejected by its own review; one without a review is rejected with a recording or
-    episode that it was made from, if that is in the same store or in one of `others`.
+    One without a review is rejected with a recording or episode that it was made from, if that is
+    in the same store or in one of `others`.
     """
     own = store.review(about.episode_id)
     if own is not None:
@@ -66,16 +67,9 @@ def select_episodes(
 ) -> Iterator[EpisodeReader]:
     """Episodes that are fit for a learner, store by store in the order of their ids.
 
-    Those that were rejected in review and those that lack what is needed are left out, counted and
-    logged by reason.
-
-    Args:
-        stores: stores to read.
-        domain: whose hands act; None for people and robots.
-        tasks: tasks to read; empty for all.
-        splits: splits of their scenes; empty for all.
-        origins: where they come from; empty for all.
-        needs: what an episode must have, beside actions.
+    Those that were rejected in review and those that lack what is needed, beside actions, are left
+    out, counted and logged by reason. A domain of None is people and robots; tasks, splits of their
+    scenes and origins that are empty are all.
 
     Raises:
         NotFoundError: an empty store, or no such episode; what those that there are lack is named.
@@ -141,11 +135,7 @@ class _Chosen:
         self._first: EpisodeAttributes | None = None
 
     def add(self, about: EpisodeAttributes) -> None:
-        """Add an episode.
-
-        Raises:
-            ConflictError: it is there already, as another alignment or at another rate.
-        """
+        """Add an episode; raises ConflictError if it is there already, or at another rate."""
         name, first = about.episode_id, self._first or about
         recording = recording_of(about) if about.origin == "recorded" else None
         other = name if recording is None else self._of_recording.setdefault(recording, name)
@@ -169,11 +159,9 @@ class _Chosen:
 def data_hash(contents: Iterable[str], **options: object) -> str:
     """SHA-256 of a set of episodes, in any order, as every checkpoint notes what it learned from.
 
-    Outcomes, event times and all else that labels are made of are part of an episode's content.
-
-    Args:
-        contents: `content_sha256` of the episodes.
-        options: what else decides the arrays, such as `image_px`; None is the usual and left out.
+    Of their `content_sha256`, of which outcomes, event times and all else that labels are made of
+    are a part, and of options that decide the arrays, such as `image_px`; None is the usual and
+    left out.
     """
     lines = [*sorted(contents), *(f"{k}={v}" for k, v in sorted(options.items()) if v is not None)]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
@@ -227,11 +215,7 @@ class EpisodeGrid:
 
     @property
     def success(self) -> bool:
-        """The outcome.
-
-        Raises:
-            InvalidInputError: it is not known, as the need `OUTCOME` asks for.
-        """
+        """The outcome; raises InvalidInputError if it is unknown (the need `OUTCOME`)."""
         if self.about.success is None:
             raise InvalidInputError(f"episode {self.episode_id!r}: is {OUTCOME.lack}")
         return self.about.success
@@ -286,14 +270,19 @@ class EpisodeGrid:
             return self.measured
         return self.reader.read("action_commanded").values.astype(np.float64)
 
-    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
         """Mean pressures (kPa) of each step, and where there was a sample."""
         return self.reader.touch(0, len(self))
 
     @property
-    def measured_taxels(self) -> Bool[np.ndarray, "2 320"]:
+    def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
-        return measured_taxels(self.about.calibration)
+        return measured_taxels(self.about.calibration, self.tactile_layout.num_taxels)
+
+    @property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels."""
+        return self.reader.tactile_layout
 
     @cached_property
     def image_steps(self) -> Int64[np.ndarray, " shown"]:

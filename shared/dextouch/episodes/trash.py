@@ -50,10 +50,7 @@ class TrashEntry:
 def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | None = None) -> Path:
     """Move a folder to the trash, where it can be restored until it is purged; returns its path.
 
-    `now_ns` are nanoseconds since 1970, None for now.
-
-    Raises:
-        NotFoundError: no such item.
+    `now_ns` are nanoseconds since 1970, None for now. Raises NotFoundError without the item.
     """
     home = root / _home(kind)
     number = time.time_ns() if now_ns is None else now_ns
@@ -87,9 +84,7 @@ def list_trash(root: Path) -> list[TrashEntry]:
 def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
     """Restore the last deleted item of an id.
 
-    Raises:
-        NotFoundError: no complete item of that kind and id is in the trash.
-        ConflictError: the id was taken in the meantime.
+    Raises NotFoundError without a complete one in the trash, ConflictError if the id was taken.
     """
     home = _home(kind)
     entries = [
@@ -147,11 +142,7 @@ def _home(kind: TrashKind) -> str:
 
 
 def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) -> Remark | None:
-    """A file beside the content of a group; None if there is none.
-
-    Raises:
-        CorruptDataError: the file has another form.
-    """
+    """A file beside the content of a group; None without, CorruptDataError for another form."""
     content = files.get(name)
     if content is None:
         return None

@@ -104,7 +104,9 @@ def measured_actions(
     )
 
 
-def measured_taxels(calibration: Mapping[str, Matrix]) -> Bool[np.ndarray, "2 320"]:
+def measured_taxels(
+    calibration: Mapping[str, Matrix], num_taxels: int = NUM_TAXELS
+) -> Bool[np.ndarray, "2 taxels"]:
     """Taxels that alignment did not refuse; the others are zero throughout."""
     refused = [calibration.get(f"tactile_{side}_refused_taxels", 0.0) for side in SIDES]
-    return np.stack([np.broadcast_to(np.ravel(one) == 0, NUM_TAXELS) for one in refused])
+    return np.stack([np.broadcast_to(np.ravel(one) == 0, num_taxels) for one in refused])

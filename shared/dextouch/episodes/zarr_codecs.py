@@ -25,11 +25,9 @@ class _ImageCodec(ArrayBytesCodec):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "_ImageCodec":
-        """Create the codec from array metadata; it has no configuration."""
         return cls()
 
     def to_dict(self) -> dict[str, Any]:
-        """The codec's entry of the array metadata."""
         return {"name": ZARR_CODECS[self.codec]}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> NoReturn:

@@ -26,18 +26,13 @@ def _checked(values: np.ndarray, tail: tuple[int, ...], what: str) -> Float64[np
 
 
 def _matrices(rows: Sequence[Sequence[npt.ArrayLike]]) -> Float64[np.ndarray, "*batch m n"]:
-    """Matrices from arrays of their entries."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
-    """First two columns of rotation matrices, one after the other (Zhou et al. 2019, CVPR).
+    """First two columns of rotation matrices [..., 3, 3] (Zhou et al. 2019, CVPR), as [..., 6].
 
-    Args:
-        R: rotation matrices [..., 3, 3].
-
-    Returns:
-        [..., 6]; the identity gives (1, 0, 0, 0, 1, 0).
+    The identity gives (1, 0, 0, 0, 1, 0).
 
     Raises:
         ShapeError: the last two axes are not 3×3.
@@ -48,13 +43,9 @@ def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
 
 
 def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices from two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).
+    """Rotation matrices [..., 3, 3] from two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Args:
-        columns: [..., 6], two linearly independent columns of any positive length.
-
-    Returns:
-        Proper rotation matrices [..., 3, 3].
+    The columns [..., 6] are linearly independent, of any positive length.
 
     Raises:
         DegenerateRotationError: a column is zero or both are parallel.
@@ -89,12 +80,9 @@ def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
 
 
 def rotation_from_quaternion(q_wxyz: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices from quaternions (w, x, y, z) of any positive length.
+    """Rotation matrices from quaternions [..., 4] (w, x, y, z) of any positive length.
 
-    Raises:
-        DegenerateRotationError: a quaternion is (nearly) zero.
-        ShapeError: the last axis is not 4.
-        NonFiniteError: NaN or infinity.
+    Raises DegenerateRotationError for one that is (nearly) zero, and as `rotation_to_6d`.
     """
     q = _checked(q_wxyz, (4,), "quaternion")
     norm = np.linalg.norm(q, axis=-1, keepdims=True)

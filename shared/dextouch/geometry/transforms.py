@@ -104,13 +104,9 @@ def project(
 ) -> tuple[Float64[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
     """Pixels [..., 2] of points [..., 3] in metres, and whether each lies in front of the camera.
 
-    Points nearer than 1 cm are projected as if at that depth and marked False.
-
-    Args:
-        K: camera matrix in pixels.
-        points_camera: points in the camera's frame.
-        distortion: k1 k2 p1 p2 k3 of the lens, for images as the camera took them; None for a
-            pinhole, as for undistorted images.
+    Points nearer than 1 cm are projected as if at that depth and marked False. `K` is in pixels;
+    `distortion` is k1 k2 p1 p2 k3 of the lens, for images as the camera took them, None for a
+    pinhole, as for undistorted images.
     """
     points = np.asarray(points_camera, dtype=np.float64)
     flat = points[..., :2] / np.maximum(points[..., 2:], _LEAST_DEPTH_M)
@@ -121,12 +117,9 @@ def project(
 def bracket(
     t_ns: np.ndarray, at_ns: np.ndarray, *, max_gap_ns: int
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Bracket each query time by two strictly increasing sample times.
+    """Bracket each query time by two sample times (int64 ns, at least two, strictly increasing).
 
-    Args:
-        t_ns: sample times [m ≥ 2], int64 nanoseconds, strictly increasing.
-        at_ns: query times [n] on the same clock.
-        max_gap_ns: no interpolation between neighbours further apart than this.
+    There is no interpolation between neighbours further apart than `max_gap_ns`.
 
     Returns:
         Left index [n] (0 … m-2), weight of the right neighbour [n] in [0, 1], and whether the query
@@ -181,15 +174,10 @@ def nearest_index(t_ns: np.ndarray, at_ns: np.ndarray) -> Int64[np.ndarray, " n"
 def undistorted(
     images: UInt8[np.ndarray, "n h w 3"], K: np.ndarray, distortion: np.ndarray
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    """Images as a pinhole camera of the same matrix would have taken them.
+    """Images as a pinhole camera of the same matrix K (px) would have taken them.
 
-    Pixels are interpolated bilinearly. What the camera did not see has the colour of the nearest
-    border. Images of a lens without distortion are returned as they are.
-
-    Args:
-        images: as the camera took them.
-        K: its matrix in pixels of these images.
-        distortion: k1 k2 p1 p2 k3.
+    `distortion` is k1 k2 p1 p2 k3; images of a lens without it are returned as they are. Pixels are
+    interpolated bilinearly. What the camera did not see has the colour of the nearest border.
     """
     lens = tuple(np.asarray(distortion, dtype=np.float64).ravel().tolist())
     if not images.size or not any(lens):
@@ -228,13 +216,10 @@ def points_on_level(
     T_world_camera: np.ndarray,
     z_m: float,
 ) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Points [n, 3] of the plane of a height that a camera shows at pixels [n, 2].
+    """Points [n, 3] of the plane at height z (m) in the world that a camera shows at pixels [n, 2].
 
-    Args:
-        pixels: where to look.
-        camera: K [3, 3] in pixels, and the distortion [5].
-        T_world_camera: pose of the camera (optical frame: x right, y down, z forward).
-        z_m: height of the plane in the world.
+    The camera is K [3, 3] in pixels, and the distortion [5]; its pose that of the optical frame (x
+    right, y down, z forward).
 
     Returns:
         The points, and whether the ray of each pixel meets the plane in front of the camera; rays

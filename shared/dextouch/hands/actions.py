@@ -64,9 +64,8 @@ class HandTrajectory:
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
     """Validate actions and return them as float64 [T, 67].
 
-    Raises:
-        ShapeError: not [T, 67] with T ≥ 1.
-        NonFiniteError: NaN or infinity; the message names the first row and column.
+    Raises ShapeError unless they are [T ≥ 1, 67], NonFiniteError for NaN or infinity, with the
+    place.
     """
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
@@ -177,22 +176,14 @@ def _relative_9d(T_world_anchor: np.ndarray, Ts_world_x: np.ndarray) -> Float64[
 
 
 def poses_from_actions(
-    actions: np.ndarray,
-    anchor: AnchorPoses,
-    *,
-    where: str = "actions",
-    validated: bool = False,
+    actions: np.ndarray, anchor: AnchorPoses, *, where: str = "actions", validated: bool = False
 ) -> HandTrajectory:
     """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`.
 
-    Args:
-        actions: [T, 67].
-        anchor: poses that they are relative to.
-        where: what gave the actions, for messages.
-        validated: `check_actions` has returned these actions, and they need no second look.
+    Messages begin with `where`; `validated` actions come from `check_actions`.
 
     Raises:
-        ShapeError, NonFiniteError: as `check_actions`, whose messages begin with `where`.
+        ShapeError, NonFiniteError: as `check_actions`.
         DegenerateRotationError: a 6-D rotation that is none.
     """
     checked = actions if validated else check_actions(actions, where=where)
@@ -207,24 +198,19 @@ def poses_from_actions(
 
 
 def _poses(actions: np.ndarray) -> Float64[np.ndarray, "time 3 4 4"]:
-    """Left wrist, right wrist and head camera of actions [T, 67]."""
     return pose_from_9d(actions[:, _POSE_COLUMNS].reshape(-1, len(POSE_SLICES), POSE_DIM))
 
 
 def reanchor(
     actions: np.ndarray, index: int, *, anchor_action: np.ndarray | None = None
 ) -> Float64[np.ndarray, "time 67"]:
-    """Re-express actions relative to another step.
+    """Re-express actions [T, 67], all relative to one anchor, relative to the step at `index`.
 
-    Args:
-        actions: [T, 67], all relative to one anchor.
-        index: step that becomes the anchor; its poses come out as exactly the identity.
-        anchor_action: [67], relative to the same anchor as `actions`: source of the new anchor
-            instead of `actions[index]`. Commanded actions need this: their anchor is the *measured*
-            action of the step.
+    The poses of that step come out as exactly the identity. `anchor_action` [67], relative to the
+    same anchor as `actions`, is the source of the new anchor instead of `actions[index]`. Commanded
+    actions need it: their anchor is the *measured* action of the step.
 
-    Raises:
-        InvalidInputError: index outside 0 … T-1.
+    Raises InvalidInputError for an index outside 0 … T-1.
     """
     checked = check_actions(actions)
     if not 0 <= index < len(checked):

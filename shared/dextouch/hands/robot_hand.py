@@ -75,7 +75,6 @@ class _Chains:
 
     @classmethod
     def of(cls, fingers: Sequence[FingerTable]) -> "_Chains":
-        """The hinges of one hand."""
         counts = np.array([len(finger.joints) for finger in fingers])
         is_joint = np.arange(counts.max()) < counts[:, np.newaxis]
         rows = [row for finger in fingers for row in finger.joints]
@@ -89,7 +88,6 @@ class _Chains:
 
     @cached_property
     def _cross(self) -> Float64[np.ndarray, "*hands fingers hinges 3 3"]:
-        """Cross product matrices of the axes."""
         return np.cross(np.eye(3), self.axes[..., None, :])
 
     @cached_property
@@ -115,7 +113,6 @@ class _Chains:
     def points_m(
         self, frames: Float64[np.ndarray, "time *hands fingers hinges 4 4"]
     ) -> Float64[np.ndarray, "time *hands fingers 4 3"]:
-        """Knuckle, PIP, DIP and tip of every finger."""
         # Padded with the last frame, so that index -1 is valid for all fingers.
         last = frames[..., -1, :, :]
         tips_m = (last[..., :3, :3] @ self.tips_m[..., None])[..., 0] + last[..., :3, 3]
@@ -125,21 +122,15 @@ class _Chains:
 
 
 class HandModel:
-    """A hand of 1 to 5 fingers with 1 to 6 hinges each.
+    """A hand of 1 to 5 fingers with 1 to 6 hinges each, whose name is for messages.
 
     Attributes:
         fingers: the tables, which do not change: others are another hand.
         joint_names: in the order of the joint vector: finger by finger, from the wrist out.
-        lower_rad: lower joint limits [joints].
-        upper_rad: upper joint limits [joints].
-
-    Args:
-        side: "left" or "right".
-        fingers: tables in the order of the hand's joint vector.
-        name: for messages.
+        lower_rad, upper_rad: joint limits [joints].
 
     Raises:
-        UnknownNameError: any other side, or a chain that the tracked skeleton lacks.
+        UnknownNameError: a side other than "left" and "right", or an unknown chain.
         InvalidInputError: no finger, a chain or name given twice, too few or many hinges, limits
             that are not an interval, an axis that is not a unit vector, points out of order; the
             message names the joint.
@@ -163,10 +154,8 @@ class HandModel:
     ) -> Float64[np.ndarray, "time fingers hinges 4 4"]:
         """T_wrist_joint of every hinge after its rotation; [T, 5, 4, 4, 4] for the Wuji hand.
 
-        A finger with fewer hinges than another repeats its last frame.
-
-        Args:
-            joints_rad: [T, J] joint angles in the order of `joint_names`.
+        A finger with fewer hinges than another repeats its last frame. Angles [T, J] are in the
+        order of `joint_names`.
 
         Raises:
             ShapeError: not [T, J].
@@ -204,11 +193,7 @@ class RobotHand(HandModel):
     the exact values of the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on
     PyPI), the fingertips its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
 
-    Args:
-        side: "left" or "right".
-
-    Raises:
-        UnknownNameError: any other side.
+    Raises UnknownNameError for a side other than "left" and "right".
     """
 
     def __init__(self, side: str) -> None:
@@ -216,10 +201,9 @@ class RobotHand(HandModel):
 
 
 def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 2 5 4 3"]:
-    """`RobotHand.chain_points_m` of the left and the right hand, in little more time than of one.
+    """`RobotHand.chain_points_m` of both hands, in little more time than of one.
 
-    Args:
-        joints_rad: [T, 2, 20] finite joint angles, left before right.
+    Joint angles [T, 2, 20] are finite, left before right.
     """
     chains = _both_hands()
     angles_rad = np.asarray(joints_rad, dtype=np.float64).reshape(-1, *chains.axes.shape[:-1])

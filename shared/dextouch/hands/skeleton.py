@@ -68,8 +68,7 @@ def solver_indices(chain: str) -> list[int]:
 def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
     """The 25 keypoints of the mean hand, flat, in wrist axes, metres; read-only.
 
-    Raises:
-        UnknownNameError: a side other than "left" and "right".
+    Raises UnknownNameError for a side other than "left" and "right".
     """
     if side not in ("left", "right"):
         raise UnknownNameError("side", side, ["left", "right"])
@@ -125,9 +124,8 @@ _THUMB_WORDS: Final = (("cmc", "mcp", "ip", "tip"), ("mcp", "pip", "dip", "tip")
 class NodeOrder:
     """Assignment of a tracker's nodes to keypoints.
 
-    Attributes:
-        places: our keypoint index of each of the tracker's nodes, in its order; −1 for a palm.
-        absent: our nodes that the tracker lacks.
+    `places` are our keypoint indices of the tracker's nodes, −1 for a palm; `absent` nodes it
+    lacks.
     """
 
     places: tuple[int, ...]
@@ -136,8 +134,7 @@ class NodeOrder:
     def keypoints(self, points: np.ndarray) -> Float64[np.ndarray, "*batch 25 3"]:
         """Reorder a tracker's points [..., n, 3] to our keypoints; NaN where absent.
 
-        Raises:
-            ShapeError: not one point per node.
+        Raises ShapeError for another number of points than nodes.
         """
         array = np.asarray(points, dtype=np.float64)
         if array.shape[-2:] != (len(self.places), 3):
@@ -152,17 +149,13 @@ class NodeOrder:
 
 
 def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> NodeOrder:
-    """Assign nodes given by chain and joint.
+    """Assign a tracker's nodes, given in its order by chain and joint; case-insensitive.
 
-    Args:
-        nodes: (chain, joint) in the tracker's order. Chains by our names ("pinky" is "little", the
-            chain "hand" the wrist), joints of a chain all by our names, or all by medicine's (CMC
-            MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them; case-insensitive. A palm is
-            ignored.
-        may_lack: optional nodes, such as `FINGER_METACARPALS`.
+    Chains are by our names ("pinky" is "little", the chain "hand" the wrist), joints of a chain all
+    by our names, or all by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames
+    them. A palm is ignored. Nodes that the tracker `may_lack` are such as `FINGER_METACARPALS`.
 
-    Raises:
-        InvalidInputError: unknown, missing or duplicate nodes; the message lists them.
+    Raises InvalidInputError for unknown, missing or duplicate nodes, which it lists.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)

@@ -1,9 +1,3 @@
 """Metrics of predicted images, touch and policy scores against ground truth."""
 
-__all__ = [
-    "geometry",
-    "image",
-    "policy",
-    "tactile",
-    "trajectory",
-]
+__all__ = ["image", "policy", "tactile", "trajectory"]

@@ -1,12 +1,12 @@
-"""PSNR (dB) and SSIM of predicted 8-bit colour images, and the check of arrays to compare.
+"""PSNR (dB) and SSIM of predicted 8-bit colour images, errors of depth, and the check of arrays.
 
-Both are averaged over images, so the value of a clip is the mean over its images.
+PSNR and SSIM are averaged over images, so the value of a clip is the mean over its images.
 """
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import NonFiniteError, ShapeError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 
 PEAK = 255.0
 # Cap for exact images, whose PSNR is infinite, so that means stay finite.
@@ -46,13 +46,9 @@ def checked_pair(
 def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean over images of 10 log10(255² / MSE) in dB, each image capped at 100 dB.
 
-    Args:
-        predicted: images [..., h, w, 3] in 0 … 255 (uint8, or a float that was not yet rounded).
-        true: images of the same shape.
+    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded).
 
-    Raises:
-        ShapeError: different shapes or not [..., h, w, 3].
-        NonFiniteError: NaN or infinity.
+    Raises ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
     """
     a, b = checked_pair(predicted, true, what="PSNR of images", tail=(None, None, 3))
     mse = np.mean((a - b) ** 2, axis=(-3, -2, -1))
@@ -66,14 +62,10 @@ def decibels(mse: np.ndarray | np.floating, *, peak: float) -> Float64[np.ndarra
 
 
 def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
-    """Mean structural similarity, 1 for equal images.
+    """Mean structural similarity of images [..., h, w, 3] in 0 … 255, 1 for equal images.
 
-    Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255,
-    each channel separately, only where the whole window lies inside the image.
-
-    Args:
-        predicted: images [..., h, w, 3] in 0 … 255, at least 11 px high and wide.
-        true: images of the same shape.
+    Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255, each
+    channel separately, only where the whole window lies inside the image.
 
     Raises:
         ShapeError: different shapes, not [..., h, w, 3], or images smaller than the window.
@@ -117,3 +109,24 @@ def _smooth(images: np.ndarray) -> np.ndarray:
         windows = np.lib.stride_tricks.sliding_window_view(images, SSIM_WINDOW_PX, axis=axis)
         images = windows @ kernel
     return images
+
+
+def depth_error(*, predicted_m: np.ndarray, true_m: np.ndarray) -> float:
+    """AbsRel after alignment of the scale: mean of abs(s p - t) / t, s = median(t) / median(p).
+
+    One scale for all depths [..., h, w] together. Pixels without depth on either side (infinite) do
+    not count.
+
+    Raises:
+        ShapeError: different shapes.
+        InvalidInputError: no pixel with two positive depths.
+    """
+    p, t = np.asarray(predicted_m, dtype=np.float64), np.asarray(true_m, dtype=np.float64)
+    if p.shape != t.shape:
+        raise ShapeError(f"depths: got shapes {p.shape} and {t.shape}, expected the same")
+    valid = np.isfinite(p) & np.isfinite(t)
+    if not valid.any() or p[valid].min() <= 0 or t[valid].min() <= 0:
+        raise InvalidInputError("depths: expected at least one pixel, and positive depths (m)")
+    p, t = p[valid], t[valid]
+    scale = np.median(t) / np.median(p)
+    return float(np.mean(np.abs(scale * p - t) / t))

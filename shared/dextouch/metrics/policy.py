@@ -61,18 +61,11 @@ def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
 def mmrv(*, real: np.ndarray, imagined: np.ndarray, ties: str = "paper") -> float:
     """Mean maximum rank violation of scores [policies]: 0 is best.
 
-    `(1/N) Σ_i max_j |real_i − real_j| · v_ij`. Both rules count a pair in opposite order; they
-    differ when one side ties.
-
-    Args:
-        real: scores in the reference world.
-        imagined: scores of the same policies in the judged world.
-        ties: "paper": v_ij = 1 only if the differences have opposite signs, so a tie never
-            counts. "simpler": as in SimplerEnv, v_ij = 1 if `imagined_i > imagined_j` and
-            `real_i > real_j` differ, so a tie on the imagined side does.
-
-    Returns:
-        The violation in the unit of the scores; NaN for fewer than two policies.
+    `(1/N) Σ_i max_j |real_i − real_j| · v_ij`, in the unit of the scores; NaN for fewer than two
+    policies. Both rules count a pair in opposite order; they differ when one side ties. "paper":
+    v_ij = 1 only if the differences have opposite signs, so a tie never counts. "simpler": as in
+    SimplerEnv, v_ij = 1 if `imagined_i > imagined_j` and `real_i > real_j` differ, so a tie on the
+    imagined side does.
 
     Raises:
         UnknownNameError: another tie rule.

@@ -15,14 +15,10 @@ MIN_FOUND_SHARE = 0.1
 
 
 def dynamic_time_warping(first: np.ndarray, second: np.ndarray) -> float:
-    """Least sum of distances over monotone alignments of two trajectories.
+    """Least sum of distances over monotone alignments of two trajectories [n, d] and [m, d].
 
-    Both ends are aligned, and every point of either has at least one partner (Sakoe and Chiba
-    1978, steps of one in either or both).
-
-    Args:
-        first: points [n, d].
-        second: points [m, d].
+    Both ends are aligned, and every point of either has at least one partner (Sakoe and Chiba 1978,
+    steps of one in either or both).
     """
     distances = np.linalg.norm(first[:, None] - second[None], axis=2)
     cost = np.full((len(first) + 1, len(second) + 1), np.inf)
@@ -37,16 +33,12 @@ def dynamic_time_warping(first: np.ndarray, second: np.ndarray) -> float:
 def trajectory_accuracy(
     *, predicted: np.ndarray, true: Float64[np.ndarray, "steps dims"], tolerance: float
 ) -> float:
-    """exp(-DTW / (steps · tolerance)) in 0 … 1; 1 for equal trajectories.
+    """exp(-DTW / (steps · tolerance)) in 0 … 1; 1 for equal trajectories [steps, d].
 
     nDTW of Ilharco et al. 2019 (arXiv:1907.05446). Unlike path length / DTW it is bounded, also for
     perfect predictions. Missing points of the prediction (NaN) are interpolated, and repeated at
-    the ends; with fewer than a tenth of the points the accuracy is 0.
-
-    Args:
-        predicted: points [steps, d], NaN where nothing was found.
-        true: points [steps, d], all finite.
-        tolerance: mean distance at which the accuracy falls to 1/e, in the unit of the points.
+    the ends; with fewer than a tenth of the points the accuracy is 0. `tolerance` is the mean
+    distance at which the accuracy falls to 1/e, in the unit of the points.
 
     Raises:
         ShapeError: different shapes.

@@ -137,6 +137,7 @@ from .station import HealthHistory as HealthHistory
 from .station import HealthLevel as HealthLevel
 from .station import OutstandingTakes as OutstandingTakes
 from .station import PendingDeletion as PendingDeletion
+from .station import PracticeStatus as PracticeStatus
 from .station import RaisedFinding as RaisedFinding
 from .station import RecorderAction as RecorderAction
 from .station import RecorderSession as RecorderSession

@@ -9,6 +9,7 @@ from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
+from dextouch.tactile import LayoutDescription
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
@@ -132,15 +133,8 @@ class Finding(FrozenModel):
     score: float | None = None
 
 
-class CatalogItem(FrozenModel):
-    """An episode or a recording with all that a table of both shows.
-
-    `consent` of an episode is that of its recording, None where that is not stored. `figures` are
-    figures of its quality, the same for all items. `recordings` and `episodes` are the stored
-    recordings that it was made from and the episodes that were made from it; `aligned` is the last
-    of these, in the list of takes only. `complete` is False of a take that was saved although its
-    check found it incomplete. `time_doubts` names streams whose times are in doubt.
-    """
+class _ItemFields(FrozenModel):
+    """What the table of items and their playback both show."""
 
     kind: ItemKind
     id: str
@@ -150,13 +144,25 @@ class CatalogItem(FrozenModel):
     origin: Origin
     station: str | None = None
     operator: str | None = None
-    consent: bool | None = None
     success: bool | None = None
     recovered: bool = False
+    at: AwareDatetime | None = None
+
+
+class CatalogItem(_ItemFields):
+    """An episode or a recording with all that a table of both shows.
+
+    `consent` of an episode is that of its recording, None where that is not stored. `figures` are
+    figures of its quality, the same for all items. `recordings` and `episodes` are the stored
+    recordings that it was made from and the episodes that were made from it; `aligned` is the last
+    of these, in the list of takes only. `complete` is False of a take that was saved although its
+    check found it incomplete. `time_doubts` names streams whose times are in doubt.
+    """
+
+    consent: bool | None = None
     complete: bool = True
     incomplete_cause: str = ""
     duration_s: float = Field(ge=0)
-    at: AwareDatetime | None = None
     trace_id: str | None = Field(default=None, exclude_if=not_)
     figures: dict[str, float] = Field(default={})
     time_doubts: tuple[str, ...] = ()
@@ -224,7 +230,7 @@ class PlayedStream(FrozenModel):
     """A stream on the item's clock; `gaps_ns` are the longest gaps in order of time.
 
     `interpolated` are the spans of actions that nothing measured, `unmeasured_taxels` those that
-    alignment refused.
+    alignment refused. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`.
 
     A gap is an interval of more than one and a half nominal periods between samples. Times are
     those of the reference clock for episodes, of the host's arrivals for recordings; None if the
@@ -245,9 +251,10 @@ class PlayedStream(FrozenModel):
     gaps_ns: tuple[tuple[int, int], ...] = ()
     interpolated: tuple[InterpolatedSpan, ...] = ()
     unmeasured_taxels: tuple[int, ...] = ()
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 
-class Playback(FrozenModel):
+class Playback(_ItemFields):
     """What can be played of a recording or an episode, from `start_ns` to `stop_ns`.
 
     `started_t_host_ns` is a recording's host time at its start, `origin_after_start_ns` how much
@@ -255,18 +262,7 @@ class Playback(FrozenModel):
     the action that no step of an episode has.
     """
 
-    kind: ItemKind
-    id: str
-    task: str
-    instruction: str
-    domain: Domain
-    origin: Origin
-    station: str | None = None
-    operator: str | None = None
-    success: bool | None = None
-    recovered: bool = False
     absent: tuple[str, ...] = ()
-    at: AwareDatetime | None = None
     model_rate_hz: float | None = None
     num_steps: int = 0
     start_ns: int

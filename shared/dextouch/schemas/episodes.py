@@ -161,11 +161,7 @@ class EpisodeAttributes(FrozenModel):
         return self.calibration | ({} if self.K_head is None else {"K_head": self.K_head})
 
     def K_head_matrix(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802 (K is the camera matrix)
-        """The head camera's matrix in pixels.
-
-        Raises:
-            InvalidInputError: it is not known.
-        """
+        """The head camera's matrix in pixels; raises InvalidInputError if it is not known."""
         if self.K_head is None:
             raise InvalidInputError(
                 f"episode {self.episode_id!r}: the matrix K_head of its head camera is not known; "

@@ -38,6 +38,8 @@ from dextouch.schemas.rollouts import (
     Uncertainty,
 )
 from dextouch.streams import pack, unpack
+from dextouch.tactile import MAX_CELLS
+from dextouch.tactile.layout import NUM_TAXELS
 
 # Tolerance of the norm of a unit quaternion in float32.
 QUATERNION_TOLERANCE: Final = 1e-3
@@ -90,7 +92,7 @@ class Observation:
 
     first_step: int
     images: dict[str, UInt8[np.ndarray, "n h w 3"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_kpa: Float32[np.ndarray, "n 2 taxels"]
     action_reached: Float64[np.ndarray, "n 67"]
     reached_is_measured: bool
     success: bool | None = None
@@ -164,15 +166,17 @@ def check_observation_arrays(
 ) -> None:
     """Check that the arrays of an observation are consistent and finite.
 
-    Raises:
-        ShapeError: inconsistent dtypes, lengths or shapes.
-        NonFiniteError: in touch, actions or object poses.
-        DegenerateRotationError: an object's quaternion is not of length 1.
+    Raises ShapeError for dtypes, lengths or shapes, NonFiniteError in touch, actions or object
+    poses, DegenerateRotationError for an object's quaternion that is not of length 1.
     """
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
         raise ShapeError(f"{where}: got 0 steps, expected at least 1")
-    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, 320)), where)
+    # How many taxels there are is a fact of the glove; worlds check it by their layout.
+    num_taxels = tactile_kpa.shape[-1] if tactile_kpa.ndim == 3 else NUM_TAXELS
+    if not 1 <= num_taxels <= MAX_CELLS:
+        raise ShapeError(f"{where}: got {num_taxels} taxels, expected 1 … {MAX_CELLS}")
+    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, num_taxels)), where)
     _check_array("action_reached", action_reached, ("float64", (num_steps, ACTION_DIM)), where)
     size_px = next((array.shape[1:3] for array in images.values() if array.ndim == 4), (0, 0))
     for camera, array in images.items():
@@ -288,11 +292,7 @@ def answer_parts(
 
 
 def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
-    """Decode a packed response that holds touch.
-
-    Raises:
-        InvalidInputError: not a valid response.
-    """
+    """Decode a packed response that holds touch; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(AnswerFields, raw, where="answer")
     if any(name.startswith(JPEG_PREFIX) for name in arrays):
@@ -308,11 +308,7 @@ def encode_observation(observation: Observation) -> bytes:
 
 
 def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
-    """Inverse of `encode_observation`.
-
-    Raises:
-        InvalidInputError: not a valid observation.
-    """
+    """Inverse of `encode_observation`; raises InvalidInputError if it is not valid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(ObservationFields, raw, where="observation")
     return _observation_from(fields, arrays, where="observation")
@@ -333,11 +329,7 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
-    """Decode and validate a start request from an untrusted source.
-
-    Raises:
-        InvalidInputError: not a valid start request.
-    """
+    """Decode a start request of an untrusted source; raises InvalidInputError if it is invalid."""
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
@@ -420,11 +412,7 @@ def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarra
 
 
 def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    """A model of decoded fields, or of JSON as bytes.
-
-    Raises:
-        InvalidInputError: wrong fields; the message begins with `where`.
-    """
+    """A model of decoded fields, or of JSON as bytes; an InvalidInputError begins with `where`."""
     try:
         # Not model_validate_json, which converts unknown parts once per mistake.
         return model.model_validate(from_json(fields) if isinstance(fields, bytes) else fields)
@@ -452,10 +440,8 @@ def decode_images(
 ) -> dict[str, np.ndarray]:
     """Inverse of `encode_images`, for a response that may hold JPEG.
 
-    Raises:
-        InvalidInputError: sizes that are missing or do not fit, or images that differ in size.
-        LimitExceededError: images that take more than `max_bytes` once decoded.
-        CorruptDataError: not JPEG.
+    Raises InvalidInputError for sizes that do not fit, LimitExceededError for more than `max_bytes`
+    once decoded, CorruptDataError for anything but JPEG.
     """
     found = {}
     for name, array in arrays.items():

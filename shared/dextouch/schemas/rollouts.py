@@ -9,10 +9,13 @@ from pydantic import ConfigDict, Field, model_validator
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION
+from dextouch.tactile import LayoutDescription
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
+# Of one hand of a `dextouch_v1`.
+_USUAL_TAXELS: Final = 320
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
 # policies, models in the paper's form and comparisons have.
 CHUNK_STEPS: Final = 16
@@ -43,7 +46,6 @@ def reported_milestones(info: Mapping[str, float]) -> dict[str, float]:
 
 
 def _is_none(value: object) -> bool:
-    """For fields that are omitted where they are unknown, so that older clients can read them."""
     return value is None
 
 
@@ -53,7 +55,8 @@ class WorldDescription(FrozenModel):
     `object_names` lists, by task, the objects whose poses are in its observations; empty for a
     world without object poses. Touch is zero in observations of a world that does not predict it.
     If it `scales_images`, those of a start may have another size: the middle square is scaled to
-    the world's size, and the rollout's `K_head` is of the scaled image.
+    the world's size, and the rollout's `K_head` is of the scaled image. `tactile_layout` is that of
+    the taxels in all observations, None of `dextouch_v1`.
     """
 
     name: str
@@ -72,6 +75,14 @@ class WorldDescription(FrozenModel):
     object_names: dict[str, tuple[str, ...]] = Field(default={})
     predicts_touch: bool = Field(default=True, exclude_if=bool)
     scales_images: bool = Field(default=False, exclude_if=not_)
+    tactile_layout: LayoutDescription | None = Field(
+        default=None, exclude_if=lambda one: one is None
+    )
+
+    @property
+    def num_taxels(self) -> int:
+        """Taxels of one hand in observations."""
+        return _USUAL_TAXELS if self.tactile_layout is None else self.tactile_layout.num_taxels
 
 
 class WorldList(FrozenModel):
@@ -156,11 +167,9 @@ class RolloutUncertainty(FrozenModel):
     size_deviation: float | None = None
 
     def after(self, uncertainty: Uncertainty | None, *, last_step: int) -> "RolloutUncertainty":
-        """The uncertainty of the rollout after one more chunk.
+        """The uncertainty of the rollout after one more chunk, which ends at `last_step`.
 
-        Args:
-            uncertainty: of the chunk; None where the world reports none.
-            last_step: last step of the chunk.
+        That of the chunk is None where the world reports none.
         """
         reason, step = self.reason, self.step
         if reason is None and uncertainty is not None and uncertainty.outside:

@@ -7,7 +7,7 @@ from pydantic import Field, FiniteFloat, ValidationError, field_validator, model
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.common import Box, StoreId
+from dextouch.schemas.common import Box, StoreId, first_problems
 
 # Position x y z (m), then the quaternion w x y z.
 Pose = tuple[
@@ -281,9 +281,8 @@ def load_scene_objects(path: Path) -> SceneObjects:
 def load_object_clicks(path: Path) -> ObjectClicks:
     """Read objects, and clicks on them, of a JSON file.
 
-    Raises:
-        NotFoundError: there is no such file.
-        InvalidInputError: not JSON, too large, or other fields than expected.
+    Raises NotFoundError without the file, InvalidInputError if it is not JSON, too large, or has
+    other fields than expected.
     """
     return _loaded(path, ObjectClicks)
 
@@ -298,8 +297,7 @@ def _loaded(path: Path, form: type[Objects]) -> Objects:
     try:
         return form.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        problems = first_problems(error)
         raise InvalidInputError(
-            f"objects {path}: {place}: {first['msg']}; docs/objects.md shows a file"
+            f"objects {path}: {problems}; docs/objects.md shows a file"
         ) from error

@@ -8,6 +8,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
+from dextouch.tactile import LayoutDescription
 
 RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
@@ -189,10 +190,11 @@ class StreamHealth(FrozenModel):
     """One stream at this moment; `lost` and `received` count its device's packets since start.
 
     `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
-    messages. `figures` are the numbers behind them by their Prometheus names, none while the
-    stream is stale. Of a glove, `taxels` are those out of order by their state, in anatomical
-    order (`dextouch.tactile.layout`), and `tare_age_s` is the age of its tare where the calibration
-    says when it was made. `following` is that of a tracked hand, where the station checks it.
+    messages. `figures` are the numbers behind them by their Prometheus names, none while the stream
+    is stale. Of a glove, `taxels` are those out of order by their state, in anatomical order
+    (`dextouch.tactile.layout`), and `tare_age_s` is the age of its tare where the calibration says
+    when it was made, and `layout` is that of its taxels, None of `dextouch_v1`. `following` is that
+    of a tracked hand, where the station checks it.
     """
 
     stream: str
@@ -213,6 +215,7 @@ class StreamHealth(FrozenModel):
     clock_residual_ms: float | None = None
     taxels: dict[TaxelState, tuple[int, ...]] = Field(default_factory=dict)
     tare_age_s: float | None = None
+    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
     following: RobotFollowing | None = None
 
 
@@ -268,6 +271,15 @@ class HealthCause(FrozenModel):
     findings: tuple[str, ...] = ()
 
 
+class PracticeStatus(FrozenModel):
+    """Whether a station simulates devices to practise calibration with, below `/practice`.
+
+    Stations of real devices have none (`unavailable`).
+    """
+
+    state: Literal["unavailable", "off", "on"]
+
+
 class StationHealth(FrozenModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 
@@ -288,6 +300,7 @@ class StationOverview(FrozenModel):
     """A station in a few values.
 
     `cause` is the widest cause of its level, `age_s` that of the newest sample of any stream.
+    `layouts` are those of its gloves by hand, where they are not `dextouch_v1`.
     """
 
     station: str
@@ -300,6 +313,7 @@ class StationOverview(FrozenModel):
     disk_left_s: float | None = None
     disk_free_bytes: float | None = None
     cameras: tuple[CameraLive, ...] = ()
+    layouts: dict[str, LayoutDescription] = Field(default={}, exclude_if=not_)
 
 
 class HealthEvent(FrozenModel):

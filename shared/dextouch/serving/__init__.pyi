@@ -26,7 +26,7 @@ from .keys import Grant as Grant
 from .keys import not_signed_in as not_signed_in
 from .keys import secret_digest as secret_digest
 from .logs import configure_logging as configure_logging
-from .masking import masked as masked
+from .logs import masked as masked
 from .refusals import WrongKeys as WrongKeys
 from .running import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
 from .running import bound_socket as bound_socket

@@ -1,18 +1,21 @@
-"""Factory of service applications: middleware, problem+json errors, health and metrics."""
+"""Factory of service applications: middleware, problem+json errors, health, metrics, OpenAPI.
+
+FastAPI documents parameters, models and successful responses. The rest follows from the routes:
+`RequireScope` the security scheme, `takes` the request body, method and parameters the refusals.
+"""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import (
-    AbstractAsyncContextManager,
-    AsyncExitStack,
-    asynccontextmanager,
-)
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from functools import partial
 from http import HTTPStatus
+from typing import Any, TypeVar
 
 import structlog
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
@@ -35,10 +38,19 @@ from dextouch.schemas import (
     status_of,
 )
 from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
-from dextouch.serving.documentation import document_service
-from dextouch.serving.guard import Admits, BodyRules, GuardMiddleware, SitePolicy
+from dextouch.serving.guard import (
+    JSON,
+    SAFE_METHODS,
+    Admits,
+    BodyRules,
+    GuardMiddleware,
+    JsonBody,
+    RequireScope,
+    SitePolicy,
+    body_rule,
+)
 from dextouch.serving.keys import AccessControl
-from dextouch.serving.masking import hide_secrets, masked
+from dextouch.serving.logs import hide_secrets, masked
 from dextouch.serving.refusals import REFUSED, RefusalLog, WrongKeys
 from dextouch.serving.served_folder import ServedFolder
 from dextouch.serving.settings import ServiceSettings
@@ -64,21 +76,15 @@ def create_service_app(  # noqa: PLR0913 - all by name
     admits: Admits | None = None,
     folders: Sequence[ServedFolder] = (),
 ) -> FastAPI:
-    """Create the application of one service.
+    """Create the application of one service, whose routes raise DexTouch errors only.
 
-    Args:
-        name: of the service, in health, logs and titles.
-        settings: keys, limits, host names and origins.
-        routers: routes of the service; they raise DexTouch errors only.
-        lifespan: context of the application (pools, workers).
-        readiness: called by /readyz; returns the names of what is missing.
-        admits: accepts requests without a key, such as those of signed-in browsers.
-        folders: that all routes need; the service is not ready without them.
+    `readiness` is called by /readyz and returns the names of what is missing. `admits` accepts
+    requests without a key, such as those of signed-in browsers. All routes need the `folders`; the
+    service is not ready without them.
 
-    Returns:
-        The application; `app.state.registry` accepts further metrics, `app.state.refusal_page`
-        renders a refusal or an error as an HTML page for browsers, and `app.state.shortcut` answers
-        some requests in place of their route (see `Shortcut`).
+    `app.state.registry` of the application accepts further metrics, `app.state.refusal_page`
+    renders a refusal or an error as an HTML page for browsers, and `app.state.shortcut` answers
+    some requests in place of their route (see `Shortcut`).
     """
     hide_secrets(settings)
     app = FastAPI(
@@ -129,8 +135,6 @@ def create_service_app(  # noqa: PLR0913 - all by name
 
 
 def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Lifespan:
-    """Mark the application as running during its lifespan."""
-
     @asynccontextmanager
     async def around(app: FastAPI) -> AsyncIterator[None]:
         for folder in folders:
@@ -186,7 +190,8 @@ def _health_router(
 
 def _add_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(DexTouchError)
-    async def ours(request: Request, error: DexTouchError) -> Response:
+    @app.exception_handler(HTTPException)
+    async def refused(request: Request, error: DexTouchError | HTTPException) -> Response:
         return _refusal(request, error)
 
     @app.exception_handler(RequestValidationError)
@@ -202,10 +207,6 @@ def _add_error_handlers(app: FastAPI) -> None:
             text += f"; and {len(found) - len(items)} more"
         ours = InvalidInputError(text or "invalid request", errors=items)
         return _problem_response(request, ours, 400 if malformed else 422)
-
-    @app.exception_handler(HTTPException)
-    async def http(request: Request, error: HTTPException) -> Response:
-        return _refusal(request, error)
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
@@ -259,3 +260,93 @@ def _problem_response(
         headers=headers,
         media_type=PROBLEM_MEDIA_TYPE,
     )
+
+
+CallT = TypeVar("CallT")
+KEY_SCHEME = "api_key"
+BEARER = {"type": "http", "scheme": "bearer", "description": "A key of the service's settings."}
+BINARY = {"type": "string", "format": "binary"}
+PROBLEM_CONTENT = {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+
+# The server, the guard and the error handlers can give these on any route (413 and 415 also where a
+# GET has a body), and on those that change something.
+OF_ANY = frozenset({408, 413, 415, 421, 429, 431, 500, 503})
+OF_CHANGES = frozenset({403, 404, 409, 422, 507})
+
+
+def document_service(
+    app: FastAPI, routers: Sequence[APIRouter], *, needs_key: bool
+) -> dict[str, Any]:
+    """The OpenAPI document of a service, made once; without keys of the service a key is optional.
+
+    A route declares further refusals by `responses={406: {}}`.
+    """
+    if app.openapi_schema is not None:
+        return app.openapi_schema
+    document = FastAPI.openapi(app)
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    schemas["Problem"] = Problem.model_json_schema()
+    # Of FastAPI's own 422, which no service gives.
+    schemas.pop("HTTPValidationError", None)
+    schemas.pop("ValidationError", None)
+    for operation, route, method in _operations(document, routers):
+        needed = _dependencies(route.dependant, RequireScope)
+        scopes = list(dict.fromkeys(one.scope for one in needed))
+        if scopes:
+            document["components"].setdefault("securitySchemes", {})[KEY_SCHEME] = BEARER
+            keyed = {KEY_SCHEME: scopes}
+            operation["security"] = [keyed] if needs_key else [keyed, {}]
+        for body in _dependencies(route.dependant, JsonBody):
+            schema = body.model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= schema.pop("$defs", {})
+            operation["requestBody"] = {"required": True, "content": {JSON: {"schema": schema}}}
+        rule = body_rule(route.endpoint)
+        if rule is not None and rule.max_bytes:
+            # Media types that the route takes and reads by itself.
+            body_of = operation.setdefault("requestBody", {"required": True})
+            for kind in rule.max_bytes:
+                schema = {} if kind == JSON else {"schema": BINARY}
+                body_of.setdefault("content", {}).setdefault(kind, schema)
+        _document_refusals(operation, method, has_scope=bool(scopes))
+    return document
+
+
+def _operations(
+    document: dict[str, Any], routers: Sequence[APIRouter]
+) -> Iterator[tuple[dict[str, Any], APIRoute, str]]:
+    """Operations of the document with their routes and methods."""
+    for router in routers:
+        for route in router.routes:
+            if isinstance(route, APIRoute) and route.include_in_schema and router.include_in_schema:
+                for method in route.methods or ():
+                    yield document["paths"][route.path_format][method.lower()], route, method
+
+
+def _dependencies(dependant: Dependant, kind: type[CallT]) -> Iterator[CallT]:
+    for dependency in dependant.dependencies:
+        if isinstance(dependency.call, kind):
+            yield dependency.call
+        yield from _dependencies(dependency, kind)
+
+
+def _document_refusals(operation: dict[str, Any], method: str, *, has_scope: bool) -> None:
+    responses = operation.setdefault("responses", {})
+    statuses = set(OF_ANY)
+    if "security" in operation:
+        statuses.add(401)
+    if has_scope:
+        statuses.add(403)
+    if method not in SAFE_METHODS:
+        statuses |= OF_CHANGES
+    if "requestBody" in operation:
+        statuses.add(400)
+    if operation.get("parameters"):
+        statuses.add(422)
+    if any(parameter["in"] == "path" for parameter in operation.get("parameters", ())):
+        statuses.add(404)
+    statuses |= {int(status) for status in responses if int(status) >= 400}
+    for status in statuses:
+        responses[str(status)] = {
+            "description": HTTPStatus(status).phrase,
+            "content": PROBLEM_CONTENT,
+        }

@@ -1,8 +1,7 @@
 """Child process that runs a Python module and exchanges JSON lines with its parent.
 
-For work that must not block a service, or kill it when the work is killed. The parent holds a
-`ChildProcess`; the module calls `serve_parent` and exits when its standard input closes, so it
-outlives the parent by the current request at most.
+For work that must not block a service, or kill it when the work is killed. The module calls
+`serve_parent` and exits when its standard input closes: it outlives the parent by one request.
 """
 
 import json
@@ -24,10 +23,7 @@ Answer = Callable[[Mapping[str, object]], None]
 class ChildProcess:
     """A running child; `kill` is thread-safe, the other methods are not.
 
-    Args:
-        module: to run, such as `services.alignment.jobs`.
-        arguments: of its command line.
-        environment: variables in addition to this process's own.
+    `environment` are variables in addition to this process's own.
     """
 
     def __init__(
@@ -97,9 +93,7 @@ def serve_parent(*, niceness: int) -> tuple[Iterator[dict[str, Any]], Answer]:
     """In the child: requests of the parent, and the function that sends responses.
 
     Standard output of the child is redirected to standard error, to keep responses separate.
-
-    Args:
-        niceness: added to this process's, so that the parent has priority.
+    `niceness` is added to this process's, so that the parent has priority.
     """
     # The parent decides when to end; Ctrl-C at the terminal reaches both processes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -25,27 +25,18 @@ from pydantic_settings import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import first_problems
 
-# Problems of settings in the words of their user: the option, what it got, what it expects.
-
 MAX_PROBLEMS: Final = 5
 MAX_SHOWN: Final = 60
 # What pydantic expects, by the type of its error; `ctx` has the numbers and names.
 _EXPECTED: Final = {
-    "int_parsing": "a whole number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "float_parsing": "a number",
-    "float_type": "a number",
+    **dict.fromkeys(("int_parsing", "int_type", "int_from_float"), "a whole number"),
+    **dict.fromkeys(("float_parsing", "float_type"), "a number"),
     "finite_number": "a finite number",
-    "bool_parsing": "true or false",
-    "bool_type": "true or false",
+    **dict.fromkeys(("bool_parsing", "bool_type"), "true or false"),
     "string_type": "a text",
     "path_type": "a path",
-    "tuple_type": "a list",
-    "list_type": "a list",
-    "dict_type": "a table",
-    "model_type": "a table",
-    "model_attributes_type": "a table",
+    **dict.fromkeys(("tuple_type", "list_type"), "a list"),
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "a table"),
     "string_too_short": "at least {min_length} characters",
     "string_too_long": "at most {max_length} characters",
     "string_pattern_mismatch": "text of the form {pattern}",
@@ -55,15 +46,14 @@ _EXPECTED: Final = {
     "greater_than_equal": "at least {ge}",
     "less_than": "less than {lt}",
     "less_than_equal": "at most {le}",
-    "literal_error": "{expected}",
-    "enum": "{expected}",
+    **dict.fromkeys(("literal_error", "enum"), "{expected}"),
     "union_tag_invalid": "one of {expected_tags}",
 }
 # Names of settings whose values are not repeated.
 _SECRET: Final = re.compile(r"key|token|secret|password|url", re.IGNORECASE)
 
 
-def _told(item: Mapping[str, Any]) -> str:
+def _problem_text(item: Mapping[str, Any]) -> str:
     where = ".".join(str(part) for part in item["loc"]) or "settings"
     kind = item["type"]
     if kind == "missing":
@@ -141,8 +131,7 @@ def section_of(settings_cls: type[BaseSettings]) -> str:
 def configuration_path() -> Path | None:
     """The file that DEXTOUCH_CONFIG names, or dextouch.toml in the working folder; None without.
 
-    Raises:
-        InvalidInputError: the named file does not exist.
+    Raises InvalidInputError if the named file does not exist.
     """
     named = os.environ.get(VARIABLE)
     if not named:
@@ -223,7 +212,7 @@ def explained(error: ValidationError, section: str) -> str:
     if error.error_count() > MAX_PROBLEMS:
         text = first_problems(error)
     else:
-        text = "; ".join(_told(item) for item in error.errors(include_url=False))
+        text = "; ".join(_problem_text(item) for item in error.errors(include_url=False))
     path = configuration_path()
     if path is None:
         return text

@@ -19,6 +19,7 @@ import structlog
 from httptools import HttpParserError
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Metric
 from prometheus_client.registry import Collector
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -28,7 +29,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
 from dextouch.serving.guard import Refuse
-from dextouch.serving.masking import masked
+from dextouch.serving.logs import masked
 from dextouch.serving.refusals import RefusalLog, caller_of
 from dextouch.serving.spans import traced
 
@@ -83,12 +84,10 @@ class _Limits:
     # Made in the process that needs it: with several workers the limits are sent to each.
     @cached_property
     def refusals(self) -> RefusalLog:
-        """The lines about refused callers."""
         return RefusalLog()
 
     @property
     def check_period_s(self) -> float:
-        """Time between two looks at a connection."""
         return min(self.client_timeout_s / 8, MAX_CHECK_PERIOD_S)
 
 
@@ -242,7 +241,6 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
             self._limits.idle[self] = None
 
     def _has_headers(self) -> bool:
-        """Whether the request that is being received has its headers."""
         return self.cycle is not None and self.cycle.scope is self.scope
 
     def _waits_for_request(self) -> bool:
@@ -309,7 +307,7 @@ class ShortcutMiddleware:
     refuse: Refuse
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        """Handle one request; other scopes pass through."""
         shortcut: Shortcut | None = scope["app"].state.shortcut
         direct = shortcut(scope) if shortcut is not None and scope["type"] == "http" else None
         if direct is None:
@@ -338,7 +336,6 @@ class _Uncounted(Collector):
             self.collect()
 
     def collect(self) -> Iterable[Metric]:
-        """Count those that wait; it has no metrics of its own."""
         waiting, self._waiting = self._waiting, []
         for answered in waiting:
             self._count(answered)
@@ -383,7 +380,7 @@ class RequestMiddleware:
         self._histogram = cache(self._seconds.labels)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request or WebSocket; other scopes (lifespan) pass through."""
+        """Handle one request; other scopes pass through."""
         if scope["type"] == "websocket":
             await self._count_websocket(scope, receive, send)
             return
@@ -453,7 +450,7 @@ class RequestMiddleware:
 
 
 async def _send_without_trace(scope: Scope, send: Send, message: Message) -> None:
-    """Send a message of the lifespan; a refusal to start is told by its owner, in one line."""
+    """Send a message of the lifespan; its owner reports a refusal to start, in one line."""
     if message["type"] == "lifespan.startup.failed" and scope["app"].state.start_error is not None:
         message = {**message, "message": ""}
     await send(message)
@@ -461,12 +458,9 @@ async def _send_without_trace(scope: Scope, send: Send, message: Message) -> Non
 
 def _request_id(scope: Scope) -> str:
     """The caller's, if it is a valid one, or a new one."""
-    for name, value in scope["headers"]:
-        if name == b"x-request-id":
-            given = value.decode("latin-1")
-            is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
-            return given if is_usable else secrets.token_hex(16)
-    return secrets.token_hex(16)
+    given = Headers(scope=scope).get("x-request-id", "")
+    is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+    return given if is_usable else secrets.token_hex(16)
 
 
 @contextmanager

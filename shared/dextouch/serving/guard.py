@@ -29,9 +29,9 @@ from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError, InvalidInputError
 from dextouch.schemas import MAX_NAMED, first_problems, status_of
-from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presented_key
 from dextouch.serving.refusals import RefusalLog, WrongKeys
+from dextouch.serving.settings import canonical_host, canonical_origin, is_loopback
 
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -148,12 +148,9 @@ def takes(
 ) -> Callable[[EndpointT], EndpointT]:
     """Decorator that declares the bodies a route accepts, placed directly above the function.
 
-    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, larger
-    bodies with 413, both before the body is read.
-
-    Args:
-        max_bytes: maximum size by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
-        needs_key: False if the route can be called without a key.
+    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, bodies
+    larger than `max_bytes` of their type (such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`) with 413,
+    both before the body is read. `needs_key` is False if the route can be called without a key.
     """
 
     def mark(endpoint: EndpointT) -> EndpointT:
@@ -325,8 +322,6 @@ class GuardMiddleware:
                 return
         self.site.check(connection, is_unsafe=is_unsafe)
 
-
-# Large JSON bodies, decoded at a bounded cost and without blocking other requests for long.
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 

@@ -13,8 +13,6 @@ from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import KEY_NAME_PATTERN
 
-# Strength of API keys: short, repetitive, orderly and published ones are refused at the start.
-
 MIN_LENGTH: Final = 16
 # So many guesses take 35 years at a thousand a second. By this estimate 97 of 100 random keys of 16
 # hexadecimal digits have as many, and all of 32 digits: the least of 20,000 had 75.
@@ -66,7 +64,6 @@ def _follows(text: str, index: int) -> bool:
 
 
 def _is_step(text: str, index: int, lag: int) -> bool:
-    """Whether a character is next to an earlier one, or the same."""
     before, after = text[index - lag], text[index]
     is_near = abs(ord(after) - ord(before)) <= 1
     return is_near or any(before + after in row or after + before in row for row in KEYBOARD_ROWS)
@@ -151,11 +148,7 @@ class AccessControl:
         return matches[0] if matches else None
 
     def granted(self, authorization: str | None, scope: str) -> Grant:
-        """Check a key and its scope, and return what the key allows.
-
-        Raises:
-            AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
-        """
+        """What a key allows; raises AccessDeniedError without it or the scope (see `reason`)."""
         if not self._keys:
             return _open_grant(scope)
         grant = self.find(authorization)
@@ -171,7 +164,6 @@ class AccessControl:
 
 @lru_cache(maxsize=64)
 def _open_grant(scope: str) -> Grant:
-    """What a service without keys allows everybody."""
     return Grant(name="loopback", scopes=(scope,))
 
 

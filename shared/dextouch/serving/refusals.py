@@ -17,7 +17,7 @@ from starlette.types import Scope
 
 from dextouch.errors import AccessDeniedError
 from dextouch.serving.keys import AccessControl, presented_key
-from dextouch.serving.masking import MASK
+from dextouch.serving.logs import MASK
 
 logger = structlog.get_logger(__name__)
 
@@ -82,7 +82,6 @@ class RateLimit:
 
 
 def _refilled(bucket: tuple[float, float], size: int, now_s: float) -> tuple[float, float]:
-    """What a bucket holds now, and the time until it holds one event."""
     left = min(float(size), bucket[0] + (now_s - bucket[1]) * size / PERIOD_S)
     return left, 0.0 if left >= 1 else (1 - left) * PERIOD_S / size
 
@@ -115,11 +114,7 @@ class WrongKeys:
         self._limit = RateLimit()
 
     def count(self, connection: HTTPConnection, *, what: str = "key") -> None:
-        """Count a wrong key.
-
-        Raises:
-            AccessDeniedError: there are too many of this address, or in all.
-        """
+        """Count a wrong key; raises AccessDeniedError for too many of this address, or in all."""
         caller = caller_of(connection.scope)
         if wait_s := self._limit.wait_s(caller):
             raise AccessDeniedError(
@@ -143,12 +138,9 @@ class RefusalLog:
         self._num_not_logged = 0
 
     def note(self, connection: HTTPConnection, status: int, reason: str) -> None:
-        """Log that a request or WebSocket is refused.
+        """Log a refused request or WebSocket: its method, path, address and the name of its key.
 
-        Args:
-            connection: whose method, path, address and key's name are logged.
-            status: of the response.
-            reason: a word, or a sentence without anything secret.
+        `reason` is a word, or a sentence without anything secret.
         """
         scope, path = connection.scope, connection.scope["path"]
         is_request = scope["type"] == "http"

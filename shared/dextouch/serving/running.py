@@ -15,17 +15,11 @@ from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import ServiceSettings, load_settings
 from dextouch.serving.spans import SPANS
 
-# Address that a service listens on, checked before anything is loaded or started.
-
 
 def bound_socket(what: str, host: str, port: int, *, advice: str) -> socket.socket:
     """A socket that is bound to an address, which does not listen yet; port 0 selects a free one.
 
-    Args:
-        what: names the service in errors.
-        host: name or address of this machine.
-        port: to bind.
-        advice: how another port is chosen.
+    `what` names the service in errors, `advice` says how another port is chosen.
 
     Raises:
         ConflictError: another program uses the port.
@@ -68,12 +62,7 @@ ServiceT = TypeVar("ServiceT", bound=ServiceSettings)
 
 
 def check_address(service: str, settings: ServiceSettings) -> None:
-    """Check that a service can listen, before it opens anything.
-
-    Raises:
-        ConflictError: another program uses the port.
-        InvalidInputError: the host is not of this machine, or the port needs rights.
-    """
+    """Check that a service can listen, before it opens anything; raises as `bound_socket`."""
     variable = f"{settings.model_config.get('env_prefix', '')}PORT"
     advice = f"choose another with --port (or {variable}), 0 for any free one"
     # uvicorn makes its own sockets, of every address of the host's name.
@@ -89,14 +78,9 @@ def run(
 ) -> None:
     """Serve until SIGINT or SIGTERM; requests in flight get `shutdown_grace_s` to end.
 
-    Args:
-        app: the application.
-        settings: its host, port and grace.
-        drain: called at SIGTERM, so that the application refuses new work.
-        drain_s: time from then until its port is closed; at once without `drain`.
-
-    Raises:
-        DexTouchError: the application could not start.
+    `drain` is called at SIGTERM, so that the application refuses new work; its port is closed
+    `drain_s` later, at once without `drain`. Raises a DexTouchError if the application could not
+    start.
     """
     import uvicorn
     from uvicorn.config import STARTUP_FAILURE
@@ -115,19 +99,14 @@ def run(
     with suppress(KeyboardInterrupt):
         server.run()
     if not server.started:
-        told = getattr(app.state, "start_error", None)
-        if told is not None:
-            raise told
+        start_error = getattr(app.state, "start_error", None)
+        if start_error is not None:
+            raise start_error
         sys.exit(STARTUP_FAILURE)
 
 
 def server_options(settings: ServiceSettings, *, grace_s: int) -> dict[str, Any]:
-    """Options of uvicorn for every service, alone or beside others.
-
-    Args:
-        settings: of the service; they limit its connections.
-        grace_s: time that requests in flight get to end.
-    """
+    """Options of uvicorn for every service, whose requests in flight get `grace_s` to end."""
     from dextouch.serving.connections import limited_protocols
 
     return limited_protocols(
@@ -150,16 +129,7 @@ def serve(
     create_app: Callable[[ServiceT], FastAPI],
     arguments: Sequence[str],
 ) -> int:
-    """Run a service until SIGINT or SIGTERM, with settings from flags and environment.
-
-    Args:
-        service: name in log events.
-        kind: class of its settings.
-        create_app: creates the application from them.
-        arguments: flags of the command line.
-
-    Returns:
-        0, the exit status.
+    """Run a service until a signal ends it, with settings of a class from flags and environment.
 
     Raises:
         InvalidInputError: invalid settings.

@@ -21,10 +21,8 @@ READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 class ServedFolder:
     """A folder that must stay the one that it was when the service started.
 
-    Args:
-        path: of the folder.
-        name: of the folder in messages, such as `store folder`.
-        is_written: whether the service writes to it; it is created at the start then.
+    `name` is that in messages, such as `store folder`; one that `is_written` is created at the
+    start.
     """
 
     def __init__(self, path: Path, name: str, *, is_written: bool = True) -> None:
@@ -34,11 +32,7 @@ class ServedFolder:
         self._failure: str | None = None
 
     def open(self) -> None:
-        """Create the folder if there is none, and remember which one it is; later only check it.
-
-        Raises:
-            UnavailableError: it cannot be created, or is another one by now.
-        """
+        """Create the folder if there is none, and remember which one it is; raises as `check`."""
         if self._is_written and not self._is_open and self._identity is None:
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
@@ -81,11 +75,7 @@ class ServedFolder:
         return None
 
     def check(self, *, writing: bool) -> None:
-        """Refuse to work with a folder that is gone, another one, or read-only.
-
-        Raises:
-            UnavailableError: with what is wrong; nothing was read or written.
-        """
+        """Raise UnavailableError for a folder that is gone, another one, or read-only."""
         problem = self.problem(writing=writing)
         if problem is not None:
             raise UnavailableError(problem)

@@ -1,11 +1,13 @@
-"""Service settings from flags, environment and file.
+"""Service settings from flags, environment and file, and host names as browsers send them.
 
 Imported by every command, also to show its help, so that it imports no server.
 """
 
 import argparse
 import inspect
+import ipaddress
 import re
+from contextlib import suppress
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -20,12 +22,6 @@ from pydantic_settings import (
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.serving.configuration_file import CommandSettings, explained, section_of
-from dextouch.serving.host_names import (
-    canonical_host,
-    canonical_network,
-    canonical_origin,
-    is_loopback,
-)
 from dextouch.serving.keys import ApiKey
 
 # Defaults that say nothing to a user of the command line.
@@ -33,6 +29,57 @@ _NO_DEFAULT = re.compile(r"\s*\((default: (null|\(\)|\{\})|default factory: [^)]
 _NO_GROUP_DEFAULT = "default: null (undefined)"
 _PLACEHOLDERS = {"int": "N", "float": "X", "Path": "PATH"}
 _LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
+
+HOST_NAME = re.compile(r"[a-z0-9_.-]+")
+ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
+
+
+def canonical_host(text: str) -> str:
+    """A host name as browsers write it: in lower case, IPv6 addresses short, without brackets."""
+    name = text.lower()
+    if HOST_NAME.fullmatch(name):
+        return name
+    try:
+        return str(ipaddress.IPv6Address(name))
+    except ValueError:
+        raise ValueError(
+            f"got {text!r}, expected a name or an address without its port (every port is "
+            "answered), IPv6 without brackets"
+        ) from None
+
+
+def canonical_origin(text: str) -> str:
+    """An origin as browsers write it: in lower case, without the default port of its scheme."""
+    parts = ORIGIN.fullmatch(text.lower())
+    if parts is None or int(parts[4] or 0) > 65535:
+        raise ValueError(
+            f"got {text!r}, expected http(s)://HOST or http(s)://HOST:PORT without a path"
+        )
+    scheme, name, address, port = parts.groups()
+    host = f"[{canonical_host(address)}]" if address else name
+    is_default = port is None or (scheme, int(port)) in {("http", 80), ("https", 443)}
+    return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
+
+
+def canonical_network(text: str) -> str:
+    """An address or a network in its short form; a network ends with the length of its prefix."""
+    try:
+        if "/" in text:
+            return str(ipaddress.ip_network(text))
+        return str(ipaddress.ip_address(text))
+    except ValueError as error:
+        raise ValueError(
+            f"got {text!r} ({error}), expected an address such as 10.0.0.7, or a network such as "
+            "10.0.0.0/24"
+        ) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a socket bound to `host`."""
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
 
 HostName = Annotated[str, AfterValidator(canonical_host)]
 Origin = Annotated[str, AfterValidator(canonical_origin)]
@@ -67,8 +114,7 @@ class ServiceSettings(CommandSettings):
         default=16 * 2**20, ge=1024, description="largest body of a request"
     )
     allowed_hosts: tuple[HostName, ...] = Field(
-        default=(),
-        description="host names other than loopback that are accepted without a key",
+        default=(), description="host names other than loopback that are accepted without a key"
     )
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
@@ -114,9 +160,7 @@ class ServiceSettings(CommandSettings):
 def service_config(service: str, command: str | None = None) -> SettingsConfigDict:
     """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>.
 
-    Args:
-        service: prefix of the variables.
-        command: as users type it, such as `dextouch station`; names the program in its help.
+    `command` is what users type, such as `dextouch station`; it names the program in its help.
     """
     return SettingsConfigDict(
         frozen=True,
@@ -132,11 +176,8 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
 
     The help describes the command with the docstring of the class, which holds an example. Flags
     have dashes (`--num-steps`, `--limits.max-chunks`), booleans are switches (`--mock`,
-    `--no-mock`), and lists are repeated or separated by commas.
-
-    Raises:
-        InvalidInputError: invalid values; all of them are listed.
-        SystemExit: an unknown flag, or --help (after printing the usage).
+    `--no-mock`), and lists are repeated or separated by commas. Raises InvalidInputError that lists
+    all invalid values, SystemExit for an unknown flag, or --help (after printing the usage).
     """
     source = CliSettingsSource[SettingsT](
         cls,

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 import structlog
+from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
@@ -96,11 +97,7 @@ SPANS = Spans()
 @contextmanager
 def traced(scope: Scope) -> Iterator[str]:
     """Continue the trace of a request's caller, or begin one; yields its id."""
-    caller = None
-    for name, value in scope["headers"]:
-        if name == b"traceparent":
-            caller = parse_traceparent(value.decode("latin-1"))
-            break
+    caller = parse_traceparent(Headers(scope=scope).get("traceparent", ""))
     if SPANS.tracer is not None:
         with SPANS.of_request(scope, caller) as context, in_trace(context):
             yield context.trace_id

@@ -92,13 +92,8 @@ class MemoryState:
     ) -> int:
         """Write if the version is the expected one (0: absent), and renew the time to live.
 
-        Args:
-            key: of the entry.
-            value: its first part.
-            tail: its second part, such as megabytes that are not to be copied behind the first.
-            note: a few bytes about it, which `newest_notes` lists without reading the value.
-            expected_version: that the new value was computed from.
-            ttl_s: seconds until it expires.
+        `tail` is a second part of the value, such as megabytes that are not to be copied behind the
+        first; `note` a few bytes about it, which `newest_notes` lists without reading the value.
 
         Returns:
             The new version.
@@ -123,14 +118,8 @@ class MemoryState:
     async def add(self, key: str, value: bytes, *, limits: Mapping[str, int], ttl_s: float) -> bool:
         """Write a new value into groups unless a limit is reached; False if one is.
 
-        Counting and writing are atomic, so concurrent callers never exceed a limit. The value is in
-        its groups until it is deleted or expires.
-
-        Args:
-            key: of the value.
-            value: to write.
-            limits: its groups, with the number of live keys that each may have.
-            ttl_s: time to live.
+        Counting and writing are atomic, so concurrent callers never exceed a limit: the number of
+        live keys of each group. The value is in its groups until it is deleted or expires.
 
         Raises:
             ConflictError: the key exists.
@@ -285,11 +274,7 @@ return found
 class RedisState:
     """As `MemoryState`, shared by several processes; one hash per key, written by a Lua script.
 
-    Args:
-        url: redis://HOST:PORT/DB; connects lazily.
-
-    Raises:
-        InvalidInputError: an invalid URL.
+    `url` is redis://HOST:PORT/DB (an invalid one raises InvalidInputError); it connects lazily.
     """
 
     def __init__(self, url: str) -> None:
@@ -402,10 +387,9 @@ StateStore = MemoryState | RedisState
 
 
 def open_state(url: str) -> StateStore:
-    """Open the store at `memory://` or `redis://host:port/db`.
+    """The store at `memory://` or `redis://host:port/db`.
 
-    Raises:
-        InvalidInputError: an unsupported URL.
+    Raises InvalidInputError for other URLs.
     """
     if url == "memory://":
         return MemoryState()

@@ -20,21 +20,13 @@ from uvicorn.supervisors import Multiprocess
 
 from dextouch.errors import DexTouchError, UnavailableError
 
-# Messages of a service to systemd: ready, stopping, and a watchdog that only a working one feeds.
-#
-# The protocol is sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names.
-
 logger = structlog.get_logger(__name__)
 
 IsWorking = Callable[[], bool]
 
 
 class ServiceManager:
-    """The service manager that started this process; without one nothing is sent.
-
-    Args:
-        environment: of the process, by default.
-    """
+    """The service manager that started this process, by sd_notify(3); without one it is silent."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
@@ -56,9 +48,8 @@ class ServiceManager:
     async def feed_watchdog(self, is_working: IsWorking | None) -> None:
         """Feed the watchdog twice a period, as long as the event loop runs and work goes on.
 
-        Args:
-            is_working: called in a thread; where it is False or does not return, the manager
-                restarts the service.
+        `is_working` is called in a thread; where it is False or does not return, the manager
+        restarts the service.
         """
         if not self._address or not self._watchdog_s:
             return
@@ -77,13 +68,9 @@ WORKER_TIMEOUT_S = 60
 class DrainingServer(uvicorn.Server):
     """Server that refuses new work for a while after SIGTERM before it closes its port.
 
-    Load balancers see in that time that it is not ready. A second signal ends it.
-
-    Args:
-        config: of uvicorn.
-        drain: called at SIGTERM, in the event loop's thread; None shuts down at once.
-        drain_s: time until the server shuts down; requests that run then still end.
-        is_working: whether the service does its work, for the watchdog of systemd.
+    Load balancers see in that time that it is not ready. A second signal ends it. `drain` is called
+    at SIGTERM, in the event loop's thread; the server shuts down `drain_s` later, and requests that
+    run then still end. `is_working` is for the watchdog of systemd.
     """
 
     def __init__(
@@ -137,7 +124,6 @@ class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which notices at once if a worker dies while it is asked to respond."""
 
     def keep_subprocess_alive(self) -> None:
-        """Replace workers that ended or hang."""
         for worker in self.processes:
             # While this process holds the worker's end of their pipe too, it never reads its end.
             worker.child_conn.close()
@@ -155,14 +141,7 @@ def run_workers(
     """Serve with several processes until SIGINT or SIGTERM.
 
     uvicorn replaces workers that end or hang; on SIGHUP it replaces all, one after another, each
-    once its successor serves.
-
-    Args:
-        create_app: picklable; called in every worker.
-        host: address to listen on.
-        port: port to listen on; 0 for any free one.
-        num_workers: number of processes.
-        options: of uvicorn, for every worker.
+    once its successor serves. `create_app` is pickled, and called in every worker.
 
     Raises:
         UnavailableError: a worker could not start.

@@ -31,6 +31,7 @@ from .samples import RATE_ERROR as RATE_ERROR
 from .samples import RATE_WARN as RATE_WARN
 from .samples import RESIDUAL_ERROR_S as RESIDUAL_ERROR_S
 from .samples import RESIDUAL_WARN_S as RESIDUAL_WARN_S
+from .samples import TAXEL_UNIT as TAXEL_UNIT
 from .samples import ClockCapabilities as ClockCapabilities
 from .samples import Sample as Sample
 from .samples import SampleBatch as SampleBatch

@@ -49,11 +49,7 @@ class EncodedBatch:
 
 
 def encode_samples(descriptor: StreamDescriptor, batch: SampleBatch) -> EncodedBatch:
-    """Check and encode a batch of at least one sample.
-
-    Raises:
-        InvalidInputError: a batch of another stream (see `check_batch`).
-    """
+    """Check and encode a batch of at least one sample; raises as `check_batch`."""
     check_batch(descriptor, batch)
     body = encode_body(descriptor, batch)
     return _encoded(descriptor, body, google_crc32c.value(body), batch)
@@ -77,11 +73,7 @@ def decode_body(
 ) -> SampleBatch:
     """The batch in a body, whose stamps and images are not checked; arrays may be read-only.
 
-    Args:
-        descriptor: of the stream.
-        body: of `encode_body`, or several end to end.
-        num_samples: in the body.
-        where: the body lies, for errors.
+    `body` is of `encode_body`, or several end to end; `where` says in errors where it lies.
 
     Raises:
         CorruptDataError: the size of the body is not that of so many samples of the stream.
@@ -128,7 +120,6 @@ def _wrong_size(
 
 @lru_cache
 def _row(dtype: str, shape: tuple[int, ...]) -> np.dtype[np.void]:
-    """Memory of one sample of numbers."""
     values = ("values", np.dtype(dtype).newbyteorder("<"), shape)
     return np.dtype([*((stamp, "<i8") for stamp in _STAMPS), values])
 
@@ -141,12 +132,10 @@ def _encoded(
 
 
 def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: int) -> bytes:
-    """Encode a batch for the wire; equal batches give equal bytes.
+    """Encode 1 … MAX_BATCH_SAMPLES samples for the wire; equal batches give equal bytes.
 
-    Args:
-        descriptor: of the stream.
-        batch: 1 … MAX_BATCH_SAMPLES samples; values of `jpeg` and `h264` streams are bytes.
-        number: of the batch within its stream, from 0.
+    Values of `jpeg` and `h264` streams are bytes. `number` is that of the batch within its stream,
+    from 0.
 
     Raises:
         InvalidInputError: an empty batch, or one of another stream.
@@ -182,12 +171,7 @@ def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> S
 
 
 def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> EncodedBatch:
-    """Validate a batch from an untrusted source.
-
-    Args:
-        data: of `encode_batch` or `frame_body`.
-        descriptor: of the expected stream.
-        number: expected batch number.
+    """Validate bytes of an untrusted source as the expected batch of a stream.
 
     Raises:
         PacketError: not a batch of this version, or damaged in transit.

@@ -36,8 +36,7 @@ C = TypeVar("C", bound=Sized)
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Serialize JSON-like fields and arrays (little endian, C order).
 
-    Raises:
-        InvalidInputError: an unsupported dtype, or an integer beyond 64 bits.
+    Raises InvalidInputError for an unsupported dtype, or an integer beyond 64 bits.
     """
     packed = {}
     for name, array in arrays.items():
@@ -56,11 +55,7 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Deserialize and validate; arrays are read-only views into `data`.
-
-    Args:
-        data: from an untrusted source.
-        max_bytes: size limit.
+    """Deserialize and validate bytes of an untrusted source; arrays are read-only views into them.
 
     Raises:
         LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
@@ -85,23 +80,12 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
 
 
 def unpack_bounded(
-    data: bytes,
-    *,
-    max_bytes: int,
-    what: str,
-    of_map: Callable[[dict[Any, Any]], Any] | None = None,
+    data: bytes, *, max_bytes: int, what: str, of_map: Callable[[dict[Any, Any]], Any] | None = None
 ) -> Any:  # noqa: ANN401 - whatever msgpack holds
     """Deserialize msgpack from an untrusted source, with a limit of lists' and maps' items.
 
-    Args:
-        data: the message.
-        max_bytes: size limit.
-        what: names the message in errors.
-        of_map: called with every map, whose place its result takes.
-
-    Raises:
-        LimitExceededError: more bytes, or items of lists and maps than allowed.
-        InvalidInputError: not msgpack.
+    `what` names the message in errors; `of_map` is called with every map, whose place its result
+    takes. Raises as `unpack`.
     """
     if len(data) > max_bytes:
         raise LimitExceededError(f"{what}: got {len(data)} bytes, expected at most {max_bytes}")
@@ -139,16 +123,10 @@ def _array(name: str, entry: object) -> np.ndarray:
 def array_of(
     data: object, dtype: "np.dtype[Any]", shape: object, *, what: str
 ) -> Shaped[np.ndarray, "..."]:
-    """A read-only array view into bytes of an untrusted message.
+    """A read-only array view into bytes of an untrusted message, in C order; `dtype` is trusted.
 
-    Args:
-        data: the elements in C order.
-        dtype: of the elements, a trusted one.
-        shape: list of counts.
-        what: names the array in errors.
-
-    Raises:
-        InvalidInputError: not a shape, too many elements, or another number of bytes.
+    Raises InvalidInputError for a shape that is none, too many elements, or another number of
+    bytes; `what` names the array.
     """
     if (
         not isinstance(shape, list)
@@ -170,8 +148,7 @@ def array_of(
 def pack_openpi(message: Mapping[str, Any]) -> bytes:
     """Serialize nested maps and lists of plain values and arrays.
 
-    Raises:
-        InvalidInputError: a value that msgpack does not hold.
+    Raises InvalidInputError for a value that msgpack does not hold.
     """
     try:
         return msgpack.packb(dict(message), default=_encoded)
@@ -180,11 +157,7 @@ def pack_openpi(message: Mapping[str, Any]) -> bytes:
 
 
 def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
-    """Deserialize a message; arrays are read-only views into `data`.
-
-    Args:
-        data: from an untrusted source.
-        max_bytes: size limit.
+    """Deserialize a message of an untrusted source; arrays are read-only views into it.
 
     Raises:
         LimitExceededError: more bytes or items than allowed.

@@ -100,16 +100,11 @@ def implausible_values(
     *,
     of_robot: bool = False,
 ) -> list[Implausible]:
-    """What is implausible in samples of a stream of poses, joints or keypoints; of others nothing.
+    """What is implausible in samples [n, …] of a stream of poses, joints or keypoints.
 
     What is commanded may leap, may be kept, and may lie beyond limits to press: only its unit is
-    checked.
-
-    Args:
-        descriptor: of the stream.
-        t_ns: increasing times.
-        values: [n, …] as the device sends them.
-        of_robot: whether what they show may rest exactly. Joints and poses in a robot's base do.
+    checked. What is `of_robot` may rest exactly; joints and poses in a robot's base always may.
+    Times increase.
     """
     if descriptor.kind == "pose":
         can_rest = of_robot or descriptor.frame == "base"
@@ -144,14 +139,10 @@ def _limits_rad() -> tuple[Float64[np.ndarray, "40"], Float64[np.ndarray, "40"]]
 def implausible_poses(
     t_ns: Int64[np.ndarray, " n"], poses: np.ndarray, *, period_ns: int, can_rest: bool = False
 ) -> list[Implausible]:
-    """What is implausible in poses of a tracked hand or head.
+    """What is implausible in poses [n, 7] of a tracked hand or head, at increasing times.
 
-    Args:
-        t_ns: increasing times.
-        poses: [n, 7] position (m) and quaternion (w, x, y, z); samples with NaN or a quaternion of
-            zeros are lost, not implausible.
-        period_ns: nominal period.
-        can_rest: of a robot, see `implausible_repeats`.
+    Poses are position (m) and quaternion (w, x, y, z); samples with NaN or a quaternion of zeros
+    are lost, not implausible. `period_ns` is nominal; `can_rest` as in `implausible_repeats`.
     """
     values = np.asarray(poses, dtype=np.float64)
     norms = np.linalg.norm(values[:, 3:], axis=1)
@@ -216,10 +207,7 @@ def lasting_jumps(
 ) -> Int64[np.ndarray, " jumps"]:
     """Numbers of the samples from which on a tracker's world is another: it found itself anew.
 
-    Args:
-        t_ns: increasing times of poses that were all seen.
-        poses: [n, 7], without outliers.
-        period_ns: nominal period.
+    Poses [n, 7] were all seen, at increasing times, and are without outliers.
     """
     if len(poses) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -265,15 +253,11 @@ def implausible_repeats(
     """Values [n, …] that a device repeats: every one several times, or the last one for a while.
 
     Equal values of a device whose values are not noisy are frozen only if it leaps afterwards.
-
-    Args:
-        values: consecutive samples. What is missing (NaN) in a tenth of them or more is left aside,
-            and the samples that miss anything else are none.
-        what: of the stream, in words.
-        can_rest: as robots do, which keep their values exactly though they are noisy in motion.
-        may_lock: as gloves do whose sensors are coarse: what they keep without a leap is harmless.
-        follows: whether each sample but the first one came right after the one before; None if all
-            did.
+    Samples are consecutive: `follows` says whether each but the first came right after the one
+    before, None if all did. What is missing (NaN) in a tenth of them or more is left aside, and the
+    samples that miss anything else are none. Robots `can_rest`: they keep values exactly, though
+    they are noisy in motion. Gloves with coarse sensors `may_lock`: what they keep without a leap
+    is harmless.
     """
     rows = np.asarray(values).reshape(len(values), int(np.prod(np.shape(values)[1:])))
     finite = np.isfinite(rows)
@@ -395,12 +379,7 @@ def _catches_up(rows: np.ndarray, is_next: np.ndarray, start: int, stop: int) ->
 def check_camera_matrix(
     K: Float64[np.ndarray, "3 3"], size_px: tuple[int, int], *, where: str
 ) -> None:
-    """Refuse a camera matrix that no lens in front of these images has.
-
-    Args:
-        K: pinhole intrinsics in pixels.
-        size_px: width and height of the images.
-        where: names the matrix in the error.
+    """Refuse a camera matrix (px) that no lens before images of width and height `size_px` has.
 
     Raises:
         InvalidInputError: not finite, not of this form, a principal point outside the image, or
@@ -423,7 +402,6 @@ def check_camera_matrix(
 def _speeds(
     t_ns: np.ndarray, poses: np.ndarray, period_ns: int
 ) -> tuple[Float64[np.ndarray, " steps"], Float64[np.ndarray, " steps"]]:
-    """Speeds of each step, in m/s and rad/s."""
     # Times of bursts are closer than the samples were.
     steps_s = np.maximum(np.diff(t_ns), max(period_ns / 2, MIN_STEP_NS)) / _NS_PER_S
     speeds_m_s = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / steps_s
@@ -433,7 +411,6 @@ def _speeds(
 
 
 def _is_fast(speeds_m_s: np.ndarray, turns_rad_s: np.ndarray) -> Bool[np.ndarray, " steps"]:
-    """Steps that no body makes."""
     return np.asarray((speeds_m_s > MAX_SPEED_M_S) | (turns_rad_s > MAX_TURN_RAD_S))
 
 
@@ -508,5 +485,4 @@ def _excess(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndar
 def _beyond(
     values: np.ndarray, lower_rad: np.ndarray, upper_rad: np.ndarray
 ) -> Bool[np.ndarray, " n"]:
-    """Samples in which a joint is far beyond its limits."""
     return np.asarray((_excess(values, lower_rad, upper_rad) > LIMIT_SLACK_RAD).any(axis=1))

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import jpeg_size
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 
 # Batches and windows add an axis to those of a sample, and a packed array has at most eight.
 MAX_SAMPLE_AXES = 7
@@ -29,6 +30,8 @@ NO_DEVICE_TIME = -1
 NO_SEQUENCE = -1
 JPEG_UNIT = "jpeg"
 H264_UNIT = "h264"
+# Of tactile streams whose values are those of taxels; other units are raw readings of a glove.
+TAXEL_UNIT = "kPa"
 # Values of these units are encoded images (bytes).
 ENCODED_UNITS = (JPEG_UNIT, H264_UNIT)
 # Start code of H.264 access units (ITU-T H.264, Annex B), optionally preceded by a zero byte.
@@ -51,7 +54,7 @@ class StreamDescriptor(FrozenModel):
 
     `shape` is that of one sample's payload, at most MAX_SAMPLE_BYTES; `unit` that of its values
     (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` their coordinate system, if
-    any.
+    any. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
@@ -64,6 +67,8 @@ class StreamDescriptor(FrozenModel):
     side: Literal["left", "right"] | None = None
     device: str | None = None
     capabilities: ClockCapabilities = ClockCapabilities()
+    # None is not written, so that older releases can read the streams of our own glove.
+    layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> "StreamDescriptor":
@@ -73,6 +78,25 @@ class StreamDescriptor(FrozenModel):
                 f"expected at most {MAX_SAMPLE_BYTES}"
             )
         return self
+
+    @model_validator(mode="after")
+    def _fits_its_layout(self) -> "StreamDescriptor":
+        if self.layout is None:
+            return self
+        is_raw = self.unit != TAXEL_UNIT
+        count = self.layout.num_raw_cells if is_raw else self.layout.num_taxels
+        if self.kind != "tactile" or self.shape != (count,):
+            raise ValueError(
+                f"{self.name}: got a {self.kind} stream with samples of {self.shape}, expected a "
+                f"tactile one of ({count},), the {'raw cells' if is_raw else 'taxels'} of its "
+                f"layout {self.layout.name!r}"
+            )
+        return self
+
+    @property
+    def tactile_layout(self) -> TactileLayout:
+        """Layout of the taxels of a tactile stream; `dextouch_v1` where none is named."""
+        return DEXTOUCH_V1 if self.layout is None else self.layout
 
     def sample_bytes(self) -> int:
         """Size of one sample in memory."""
@@ -134,12 +158,10 @@ def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
 
 
 def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
-    """Check that a batch matches its stream.
+    """Check that a batch matches its stream, and that `t_host_ns` never decreases.
 
-    Args:
-        descriptor: of the stream.
-        batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
-            object array of bytes; `t_host_ns` is non-decreasing.
+    Values have the descriptor's dtype and shape; for the units `jpeg` and `h264` they are an object
+    array of bytes.
 
     Raises:
         ShapeError: another dtype or shape.
@@ -169,11 +191,7 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
 
 
 def check_follows(name: str, t_host_ns: int, last_t_host_ns: int | None) -> None:
-    """Check that a batch does not start before the last sample of its stream.
-
-    Raises:
-        InvalidInputError: it does.
-    """
+    """Raise InvalidInputError if a batch starts before the last sample of its stream."""
     if last_t_host_ns is not None and t_host_ns < last_t_host_ns:
         raise InvalidInputError(
             f"{name}: t_host_ns goes back to {t_host_ns} from {last_t_host_ns}; "
@@ -193,12 +211,10 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
 
 
 def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
-    """Check an encoded image of a stream with the unit `jpeg` or `h264`.
-
-    For H.264 only the start code is checked; the size is known after decoding.
+    """Check an encoded image of a stream with the unit `jpeg`, or `h264` (its start code alone).
 
     Raises:
-        ShapeError: not bytes, or an image of another size.
+        ShapeError: not bytes, or a JPEG image of another size.
         InvalidInputError: another format.
     """
     if not isinstance(data, bytes):
@@ -234,8 +250,7 @@ RESIDUAL_SHARES: Final = (0.25, 0.5)
 def residual_limits_s(counted_period_s: float | None) -> tuple[float, float]:
     """From where on the scatter of arrivals is a warning and an error.
 
-    Args:
-        counted_period_s: period of a stream that is dated by counting its samples; None of others.
+    `counted_period_s` is that of a stream that is dated by counting its samples; None of others.
     """
     warn_s, error_s = RESIDUAL_WARN_S, RESIDUAL_ERROR_S
     if counted_period_s is None:

@@ -1,7 +1,14 @@
 from . import layout as layout
+from .description import MAX_CELLS as MAX_CELLS
+from .description import PADS as PADS
+from .description import LayoutDescription as LayoutDescription
+from .description import RawCells as RawCells
+from .description import TactilePad as TactilePad
 from .layout import CONTACT_THRESHOLD_KPA as CONTACT_THRESHOLD_KPA
-from .layout import PADS as PADS
+from .layout import DEXTOUCH_V1 as DEXTOUCH_V1
+from .layout import TactileLayout as TactileLayout
 from .layout import colour as colour
 from .layout import hand_canvas as hand_canvas
 from .layout import in_contact as in_contact
 from .layout import pad_forces_n as pad_forces_n
+from .layout import read_layout as read_layout

@@ -2,9 +2,9 @@ from .app import create_serving_app as create_serving_app
 from .app import create_world_app as create_world_app
 from .app import serve_worlds as serve_worlds
 from .baseline import CopyFirstWorld as CopyFirstWorld
-from .fixed_batch import FixedBatchWorld as FixedBatchWorld
 from .settings import WorldServiceSettings as WorldServiceSettings
 from .world import BatchWorld as BatchWorld
+from .world import FixedBatchWorld as FixedBatchWorld
 from .world import ReconstructingWorld as ReconstructingWorld
 from .world import StartedRollout as StartedRollout
 from .world import State as State

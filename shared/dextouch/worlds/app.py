@@ -27,11 +27,9 @@ from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
 from dextouch.worlds.settings import WorldServiceSettings
 from dextouch.worlds.world import World
 
-# Prometheus metrics of the worlds of a process: queues, rollouts and sizes of batches.
-
 
 class WorldMetrics(Collector):
-    """Shows a process's rollouts."""
+    """Prometheus metrics of the worlds of a process: queues, rollouts and sizes of batches."""
 
     def __init__(self, service: RolloutService) -> None:
         self._service = service
@@ -67,15 +65,9 @@ def create_world_app(
 ) -> FastAPI:
     """Create the application; its shutdown ends the worlds' threads.
 
-    Args:
-        worlds: by name.
-        settings: of the service.
-        name: of the service.
-        reopen: opens a world by name and digest, for rollouts that began in an earlier one.
-        warm_up: compute a first chunk of each world before the application is ready.
-
-    Returns:
-        The application; `app.state.drain()` refuses new rollouts and makes it not ready.
+    `reopen` opens a world by name and digest, for rollouts that began in an earlier one; with
+    `warm_up` a first chunk of each world is computed before the application is ready.
+    `app.state.drain()` of the application refuses new rollouts and makes it not ready.
     """
     store = open_state(settings.state_url)
     service = RolloutService(worlds, store, settings.limits, reopen=reopen)
@@ -116,11 +108,7 @@ def serve_worlds(
 ) -> None:
     """Serve worlds until SIGINT or SIGTERM, with as many processes as the settings say.
 
-    Args:
-        open_worlds: picklable; called in each process.
-        settings: of the service.
-        name: of the service.
-        reopen: see create_world_app; picklable, too.
+    `open_worlds` is called in each process; it and `reopen` (see `create_world_app`) are picklable.
     """
     check_address(name, settings)
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)

@@ -116,7 +116,6 @@ class WorldWorker(Generic[State]):
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _step_next(self) -> None:
-        """Hand the next batch to the world's thread."""
         batch = [self._apart.popleft()] if self._apart else self._take_batch()
         self._is_stepping = True
         loop = asyncio.get_running_loop()

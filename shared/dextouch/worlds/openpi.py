@@ -20,13 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.hands.actions import ACTION_DIM
-from dextouch.schemas import (
-    EVERYTHING,
-    ReturnSelector,
-    StartRequest,
-    start_from,
-    validate_fields,
-)
+from dextouch.schemas import EVERYTHING, ReturnSelector, StartRequest, start_from, validate_fields
 from dextouch.serving import MAX_WEBSOCKET_BYTES
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
@@ -69,8 +63,6 @@ def openpi_router(service: RolloutService) -> APIRouter:
 
 
 class _Session:
-    """The rollout and the selector of one connection."""
-
     def __init__(self, service: RolloutService, owner: str) -> None:
         self._service = service
         self._owner = owner

@@ -101,8 +101,7 @@ class RolloutRecord:
     def replay(self, chunk: int, request_sha256: str) -> "Answer | None":
         """The stored response if the request is a repetition; None if the chunk is the next one.
 
-        Raises:
-            ConflictError: another chunk, or the newest one with another body.
+        Raises ConflictError for another chunk, or the newest one with another body.
         """
         info = self.info
         if chunk == info.next_chunk:
@@ -121,8 +120,7 @@ class RolloutRecord:
     def from_stored(stored: Versioned) -> "RolloutRecord":
         """The record that a store holds.
 
-        Raises:
-            StorageError: not the whole record, or one of another version of DexTouch.
+        Raises StorageError if it is not the whole record, or one of another version of DexTouch.
         """
         fields = msgpack.unpackb(stored.value)
         if not isinstance(fields, list) or fields[0] != RECORD_FORMAT:
@@ -276,11 +274,11 @@ async def parts_of(
     rollout: RolloutInfo,
     seen: Observation,
     selector: ReturnSelector,
-    **told: Any,  # noqa: ANN401 - see answer_parts
+    **options: Any,  # noqa: ANN401 - see answer_parts
 ) -> AnswerParts:
     """Fields and arrays of a response, from a thread where encoding the images takes long."""
     num_bytes = sum(images.nbytes for images in seen.images.values())
-    make = partial(answer_parts, rollout, seen, selector=selector, **told)
+    make = partial(answer_parts, rollout, seen, selector=selector, **options)
     if selector.images == "raw" or num_bytes <= MAX_INLINE_IMAGE_BYTES:
         return make()
     return await asyncio.to_thread(make)
@@ -292,20 +290,16 @@ def selector_bytes(selector: ReturnSelector) -> bytes:
     return selector.model_dump_json().encode()
 
 
-# Read access to open rollouts for people who watch: a listing, and each one's newest response.
-#
-# Both read what the rollouts have stored anyway, so a world computes and renders nothing for them.
-
 _TAG_LETTERS: Final = 32
 _MAX_BYTES: Final = 2**30
 _NS: Final = 1e-9
 
 
 class RolloutWatch:
-    """The open rollouts of a state store; one newest response is read at a time.
+    """The open rollouts of all processes with one state store, for people who watch.
 
-    Args:
-        records: of the rollouts, in this process and in all others with the same store.
+    It reads what they have stored anyway, so a world computes and renders nothing for it; one
+    response is read at a time.
     """
 
     def __init__(self, records: RecordStore) -> None:
@@ -321,10 +315,8 @@ class RolloutWatch:
     async def newest(self, watch_id: str, known: str = "") -> tuple[str, bytes | None]:
         """The newest response as the rollout's client got it, and a tag of it.
 
-        Its `rollout` is that of the listing. The bytes are None if the tag is `known`.
-
-        Raises:
-            NotFoundError: unknown, deleted or expired.
+        Its `rollout` is that of the listing. The bytes are None if the tag is `known`. Raises
+        NotFoundError for a rollout that is unknown, deleted or expired.
         """
         note = await self._records.note(watch_id)
         if not note:
@@ -367,6 +359,5 @@ def _watched(info: dict[str, Any], written_host_ns: int, note: WatchNote) -> Wat
 
 
 def _shown(payload: bytes, rollout: dict[str, Any]) -> bytes:
-    """A response with the id of its rollout left out."""
     fields, arrays = unpack(payload, max_bytes=_MAX_BYTES)
     return pack(fields | {"rollout": rollout}, arrays)

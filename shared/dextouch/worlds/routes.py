@@ -164,10 +164,10 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
     async def start(request: Request, selector: Selector, owner: Owner) -> Response:
         """Start a rollout from a task and seed, or from an observation."""
         with timed(request, "decode"):
-            asked, begin = await _start_of(request)
+            chosen, begin = await _start_of(request)
         with timed(request, "world"):
             client = client_name(request.headers.get(CLIENT_HEADER, ""))
-            answer = await service.start(asked.world, begin, selector, owner=owner, client=client)
+            answer = await service.start(chosen.world, begin, selector, owner=owner, client=client)
         return _response(request, answer, status=201)
 
     @router.get("/rollouts/{rollout_id}")
@@ -216,9 +216,7 @@ def watch_router(watch: RolloutWatch) -> APIRouter:
         return await watch.listed(limit)
 
     @router.get(
-        "/{watch_id}",
-        response_class=Response,
-        responses={200: {"content": {MSGPACK: {}}}, 304: {}},
+        "/{watch_id}", response_class=Response, responses={200: {"content": {MSGPACK: {}}}, 304: {}}
     )
     async def newest(request: Request, watch_id: WatchId) -> Response:
         """The newest response of a rollout, as its client asked for it."""
@@ -239,7 +237,6 @@ def client_name(header: str) -> str:
 
 
 def _json_body(model: type[FrozenModel]) -> dict[str, Any]:
-    """OpenAPI fields of a body that the route reads by itself."""
     content = {JSON: {"schema": model.model_json_schema()}}
     return {"requestBody": {"required": True, "content": content}}
 
@@ -314,9 +311,7 @@ def wants_json(accepted: str) -> bool:
 def actions_from(body: bytes, dtype: str) -> Shaped[np.ndarray, "..."]:
     """Actions [K, 67] of a binary body.
 
-    Raises:
-        InvalidInputError: an unknown dtype.
-        ShapeError: no whole rows.
+    Raises InvalidInputError for an unknown dtype, ShapeError for no whole rows.
     """
     if dtype not in DTYPES:
         raise InvalidInputError(

@@ -25,8 +25,7 @@ class WorldServiceSettings(ServiceSettings):
     """Settings of a service of worlds; subclass to add those of a world."""
 
     state_url: str = Field(
-        default="memory://",
-        description="store of rollouts: memory:// or redis://HOST:PORT/DB",
+        default="memory://", description="store of rollouts: memory:// or redis://HOST:PORT/DB"
     )
     limits: RolloutLimits = RolloutLimits()
     workers: int = Field(

@@ -13,8 +13,7 @@ from dextouch.worlds.world import World
 def first_chunk_s(world: World[Any]) -> float:
     """Start a rollout and advance it by one chunk; returns the duration.
 
-    Raises:
-        DexTouchError: the world begins nothing from black images, or cannot continue.
+    Raises DexTouchError if the world begins nothing from black images, or cannot continue.
     """
     began_s = time.perf_counter()
     description = world.description
@@ -37,7 +36,7 @@ def _plain_start(description: WorldDescription) -> RolloutStart:
     images = {
         camera: np.zeros((1, height_px, width_px, 3), np.uint8) for camera in description.cameras
     }
-    touch_kpa = np.zeros((1, 2, 320), np.float32)
+    touch_kpa = np.zeros((1, 2, description.num_taxels), np.float32)
     observation = Observation(
         first_step=0,
         images=images,

@@ -1,4 +1,4 @@
-"""The World protocol, implemented by the twin, world models and, one day, a real robot, and checks.
+"""The World protocol of the twin, world models and, one day, a real robot; checks; fixed batches.
 
 Requests and responses are validated against a world's description by the `check_…` functions.
 
@@ -87,15 +87,12 @@ class World(Protocol[State]):
     ) -> SteppedRollout[State]:
         """Advance by one action chunk, which the world validates (`check_actions`).
 
-        Args:
-            state: from `reset`, `step` or `restore`; it is not changed.
-            actions: [K, 67], row i the pose at step i+1 of the chunk, relative to the rollout's
-                step 0 (measured poses), of the action kind the rollout was started with.
-            seed: of the noise of this chunk; equal state, actions and seed give an equal
-                observation, regardless of other rollouts.
-            selector: part of the observation to return. The result equals `Observation.selected` of
-                the full one, so a world can skip rendering unrequested images. The new state does
-                not depend on it.
+        Row i of actions [K, 67] is the pose at step i+1 of the chunk, relative to the rollout's
+        step 0 (measured poses), of the action kind the rollout was started with. The state is from
+        `reset`, `step` or `restore`, and is not changed. Equal state, actions and seed of the noise
+        give an equal observation, regardless of other rollouts. The result equals
+        `Observation.selected` of the full one, so a world can skip rendering unrequested images;
+        the new state does not depend on the selector.
 
         Raises:
             InvalidInputError: wrong shape, NaN, infinity, or out of reach; nothing has changed.
@@ -109,11 +106,7 @@ class World(Protocol[State]):
         ...
 
     def restore(self, data: bytes) -> State:
-        """Restore the state of a snapshot.
-
-        Raises:
-            InvalidInputError: not a snapshot of this world.
-        """
+        """Restore the state of a snapshot; raises InvalidInputError for one of another world."""
         ...
 
 
@@ -143,11 +136,8 @@ class BatchWorld(World[State], Protocol[State]):
     ) -> list[SteppedRollout[State]]:
         """`step` for each entry; results do not depend on the other entries.
 
-        Args:
-            states: one per rollout.
-            actions: chunks of one length.
-            seeds: one per rollout.
-            selectors: one per rollout; None requests everything.
+        Chunks have one length; there is one seed per rollout, and one selector: None requests
+        everything.
         """
         ...
 
@@ -159,8 +149,8 @@ class ReconstructingWorld(World[State], Protocol[State]):
     def reconstruct(
         self,
         images: UInt8[np.ndarray, "steps h w 3"],
-        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
-    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        tactile_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode head images and touch of 1 + 4k consecutive steps.
 
         Returns:
@@ -277,5 +267,62 @@ def _check_fits(
 
 
 def _size_px(description: WorldDescription) -> tuple[int, int]:
-    """Height and width of a world's images."""
     return description.image_height_px, description.image_width_px
+
+
+_NOTHING = ReturnSelector(cameras=(), steps="last")
+
+
+class FixedBatchWorld(BatchWorld[State]):
+    """Pads the batches of a world with `step_batch` to a fixed size, for results equal bit for bit.
+
+    Matrix products of another batch size round differently, so that a rollout depends on how many
+    others are stepped with it. With a fixed size it does not, at the cost of computing `size`
+    entries for every chunk.
+    """
+
+    def __init__(self, world: BatchWorld[State], size: int) -> None:
+        if size < 1:
+            raise InvalidInputError(f"fixed batch: got a size of {size}, expected at least 1")
+        self._world = world
+        self._size = size
+
+    @property
+    def description(self) -> WorldDescription:
+        """That of the world."""
+        return self._world.description
+
+    def reset(self, start: RolloutStart) -> StartedRollout[State]:
+        """See World."""
+        return self._world.reset(start)
+
+    def step_batch(
+        self,
+        states: Sequence[State],
+        actions: Float64[np.ndarray, "batch steps 67"],
+        *,
+        seeds: Sequence[int],
+        selectors: Sequence[ReturnSelector] | None = None,
+    ) -> list[SteppedRollout[State]]:
+        """See BatchWorld; raises InvalidInputError for more entries than the fixed size."""
+        missing = self._size - len(states)
+        if missing < 0:
+            raise InvalidInputError(
+                f"fixed batch: got {len(states)} entries, expected at most {self._size}"
+            )
+        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        found = self._world.step_batch(
+            [*states, *[states[-1]] * missing],
+            np.concatenate([actions, np.repeat(actions[-1:], missing, axis=0)]),
+            seeds=[*seeds, *[seeds[-1]] * missing],
+            selectors=[*requested, *[_NOTHING] * missing],
+        )
+        return found[: len(states)]
+
+    def snapshot(self, state: State) -> bytes:
+        """See World."""
+        return self._world.snapshot(state)
+
+    def restore(self, data: bytes) -> State:
+        """See World."""
+        return self._world.restore(data)

@@ -11,12 +11,10 @@ from lerobot_designs import DIRECT, STREAMING, lerobot_designs
 from benchmarks.figures import Requirement
 from benchmarks.report import StageReport
 from benchmarks.stages import Bar
+from benchmarks.store.benchmark import panels, read_table, write_table
 from benchmarks.store.compare import DesignResult, Effort, compare
-from benchmarks.store.designs import Design
-from benchmarks.store.our_design import OurDesign
-from benchmarks.store.tables import panels, read_table, write_table
-from benchmarks.store.take import make_take
-from benchmarks.store.workload import CAMERAS
+from benchmarks.store.designs import Design, OurDesign
+from benchmarks.store.workload import CAMERAS, make_take
 from dextouch.errors import UnknownNameError
 
 OURS = "ours-h264"

@@ -19,8 +19,8 @@ from dextouch.schemas import Observation
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
 from services.pipelines.servers import served
-from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings
+from services.twin.world import twin_worlds
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]

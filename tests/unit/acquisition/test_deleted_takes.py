@@ -95,7 +95,7 @@ def test_the_spool_is_asked_about_once_for_every_deletion(tmp_path, deleted, for
 
 
 def test_a_large_spool_is_asked_about_in_parts(tmp_path, deleted, monkeypatch):
-    monkeypatch.setattr(retention, "MAX_CHECKED_TAKES", 2)
+    monkeypatch.setattr(retention.schemas, "MAX_CHECKED_TAKES", 2)
     for number in range(5):
         spool(tmp_path, f"take-{number}")
     store = Store()

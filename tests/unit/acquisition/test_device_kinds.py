@@ -55,6 +55,7 @@ OWN_KINDS = [
     "camera",
     "finger_tracker",
     "justfloat_glove",
+    "numbers",
     "pose_tracker",
     "robot_state",
     "station_camera",

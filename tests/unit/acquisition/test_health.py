@@ -10,10 +10,11 @@ from services.acquisition.devices.camera import camera_descriptor
 from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health import CODES, DiskCheck, HealthCollector, HealthMonitor
-from services.acquisition.health.codes import table
+from services.acquisition.health.codes import CODES, table
 from services.acquisition.health.evaluation import Board, Finding, Hysteresis
-from services.acquisition.health.station import CalibrationCheck
+from services.acquisition.health.metrics import HealthCollector
+from services.acquisition.health.monitor import HealthMonitor
+from services.acquisition.health.station import CalibrationCheck, DiskCheck
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.station import LiveView
 from services.acquisition.supervisor import DeviceSupervisor

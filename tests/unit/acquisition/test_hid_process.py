@@ -194,7 +194,7 @@ def test_the_stop_of_a_service_leaves_the_reader_to_the_station(plugged, transpo
 def test_a_reader_ends_with_a_station_that_is_killed(plugged, path):
     station = (
         "from services.acquisition.hid_process import *\n"
-        f"transport = HidProcessTransport(UsbAddress(1, 1, {path!r}))\n"
+        f"transport = HidProcessTransport(transports.UsbAddress(1, 1, {path!r}))\n"
         "transport.open()\n"
         "print(transport.reader_pid, flush=True)\n"
         "input()\n"

@@ -1,10 +1,12 @@
 """What hidapi is known to do, and what the HID transport makes of it."""
 
+from functools import partial
+
 import hidraw
 import pytest
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports import HidTransport, hid_opener
+from services.acquisition.transports import HidTransport, UsbAddress, open_hid
 
 REPORT = bytes(range(64))
 
@@ -88,12 +90,13 @@ def test_devices_are_opened_by_ids_and_serial_number(monkeypatch):
             calls.append(address)
 
     monkeypatch.setattr(hidraw, "device", Device)
-    opener = hid_opener(vendor_id=0x28DE, product_id=0x2300, serial_number="A1")
-    HidTransport(opener, address="28de:2300").open()
+    address = UsbAddress(0x28DE, 0x2300, "A1")
+    HidTransport(partial(open_hid, address), address=str(address)).open()
     assert calls == [(0x28DE, 0x2300, "A1")]
 
 
 def test_the_real_library_says_that_nothing_is_there():
-    transport = HidTransport(hid_opener(vendor_id=0xFFFE, product_id=0xFFFE), address="fffe:fffe")
+    address = UsbAddress(0xFFFE, 0xFFFE)
+    transport = HidTransport(partial(open_hid, address), address=str(address))
     with pytest.raises(DeviceError, match="plugged in, and allowed by udev"):
         transport.open()

@@ -11,12 +11,11 @@ from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.camera import CameraDecoder
 from services.acquisition.devices.station_camera import StationCamera
 from services.acquisition.drivers.sdk_link import BridgeDriver
-from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation, build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import at_rate
-from services.acquisition.settings import AcquisitionSettings
+from services.acquisition.settings import AcquisitionSettings, MockLinks
 from tests.integration.recording_streams import human_streams, robot_streams
 from tests.unit.acquisition.ledgers import accepted
 

@@ -13,11 +13,12 @@ from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health import HealthCollector, HealthMonitor
+from services.acquisition.health.metrics import HealthCollector
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.health.station import PathCheck
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
-from services.acquisition.recorder import Recorder, TakeOptions
+from services.acquisition.recorder import Recorder
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.unit.acquisition.health_blocks_made import block, judged
 
@@ -210,7 +211,7 @@ def test_a_take_gets_the_delay_at_its_start_and_a_better_one_at_its_end(tmp_path
         drivers=[SimulatedGlove(clock=clock)],
         clock=clock,
         calibration={"K_head": ((1.0,),)},
-        options=TakeOptions(latencies=lambda: latencies),
+        latencies=lambda: latencies,
     )
     recorder.arm(TakePrompt(task="stand_bottle", instruction="stand it up", consent=True))
     recorder.record("take")

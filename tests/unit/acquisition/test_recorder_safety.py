@@ -19,7 +19,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.recorder import Recorder, TakeOptions
+from services.acquisition.recorder import Recorder
 from services.acquisition.settings import SpoolSafety
 from tests.unit.acquisition.sleepy_clock import SleepyClock
 
@@ -56,7 +56,7 @@ def make_recorder(tmp_path, clock):
             drivers=[driver],
             clock=clock,
             calibration={},
-            options=TakeOptions(SpoolSafety(**safety)),
+            safety=SpoolSafety(**safety),
         )
         made.append(recorder)
         return recorder

@@ -42,7 +42,7 @@ def test_lost_reports_cost_only_their_messages(messages, data):
 @given(st.lists(st.binary(max_size=70)))
 def test_no_reports_break_it(reports):
     _, reassembler = reassemble(reports)
-    assert reassembler.num_reports == len(reports)
+    assert reassembler.num_incomplete <= len(reports)
 
 
 def test_limits():

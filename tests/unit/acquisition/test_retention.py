@@ -9,7 +9,8 @@ from prometheus_client import CollectorRegistry
 from dextouch.schemas import RecorderStatus
 from services.acquisition import retention as retention_module
 from services.acquisition.health.metrics import RecorderCollector
-from services.acquisition.retention import Retention, SpoolRetention, spooled_takes
+from services.acquisition.retention import SpoolRetention, spooled_takes
+from services.acquisition.settings import Retention
 
 DAY_S = 86_400
 NOW_S = 1_000 * DAY_S

@@ -8,8 +8,7 @@ from dextouch.serving import ServiceSettings, load_settings
 from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
-from services.acquisition.mock_links import MockLinks
-from services.acquisition.settings import AcquisitionSettings, SpoolSafety
+from services.acquisition.settings import AcquisitionSettings, MockLinks, SpoolSafety
 
 OPTIONS = {
     "station",
@@ -21,7 +20,6 @@ OPTIONS = {
     "mock_episode_id",
     "mock_faults",
     "mock_links",
-    "mock_practice",
     "seed",
     "devices",
     "calibration",

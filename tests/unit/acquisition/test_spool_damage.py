@@ -12,7 +12,7 @@ from dextouch.errors import CorruptDataError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import LedgerEntry, RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
-from services.acquisition.retention import Retention
+from services.acquisition.settings import Retention
 from services.acquisition.uploader import Uploader, recover_spool
 from tests.unit.acquisition.test_uploader import FakeStore
 

@@ -278,9 +278,11 @@ def test_a_take_begins_a_group_of_pictures():
 
 def test_the_encoder_is_loaded_before_the_first_image(monkeypatch):
     loaded = []
-    make = images.GopEncoder
+    make = images.episodes.GopEncoder
     monkeypatch.setattr(
-        images, "GopEncoder", lambda *size, **how: loaded.append(size) or make(*size, **how)
+        images.episodes,
+        "GopEncoder",
+        lambda *size, **how: loaded.append(size) or make(*size, **how),
     )
     FakeCamera([]).driver(encoding="h264").open()
     assert len(loaded) == 1

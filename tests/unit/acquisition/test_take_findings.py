@@ -10,7 +10,7 @@ from dextouch.schemas import (
     StreamHealth,
     TakeProblem,
 )
-from services.acquisition.health import HealthMonitor
+from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.take_check import TakeFindings
 
 START_NS = 10**10

@@ -13,7 +13,7 @@ from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch
 from services.acquisition import uploader as uploader_module
-from services.acquisition.retention import Retention
+from services.acquisition.settings import Retention
 from services.acquisition.uploader import (
     UPLOADED_FILE,
     Uploader,
@@ -295,7 +295,7 @@ def test_takes_whose_folder_is_removed_by_hand_are_left_out(refusing, tmp_path, 
     assert (list(refusing.refused), listed(refusing)) == (["c"], ["c"])
     # Removed while the list is being made.
     paths = [tmp_path / "b", tmp_path / "c"]
-    monkeypatch.setattr(uploader_module, "_spools", lambda _: iter(paths))
+    monkeypatch.setattr(uploader_module, "spooled_takes", lambda _: iter(paths))
     assert [status.recording_id for status in refusing.status()] == ["c"]
 
 

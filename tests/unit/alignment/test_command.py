@@ -13,6 +13,7 @@ from services.alignment import command_line
 from services.cli.main import main
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
+from tests.unit.episodes.hostile_group import stamp_version
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +71,14 @@ def test_all_aligns_what_has_no_episode(store, capsys):
     store.delete("handless", kind="recording")
     assert main(["align", "run", "--all", "--store", str(store.root)]) == 0
     assert "nothing to do" in capsys.readouterr().out
+
+
+def test_a_damaged_recording_keeps_no_other_from_being_aligned(store, capsys):
+    stamp_version(store, "recording", "take", 1)
+    assert main(["align", "run", "--all", "--store", str(store.root)]) == 3
+    told = capsys.readouterr()
+    assert "other aligned" in told.out
+    assert "format version 1, expected 2" in told.err
 
 
 @pytest.mark.parametrize("which", ["take", "episode"])

@@ -70,8 +70,8 @@ def no_decoding(monkeypatch):
 
     monkeypatch.setattr(ImageChunks, "decode", refuse)
     monkeypatch.setattr(images, "encode_jpeg", refuse)
-    monkeypatch.setattr("dextouch.episodes.stream_writer.encode_jpeg", refuse)
-    monkeypatch.setattr("dextouch.episodes.stream_writer.GopEncoder", refuse)
+    monkeypatch.setattr("dextouch.episodes.writer.encode_jpeg", refuse)
+    monkeypatch.setattr("dextouch.episodes.writer.GopEncoder", refuse)
 
 
 @pytest.mark.parametrize("unit", ["jpeg", "h264"])

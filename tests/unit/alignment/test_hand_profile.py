@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from benchmarks.retargeting.pinches import people, pinch_motion
-from benchmarks.simulated.hand_motions import robot_motion
+from benchmarks.simulated.hand_motions import people, pinch_motion, robot_motion
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, NODE_INDEX, chain_indices, mean_hand_m
 from services.alignment.retargeting import HandProfile, HandRetargeter
-from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
+from services.alignment.retargeting.hand_retargeter import calibrated_profile, profile_name
 
 NOISE_M = 1e-3
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import StreamData
+from dextouch.tactile.layout import DEXTOUCH_V1
 from services.alignment import recording_error
 from services.alignment.recording_error import NEAR_NS, match_samples
 
@@ -49,15 +50,15 @@ def test_touch_is_compared_over_the_taxels_of_both_gloves():
     mine = gloves({0: 2.0, 1: 5.0, 2: 1.9}, {7: 3.0, 8: 3.0})
     true = gloves({0: 2.0, 1: 1.0, 2: 1.9}, {7: 3.0, 8: 2.0, 9: 2.5})
     # Left: taxel 0 of 0 and 1. Right: 7 and 8 of 7, 8 and 9. Contact begins at 2 kPa.
-    errors = recording_error._taxel_errors(zip(mine, true, strict=True))
+    errors = recording_error._taxel_errors(zip(mine, true, strict=True), DEXTOUCH_V1)
     assert errors["taxel_iou"] == pytest.approx(3 / 5)
     assert errors["taxel_mae_kpa"] == pytest.approx((4.0 + 1.0 + 2.5) / 640)
 
 
 def test_without_gloves_or_contact_there_is_no_agreement_to_tell():
     nothing = gloves({}, {3: 1.0})
-    assert recording_error._taxel_errors(zip(nothing, nothing, strict=True)) == {
+    assert recording_error._taxel_errors(zip(nothing, nothing, strict=True), DEXTOUCH_V1) == {
         "taxel_iou": None,
         "taxel_mae_kpa": 0.0,
     }
-    assert recording_error._taxel_errors([])["taxel_iou"] is None
+    assert recording_error._taxel_errors([], DEXTOUCH_V1)["taxel_iou"] is None

@@ -9,7 +9,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
-from services.alignment.retargeting.hand_profile import person_arrays
+from services.alignment.retargeting.hand_retargeter import person_arrays
 from services.alignment.retargeting.solver.arrays import SCRATCH, hand_arrays
 from services.alignment.retargeting.solver.minimize import linearize
 

@@ -32,8 +32,8 @@ class FakeLink:
 
     def request(self, method, path, **_):
         self.asked.append(f"{method} {path}")
-        assert path == "/v1/health"
-        return Reply(200, {}, json.dumps(self.health).encode())
+        replies = {"/v1/health": self.health, "/v1/practice": {"state": "unavailable"}}
+        return Reply(200, {}, json.dumps(replies[path]).encode())
 
     def close(self):
         pass
@@ -102,6 +102,11 @@ def test_one_run_at_a_time_and_none_writes_when_it_is_ended(runs, place):
         (RunRequest(kind="camera", subject="left", board="chessboard:9x6:25mm"), InvalidInputError,
          "got 'left'"),
         (RunRequest(kind="camera", subject="head", board="paper"), UnknownNameError, "board"),
+        (RunRequest(kind="time", subject="head"), InvalidInputError, "expected all"),
+        (RunRequest(kind="mount", subject="head", board="chessboard:8x6:25mm"), InvalidInputError,
+         "half a turn"),
+        (RunRequest(kind="mount", subject="head", board="chessboard:9x6:25mm"), NotFoundError,
+         "calibrate camera"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_calibrated_is_refused_at_once(runs, request_, error, why):
@@ -119,9 +124,12 @@ def test_without_a_station_nothing_is_begun_and_the_rest_is_shown(facts):
     assert [(item.name, item.state) for item in seen.items] == [("K_head", "missing")]
 
 
-def test_calibrations_of_simulated_devices_have_a_folder_of_their_own(facts):
-    simulated = FakePlace(url="http://station", simulated=True, **facts)
-    assert overview(simulated).folder == str(facts["folder"] / "practice")
+def test_simulated_devices_need_no_calibration_and_have_a_folder_of_their_own(facts):
+    simulated = overview(FakePlace(url="http://station", simulated=True, **facts))
+    assert simulated.folder == str(facts["folder"] / "practice")
+    assert simulated.is_simulated
+    assert {item.state for item in simulated.items} == {"simulated", "optional"}
+    assert {item.run for item in simulated.items} == {None}
     assert overview(FakePlace(url="http://station", **facts)).folder == str(facts["folder"])
 
 
@@ -143,9 +151,9 @@ def test_what_is_there_is_judged_and_what_the_devices_need_is_missing(place):
     assert lens.views_by_region == ((2, 3, 4), (5, 6, 7), (8, 9, 1))
     assert lens.run == RunRequest(kind="camera", subject="head")
     mount = items["T_tracker_head_camera_head"]
-    assert mount.run is None
-    assert "hand-eye --camera head" in mount.step
-    assert str(place.folder) in mount.step
+    assert mount.run == RunRequest(kind="mount", subject="head")
+    assert mount.num_kept_places == 0
+    assert not overview(place).is_simulated
 
 
 def test_what_is_older_than_a_week_is_due(place):

@@ -139,7 +139,7 @@ def shaken(t_s):
 
 
 @pytest.mark.parametrize("same_world", [True, False])
-def test_latency_from_trackers_that_are_held_together(tmp_path, same_world):
+def test_delays_of_trackers_of_one_or_two_worlds_that_are_held_together(tmp_path, same_world):
     rng = np.random.default_rng(2)
     t_s = {"wrist_left": np.arange(0, 10, 1 / 100), "wrist_right": np.arange(0, 10, 1 / 90)}
     delays_ms = {"wrist_left": 37.0, "wrist_right": 12.0}
@@ -158,11 +158,9 @@ def test_latency_from_trackers_that_are_held_together(tmp_path, same_world):
         "wrist_left_latency_ns": ((20e6,),),
     }
     take = write_take(tmp_path / "take", streams, known)
-    arguments = ["--stream", "wrist_left", "--reference", "wrist_right", "--take", take]
-    report, matrices = run("latency", *arguments, to=tmp_path / "to")
+    _, matrices = run("time", "--reference", "wrist_right", "--take", take, to=tmp_path / "to")
     assert matrices["wrist_left_latency_ns"][0][0] * 1e-6 == pytest.approx(37.0, abs=1.0)
-    assert report["method"] == "motion"
-    assert 0.5 <= report["sigma_ms"] < 2
+    assert 0.5 <= matrices["wrist_left_latency_sigma_ns"][0][0] * 1e-6 < 2
 
 
 @pytest.mark.parametrize("stream", ["wrist_left", "tactile_left"])
@@ -195,11 +193,12 @@ def test_streams_without_common_motion_are_refused(tmp_path):
     streams = dict.fromkeys(("wrist_left", "head"), ("pose", "pose_m_wxyz", t_ns, still))
     streams["joints_measured"] = ("robot_state", "rad", t_ns, np.zeros((400, 40)))
     take = str(write_take(tmp_path / "take", streams))
-    common = ["latency", "--take", take, "--to", str(tmp_path / "to"), "--stream", "wrist_left"]
     with pytest.raises(DegenerateMotionError, match="brisk"):
-        main([*common, "--reference", "head"])
-    with pytest.raises(InvalidInputError, match="two poses, or a pose and a glove"):
-        main([*common, "--reference", "joints_measured"])
+        main(["time", "--take", take, "--to", str(tmp_path / "to")])
+    common = ["latency", "--take", take, "--to", str(tmp_path / "to"), "--stream", "wrist_left"]
+    for reference in ("head", "joints_measured"):
+        with pytest.raises(InvalidInputError, match="expected a pose and a glove"):
+            main([*common, "--reference", reference])
     assert command_line.main(["station", "calibrate", *common, "--reference", "none"]) == 3
     assert not load_or_none(tmp_path / "to")
 

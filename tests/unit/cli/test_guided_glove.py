@@ -21,6 +21,7 @@ from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.station_calibration import glove
+from services.alignment.station_calibration.takes import TakeRecorder
 from services.pipelines.calibrate import main
 
 TRUTH = GloveCalibration.seeded("left", 4)
@@ -106,7 +107,7 @@ def operator(bench, script):
     asked = []
 
     def ask(question):
-        asked.append(question)
+        asked.append(question.text)
         if len(asked) > len(script):
             raise EOFError
         answer, kpa = script[len(asked) - 1]
@@ -116,11 +117,17 @@ def operator(bench, script):
     return ask, asked
 
 
+def recorder(bench, given, wait=None):
+    return TakeRecorder(
+        bench.request, glove.TASK, spool=given.spool, store=given.store, wait=wait or bench.wait
+    )
+
+
 def guide(bench, tmp_path, script, monkeypatch, **changed):
     """The whole command with a fake link and operator."""
     ask, asked = operator(bench, script)
     given = options(tmp_path, **changed)
-    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    leads = glove.Guide(given, recorder(bench, given), ask=ask)
     record = glove.record_takes
     monkeypatch.setattr(glove, "record_takes", lambda o, _: record(o, leads))
     return glove.calibrate(given), asked
@@ -191,7 +198,7 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
     given = options(tmp_path)
-    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    leads = glove.Guide(given, recorder(bench, given), ask=ask)
     rest, rows = glove.record_takes(given, leads)
     assert rows == []
     assert rest.endswith("-2")
@@ -205,11 +212,11 @@ def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
     ask, _ = operator(bench, [("", 0.0), ("20", None), ("", 20.0), ("", None)])
 
     def creeping(question):
-        bench.creeps = "Put" in question
+        bench.creeps = "Put" in question.text
         return ask(question)
 
     given = options(tmp_path)
-    leads = glove.Guide(given, bench.request, ask=creeping, wait=bench.wait)
+    leads = glove.Guide(given, recorder(bench, given), ask=creeping)
     _, rows = glove.record_takes(given, leads)
     assert rows == []
     assert "changed while it lay" in capsys.readouterr().out
@@ -219,7 +226,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    takes = glove.Guide(options(tmp_path), bench.request, wait=interrupted)
+    takes = recorder(bench, options(tmp_path), wait=interrupted)
     with pytest.raises(KeyboardInterrupt):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().state == "discarded"
@@ -229,7 +236,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.arm(TakePrompt(task="t", instruction="i"))
     bench.recorder.record("other")
-    takes = glove.Guide(options(tmp_path), bench.request, wait=bench.wait)
+    takes = recorder(bench, options(tmp_path))
     with pytest.raises(ConflictError, match="while recording"):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().recording_id == "other"
@@ -237,18 +244,18 @@ def test_a_busy_recorder_is_left_alone(bench, tmp_path):
 
 def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
     elsewhere = options(tmp_path, spool=tmp_path / "not-here")
-    takes = glove.Guide(elsewhere, bench.request, wait=bench.wait)
+    takes = recorder(bench, elsewhere)
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
         takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
-    elsewhere.store = "http://store"
+    takes = recorder(bench, options(tmp_path, spool=tmp_path / "not-here", store="http://store"))
     assert takes.record("take-2", "rest", 1.0, str.upper) == ("take-2", "TAKE-2")
     assert bench.sent[-1] == "GET /v1/uploads"
 
 
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
     given, ask = options(tmp_path), operator(bench, [])[0]
-    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    leads = glove.Guide(given, recorder(bench, given), ask=ask)
     with pytest.raises(InvalidInputError, match="nobody answers"):
         glove.record_takes(given, leads)
     with pytest.raises(InvalidInputError, match="one of the two"):

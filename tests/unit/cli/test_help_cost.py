@@ -13,9 +13,8 @@ HEAVY = (
     *("torch", "numpy", "scipy", "mujoco", "zarr", "cv2", "av", "jaxtyping", "safetensors"),
     *("fastapi", "uvicorn", "redis", "structlog", "rich", "httpx", "prometheus_client"),
 )
-# Kinds of devices and of calibration boards are described by the modules that use them.
-EXEMPT = {"station serve": {"numpy", "jaxtyping", "structlog", "rich"}}
-EXEMPT["station calibrate"] = {"numpy", "jaxtyping"}
+# Kinds of calibration boards are described by the module that uses them.
+EXEMPT = {"station calibrate": {"numpy", "jaxtyping"}}
 SHOW_HELP = """
 import os, sys
 from services.cli.main import main
@@ -49,7 +48,7 @@ def pydantic_s():
 @pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.target])
 def test_help_is_cheap(name, pydantic_s):
     # On an idle 3 GHz core the settings library takes 0.1 s, and help at most 0.3 s.
-    limit_s = 3.0 * pydantic_s * (2.0 if name in EXEMPT else 1.0)
+    limit_s = 3.0 * pydantic_s
     for _ in range(3):
         cpu_s, modules = cpu_s_and_modules(SHOW_HELP, *name.split())
         heavy = modules & set(HEAVY) - EXEMPT.get(name, set())

@@ -24,7 +24,10 @@ def test_unknown_command_names_the_valid_ones(capsys):
 def test_a_misspelt_inner_command_names_the_valid_ones(capsys):
     assert main.main(["station", "calibrat"]) == main.EXIT_USAGE
     told = capsys.readouterr().err
-    assert "unknown dextouch station command 'calibrat'; valid: calibrate, enrol, serve" in told
+    assert (
+        "unknown dextouch station command 'calibrat'; valid: bridge, calibrate, enrol, serve"
+        in told
+    )
 
 
 def test_help_of_a_group_lists_its_commands(capsys):

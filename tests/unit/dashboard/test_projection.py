@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from dextouch.hands import mean_hand_m
-from dextouch.tactile import PADS, pad_forces_n
+from dextouch.tactile import DEXTOUCH_V1, PADS, hand_canvas, pad_forces_n
 from dextouch.tactile.layout import split_pads
 from services.dashboard.app import STATIC
-from services.dashboard.feeds import pose_message, skeleton_bones
+from services.dashboard.feeds import heatmap_layout, pose_message, skeleton_bones
+from tests.unit.other_gloves import small_layout
 
 # Vertical field of view of static/projection.js.
 FOVY_RAD = 0.7
@@ -84,6 +85,18 @@ def test_projection_in_node(tmp_path):
     }
     pressures = rng.uniform(0, 40, 320).astype(np.float32)
     cases |= {"pressures": pressures.tolist(), "names": taxel_places()}
+    cases["heatmap"], other = heatmap_layout(), small_layout()
+    cases["layout"] = other.model_dump(mode="json")
+    taxels = np.arange(138, dtype=np.float32)
+    cases["canvases"] = {
+        side: np.nan_to_num(other.hand_canvas(taxels, side=side), nan=-1).ravel().tolist()
+        for side in ("left", "right")
+    }
+    cases["own_canvases"] = {
+        side: np.nan_to_num(hand_canvas(np.arange(320.0), side=side), nan=-1).ravel().tolist()
+        for side in ("left", "right")
+    }
+    cases["own_layout"] = DEXTOUCH_V1.model_dump(mode="json")
     cases["forces"] = pad_forces_n(pressures[None])[0].tolist()
     path = tmp_path / "cases.json"
     path.write_text(json.dumps(cases))

@@ -123,14 +123,14 @@ async def test_a_watched_rollout_is_fetched_again_only_after_it_changed(world):
         return answer
 
     world._sent = noted
-    first = await topic._fetch()
-    assert await topic._fetch() == first
+    first = await topic.fetch()
+    assert await topic.fetch() == first
     assert statuses == [200, 304]
     header, _, _ = parsed(first[0])
     assert "id" not in header["rollout"]
     rollout_id = decode_answer(begun.content, max_bytes=10**6).rollout.id
     await world.send("DELETE", f"/v1/rollouts/{rollout_id}")
-    (gone,) = await topic._fetch()
+    (gone,) = await topic.fetch()
     assert json.loads(gone)["data"]["gone"]
 
 

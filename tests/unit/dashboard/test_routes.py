@@ -223,7 +223,7 @@ async def test_live_ends_with_its_session(make_app, looks, ends_by):
             socket.look_at("taxels")
             await socket.receive()
         if ends_by == "time":
-            app.state.sessions._clock_s = lambda: float("inf")
+            app.state.sessions.clock_s = lambda: float("inf")
         else:
             await client.post("/sign_out", headers={"content-length": "0"})
         while (message := await socket.receive())["type"] == "websocket.send":

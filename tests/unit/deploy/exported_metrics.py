@@ -6,7 +6,7 @@ from collections import defaultdict
 from prometheus_client.parser import text_string_to_metric_families
 
 from dextouch.schemas import StationHealth
-from services.acquisition.health import STATION_FIGURES, HealthCollector
+from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.dashboard.upstream import Upstream
 from tests.contracts.service_apps import APPS, client_of, open_websocket
 from tests.unit.worlds.fakes import actions

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from services.episode_store.findings import (
+from services.episode_store.items import (
     FIGURES,
     MIN_ITEMS,
     figures_of,

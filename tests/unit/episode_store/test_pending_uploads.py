@@ -61,7 +61,7 @@ def test_what_failed_is_uploaded_when_the_bucket_is_back(s3_server, store):
     fail_to_upload(s3_server, store, made)
     with s3_server.checking_credentials():
         with pytest.raises(StorageError, match="refused"):
-            pending.try_all()
+            pending.work()
         pending.start()
         time.sleep(0.2)
     try:

@@ -15,7 +15,7 @@ from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttribute
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.cli.main import main
 from services.episode_store import command_line
-from services.episode_store.commands import readable_size, table
+from services.episode_store.command_line import readable_size, table
 from services.episode_store.parser import seconds_of
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
@@ -243,7 +243,7 @@ def test_repair_from_a_copy_and_by_salvage(store, word, tmp_path):
     (tmp_path / "copy" / "recordings" / "r-1" / "commit.json").unlink()
     status, out, _ = word("repair", "--from", str(tmp_path / "copy"))
     assert status == 0
-    assert "e-1  mended" in out
+    assert "e-1  repaired" in out
     assert "r-1  salvaged  as r-1-salvaged-1" in out
     assert "force: 5 samples lost" in out
     assert store.list(kind="recording") == ["r-1-salvaged-1"]

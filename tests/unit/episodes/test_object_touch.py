@@ -10,6 +10,7 @@ from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import HandTrajectory, actions_from_poses
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import EpisodeAttributes, ObjectClicks, matrix_rows
+from dextouch.tactile import DEXTOUCH_V1
 
 NUM_STEPS, RATE_HZ = 60, 15.0
 TOUCHES = slice(10, 40)
@@ -37,6 +38,8 @@ def wrist():
 
 class InMemory(EpisodeGrid):
     """An episode whose hands and touch are in memory."""
+
+    tactile_layout = DEXTOUCH_V1
 
     def __init__(self, about, hands, kpa):
         self.about, self.anchor, self.kpa = about, hands.anchor(0), kpa

@@ -166,7 +166,7 @@ def test_metadata_of_arrays_is_written_anew(store, folder, truth):
     (folder / TOUCH / "zarr.json").write_text("{}")
     (folder / VIDEO / "zarr.json").unlink()
     result = repair_group(store.root, "episode", ID)
-    assert result.action == "mended"
+    assert result.action == "repaired"
     assert len(result.notes) == 2
     assert store.open(ID).verify().content_sha256 == sha256
 
@@ -206,7 +206,7 @@ def test_a_copy_makes_it_whole(store, folder, copy, tmp_path):
     shutil.rmtree(folder / STILLS)
     (folder / STILLS).symlink_to(tmp_path)
     result = repair_group(store.root, "episode", ID, copy=LocalGroup(copy))
-    assert result.action == "mended"
+    assert result.action == "repaired"
     assert store.open(ID).verify().content_sha256 == sha256
     assert not inspect_group(LocalGroup(folder), "episode").damaged
     assert list((store.root / ".staging").iterdir()) == []
@@ -216,7 +216,7 @@ def test_a_copy_makes_it_whole(store, folder, copy, tmp_path):
 def test_a_copy_mends_the_commit_record(store, folder, copy):
     sha256 = store.open(ID).content_sha256
     (folder / "commit.json").unlink()
-    assert repair_group(store.root, "episode", ID, copy=LocalGroup(copy)).action == "mended"
+    assert repair_group(store.root, "episode", ID, copy=LocalGroup(copy)).action == "repaired"
     assert store.open(ID).verify().content_sha256 == sha256
 
 

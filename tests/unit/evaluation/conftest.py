@@ -37,9 +37,7 @@ def policy_checkpoint(demonstrations):
 
 
 def _probe(demonstrations, num_steps):
-    settings = ClassifierSettings(
-        num_training_steps=num_steps, batch_size=32, shift_px=1, learning_rate=3e-3
-    )
+    settings = ClassifierSettings(num_training_steps=num_steps, batch_size=32, learning_rate=3e-3)
     return train_success_classifier(
         [ending_episode(d) for d in demonstrations], settings, command="a test"
     )

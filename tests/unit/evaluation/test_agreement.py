@@ -30,7 +30,7 @@ def rng(seed=0):
 
 
 def binary(rates, num_starts, generator):
-    return (generator.random((len(rates), num_starts, 1)) < np.array(rates)[:, None, None]) * 1.0
+    return (generator.random((len(rates), num_starts)) < np.array(rates)[:, None]) * 1.0
 
 
 def test_figures_of_draws_are_those_of_scipy():
@@ -148,7 +148,7 @@ def test_posterior_is_that_of_importance_sampling():
     normal = generator.standard_normal((2, num, 2))
     normal[1] = r[:, None] * normal[0] + np.sqrt(1 - r**2)[:, None] * normal[1]
     true = np.concatenate([mean[:, [k]] + spread[:, [k]] * normal[k] for k in (0, 1)], axis=1)
-    rollouts = np.concatenate(scores.by_rollout())
+    rollouts = np.concatenate([scores.real, scores.imagined])
     weight = stats.multivariate_normal(rollouts.mean(axis=1), noise_covariance(rollouts)).pdf(true)
     weight /= weight.sum()
     true = np.clip(true, 0, 1)
@@ -187,16 +187,10 @@ def test_many_starts_leave_little_doubt():
     assert agreement.figures["pearson"].undefined_share == 0
 
 
-def test_bootstrap_spreads_as_starts_and_raters_do():
-    # Rollouts vary by 0.5 and raters by 0.5 around each: the variance of a mean over 50 rollouts of
-    # 4 raters is (0.25 + 0.25 / 4) / 50, and drawing raters adds their part a second time.
-    generator = rng(18)
-    rollout = generator.uniform(0.25, 0.75, (1, 50, 1))
-    scores = np.clip(rollout + generator.uniform(-0.25, 0.25, (1, 50, 4)), 0, 1)
+def test_bootstrap_spreads_as_starts_do():
+    scores = rng(18).uniform(0, 1, (1, 50))
     drawn = bootstrap_scores(MatchedScores(scores, scores), rng(19), num_draws=4000).real
-    between = scores.mean(axis=2).var()
-    within = scores.var(axis=2).mean()
-    assert drawn.var() == pytest.approx((between + within / 4) / 50, rel=0.1)
+    assert drawn.var() == pytest.approx(scores.var() / 50, rel=0.1)
     assert drawn.mean() == pytest.approx(scores.mean(), abs=0.005)
 
 
@@ -207,7 +201,7 @@ def test_a_start_is_drawn_for_both_worlds():
 
 
 def test_a_world_without_spread_has_no_correlation():
-    scores = MatchedScores(binary([0.2, 0.5, 0.8], 10, rng(28)), np.ones((3, 10, 1)))
+    scores = MatchedScores(binary([0.2, 0.5, 0.8], 10, rng(28)), np.ones((3, 10)))
     agreement, _ = task_agreement("abc", scores, rng(29))
     pearson = agreement.figures["pearson"]
     assert math.isnan(pearson.value)
@@ -244,30 +238,19 @@ def test_three_policies_without_one_are_two():
         assert all(math.isnan(r) for r in agreement.without.values())
 
 
-def test_absent_raters_are_left_out():
-    full = rng(20).random((2, 6, 3))
-    gaps = np.concatenate([np.full((2, 6, 1), np.nan), full[:, :, :1]], axis=2)
-    one, both = (
-        bootstrap_scores(MatchedScores(side, side), rng(21), num_draws=500)
-        for side in (full[:, :, :1], gaps)
-    )
-    assert both.real.mean() == pytest.approx(one.real.mean(), abs=0.02)
-    assert np.isfinite(both.real).all()
-
-
 def test_undecided_rollouts_are_missing():
     real, imagined = binary([0.2, 0.5, 0.8], 30, rng(50)), binary([0.3, 0.5, 0.7], 30, rng(51))
     imagined[0, :12], imagined[2, 20:] = np.nan, np.nan
     scores = MatchedScores(real, imagined)
     agreement, draws = task_agreement("abc", scores, rng(52))
-    means = [side[np.isfinite(side)].mean() for side in imagined[:, :, 0]]
+    means = [side[np.isfinite(side)].mean() for side in imagined]
     assert agreement.figures["bias"].value == pytest.approx(np.mean(means) - real.mean())
     assert agreement.figures["pearson"].interval is not None
     # Of a policy with fewer decided rollouts less is known; its draws lie about its own rate.
     for drawn in (draws.posterior, draws.bootstrap):
         assert np.isfinite(drawn.imagined).all()
         assert drawn.imagined.mean(axis=0) == pytest.approx(means, abs=0.06)
-    (pair, *_) = paired_differences("ab", imagined[:2, :, 0], rng(53))
+    (pair, *_) = paired_differences("ab", imagined[:2], rng(53))
     assert pair.difference == pytest.approx((imagined[0, 12:] - imagined[1, 12:]).mean())
     never = np.array([[1.0, np.nan], [np.nan, 0.0]])
     assert paired_differences("ab", never, rng(54)) == []
@@ -292,7 +275,7 @@ def test_pooled_agreement_joins_tasks():
     ]
     found = [task_agreement("abc", scores, rng(24)) for scores in tasks]
     pooled = pooled_agreement("abc", tasks, [draws for _, draws in found], rng(25))
-    means = [[side.mean(axis=1) for side in scores.by_rollout()] for scores in tasks]
+    means = [[side.mean(axis=1) for side in (scores.real, scores.imagined)] for scores in tasks]
     real, imagined = (np.concatenate([pair[k] for pair in means]) for k in (0, 1))
     assert pooled.figures["pearson"].value == pytest.approx(np.corrcoef(real, imagined)[0, 1])
     assert set(pooled.without) == set("abc")

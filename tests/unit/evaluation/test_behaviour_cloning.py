@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.clients import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import transform

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.clients import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.worlds.world import Observation, ReturnSelector, RolloutStart

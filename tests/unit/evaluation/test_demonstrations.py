@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from services.cli.main import run_command

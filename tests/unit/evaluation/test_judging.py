@@ -390,11 +390,10 @@ def test_true_endings_are_learned_without_poses_and_imagined_ones_with_them():
     episodes = _episodes(range(30))
     shape = ClassifierShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
     batch = labelled_endings(episodes, shape).batch
-    settings = ClassifierSettings(
-        true_without_poses=1, true_without_images=0,
-        imagined_without_poses=0, imagined_without_images=1,
-    )  # fmt: skip
-    seen = some_parts(batch, torch.ones(105), settings, torch.Generator().manual_seed(0))
+    generator, shares = torch.Generator().manual_seed(0), ((1.0, 0.0), (0.0, 1.0))
+    seen = some_parts(
+        batch, torch.ones(105), generator, without_poses=shares[0], without_images=shares[1]
+    )
     assert not seen.has_objects[~batch.imagined].any()
     assert seen.has_image[~batch.imagined].all()
     assert seen.has_objects[batch.imagined].all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import UnknownNameError
 from dextouch.worlds.world import ReturnSelector, RolloutStart
 from services.evaluation.bundled_policies import DEFAULT_POLICY

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.clients import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, NonFiniteError, NotFoundError
 from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
 from tests.unit.evaluation import toy

@@ -21,13 +21,14 @@ from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.rating.marks import Rubric
 from services.evaluation.rating.rating_queue import rated_rollouts, state_scores
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
-from services.evaluation.studies.definition import StudyDefinition, read_definition
 from services.evaluation.studies.engine import PolicyFactory, StudyParts, run_study
 from services.evaluation.studies.results import (
     PlannedRollout,
+    StudyDefinition,
     StudyHeader,
     StudyResults,
     cells_of,
+    read_definition,
     rollout_episode_id,
     study_report,
 )

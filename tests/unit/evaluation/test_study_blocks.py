@@ -9,8 +9,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.scores import RolloutScore
-from services.evaluation.studies.definition import StudyDefinition
-from services.evaluation.studies.results import StudyResults, cells_of
+from services.evaluation.studies.results import StudyDefinition, StudyResults, cells_of
 from services.evaluation.trained_networks import save_checkpoint
 from services.pipelines.study import blocks_of, main, run_block
 from tests.unit.evaluation import toy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from dextouch.metrics.geometry import depth_error
+from dextouch.metrics.image import depth_error
 
 RNG = np.random.default_rng(0)
 

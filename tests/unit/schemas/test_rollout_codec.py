@@ -295,7 +295,7 @@ def unpack_all(data: bytes) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("changed", "error", "says"),
     [
-        ({"tactile_kpa": np.zeros((1, 2, 360), np.float32)}, ShapeError, "360"),
+        ({"tactile_kpa": np.zeros((1, 2, 4097), np.float32)}, ShapeError, "4097"),
         ({"tactile_kpa": np.zeros((1, 2, 320))}, ShapeError, "float64"),
         ({"tactile_kpa": np.zeros((), np.float32)}, ShapeError, "0 steps"),
         ({"tactile_kpa": np.full((1, 2, 320), np.nan, np.float32)}, NonFiniteError, "tactile"),

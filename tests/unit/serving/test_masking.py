@@ -5,8 +5,8 @@ import secrets
 import pytest
 from pydantic import BaseModel, SecretStr
 
-from dextouch.serving import masking
-from dextouch.serving.masking import hide_secrets, masked
+from dextouch.serving import logs
+from dextouch.serving.logs import hide_secrets, masked
 
 
 class Inner(BaseModel):
@@ -22,7 +22,7 @@ class Outer(BaseModel):
 
 @pytest.fixture(autouse=True)
 def _forgotten(monkeypatch):
-    monkeypatch.setattr(masking, "_secrets", {})
+    monkeypatch.setattr(logs, "_secrets", {})
 
 
 def settings(key, **more):

@@ -15,7 +15,7 @@ from dextouch.serving import (
     run,
     service_config,
 )
-from dextouch.serving.host_names import is_loopback
+from dextouch.serving.settings import is_loopback
 from services.cli.up_settings import UpSettings
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from benchmarks.simulated.finger_contact import touching
+from benchmarks.simulated.hand_motions import touching
 from dextouch.errors import ShapeError
 from services.pipelines.teleoperation.finger_gaps import FingerGaps, segment_distances_m
 from services.twin.hands import twin_hand

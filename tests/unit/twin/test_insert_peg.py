@@ -8,8 +8,8 @@ import pytest
 
 from dextouch.geometry import apply, invert, project, transform_from_pose
 from services.twin.demonstrators import NUM_GRID_STEPS
+from services.twin.scene import object_boxes_m
 from services.twin.settings import TwinSettings
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import get_task
 

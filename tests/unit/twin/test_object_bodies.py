@@ -9,9 +9,8 @@ from dextouch.hands.actions import actions_from_poses, poses_from_actions
 from services.twin.cameras import HEAD_HOME
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TakeOptions, record
-from services.twin.scene import compile_scene
+from services.twin.scene import compile_scene, object_boxes_m
 from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Command, Simulation
-from services.twin.sizes import object_boxes_m
 from services.twin.stage import _displaced, command_row
 from services.twin.tasks.task import relaxed
 
@@ -142,13 +141,13 @@ def test_contacts_are_told_by_hand_and_object(furnished):
     np.testing.assert_array_equal(furnished.hand_contacts(), [[0, 0, 0, 0], [0, 1, 0, 0]])
     assert furnished.hand_touches(1)
     assert not furnished.hand_touches(0)
-    assert furnished.hand_touches_object()
+    assert furnished.hand_touches()
     placed[1, :3] = [0.10, 0.20, 0.079]
     furnished.place(still(), placed, settle_s=0.0)
     assert furnished.objects_touch(1, 2)
     assert furnished.objects_touch(2, 1)
     assert not furnished.objects_touch(0, 1)
-    assert not furnished.hand_touches_object()
+    assert not furnished.hand_touches()
 
 
 def test_boxes_of_shapes_are_those_computed_by_hand():

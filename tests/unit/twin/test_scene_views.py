@@ -6,8 +6,8 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.geometry import apply, invert
 from dextouch.hands.actions import poses_from_actions
-from services.evaluation.prediction_scenes import labelled
-from services.pipelines.twin_geometry import TABLE_LABEL, SceneViews
+from services.evaluation.prediction_scenes import TABLE, labelled
+from services.pipelines.twin_geometry import SceneViews
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -59,7 +59,7 @@ def test_pixels_have_the_colour_of_what_their_label_says(take):
 def test_every_body_is_seen_where_it_projects_to(take):
     """An object's pixels, back in the world by their depth, lie close to its pose."""
     stage, _, views, seen, poses, objects = take
-    rays = stage.rig.rays("camera_head").reshape(PX, PX, 3)
+    rays = stage.rig.rays["camera_head"].reshape(PX, PX, 3)
     for step, (labels, depth_m) in seen:
         T_world_camera = poses.Ts_world_camera_head[step]
         for index, name in enumerate(views.names[4:]):
@@ -70,7 +70,7 @@ def test_every_body_is_seen_where_it_projects_to(take):
             world = apply(T_world_camera, points)
             extent_m = np.abs(world.mean(axis=0) - objects[step, index, :3]).max()
             assert extent_m < 0.2, name
-        table = labels == TABLE_LABEL
+        table = labels == TABLE
         points = rays[table] / rays[table][:, 2:] * depth_m[table][:, None]
         np.testing.assert_allclose(apply(T_world_camera, points)[:, 2], 0.0, atol=1e-6)
         assert np.isfinite(invert(T_world_camera)).all()

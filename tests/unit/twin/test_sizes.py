@@ -6,9 +6,8 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import RolloutStart
 from services.twin.episodes import record
-from services.twin.scene import compile_scene
+from services.twin.scene import Geometry, Sizes, compile_scene
 from services.twin.settings import TwinSettings
-from services.twin.sizes import Geometry, Sizes
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions, episode_id
 from services.twin.world import TwinWorld

@@ -15,6 +15,7 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.actions import HandTrajectory, actions_from_poses
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams import StreamDescriptor
+from dextouch.tactile import DEXTOUCH_V1
 from services.world_model.checkpoints import (
     CheckpointMetadata,
     read_checkpoint,
@@ -151,7 +152,7 @@ def _touch(trajectory, box_m):
     return touch
 
 
-def write_episode(store, episode, image_every=1):
+def write_episode(store, episode, image_every=1, *, success=None):
     """The toy episode in a real store: every stream at the model rate, images if asked sparser."""
     stamps = (np.arange(len(episode)) * 1_000_000_000) // 15
     streams = {
@@ -176,6 +177,7 @@ def write_episode(store, episode, image_every=1):
         K_head=matrix_rows(episode.K_head),
         object_names=("box",),
         object_boxes_m=tuple(map(tuple, episode.boxes_m.tolist())),
+        success=success,
     )
     with store.writer(attributes=attributes) as writer:
         for name, (kind, values, unit) in streams.items():
@@ -183,10 +185,15 @@ def write_episode(store, episode, image_every=1):
                 StreamDescriptor(
                     name=name, kind=kind, shape=values.shape[1:], dtype=values.dtype.name,
                     unit=unit, nominal_rate_hz=15.0,
+                    layout=_named_layout(episode) if kind == "tactile" else None,
                 )
             )  # fmt: skip
             every = image_every if kind == "image" else 1
             writer.append(name, values=values[::every], t_ref_ns=stamps[::every])
+
+
+def _named_layout(episode):
+    return None if episode.tactile_layout == DEXTOUCH_V1 else episode.tactile_layout
 
 
 def human_episode(seed, task="fold_cloth"):

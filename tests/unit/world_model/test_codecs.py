@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.networks.principal_axes import principal_axes, root_scale
+from services.world_model.dynamics.features import principal_axes, root_scale
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import PrincipalAxesTokenizer
 from services.world_model.network.video import VisualCodec, to_uint8, to_unit

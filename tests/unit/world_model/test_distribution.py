@@ -148,7 +148,7 @@ def test_losses_of_the_parts_have_that_of_the_batch_as_their_mean(toy_episodes, 
     windows = [episode.cut(WindowPosition(0, 3, 9)) for episode in toy_episodes[:4]]
 
     def found(processes):
-        batch = stack_windows(processes.part(windows))
+        batch = stack_windows(processes.own(windows))
         generator = torch.Generator().manual_seed(5)
         loss = losses(tiny_model, batch, generator=generator, processes=processes)
         return torch.stack([loss.video, loss.tactile])

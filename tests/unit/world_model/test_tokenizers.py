@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from dextouch.tactile import DEXTOUCH_V1
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import build_tokenizer, canvas_cells
 
@@ -110,7 +111,8 @@ def test_the_grid_lays_out_every_taxel_once_where_its_table_says():
             if letter != ".":
                 expected[first_taxel[letter] + counted[letter]] = 20 * row + column
                 counted[letter] += 1
-    cells = canvas_cells()
+    cells, shape = canvas_cells(DEXTOUCH_V1)
+    assert shape == (20, 20)
     assert cells.tolist() == [expected[taxel] for taxel in range(320)]
     assert len(set(cells.tolist())) == 320
 

@@ -7,10 +7,12 @@ import numpy as np
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, EpisodeAttributes
+from dextouch.tactile import DEXTOUCH_V1
 
 
 @dataclass(kw_only=True)
 class ToyGrid(EpisodeGrid):
+    tactile_layout = DEXTOUCH_V1
     about: EpisodeAttributes
     anchor: AnchorPoses
     measured: np.ndarray

@@ -1,6 +1,7 @@
 // Panes, timeline, plots and keys around one playhead.
 
 import { element, setText } from "../dom.js";
+import { withLayout } from "../layouts.js";
 import { pagePath } from "../session.js";
 import { ActionPane, ACTION_SIZE } from "./action_pane.js";
 import { CameraPane } from "./camera_pane.js";
@@ -64,8 +65,8 @@ export class Player {
     find("camera_row").append(...this.cameras.map((pane) => pane.root));
     find("camera_choice").append(...cameras.map((stream) => this.choice(stream.name, this.shown, () => this.chosen())));
 
-    const hands = item.ofKind("tactile").filter((stream) => ["left", "right"].includes(stream.side) && [320, 360].includes(stream.size));
-    this.touch = hands.map((stream) => new TouchPane(samples(stream), stream.side, this.heatmap));
+    const hands = item.ofKind("tactile").filter((stream) => ["left", "right"].includes(stream.side) && this.isHand(stream));
+    this.touch = hands.map((stream) => new TouchPane(samples(stream), stream.side, withLayout(this.heatmap, stream.layout)));
     find("touch").hidden = !hands.length;
     find("hands").append(...this.touch.map((pane) => pane.root));
 
@@ -127,6 +128,12 @@ export class Player {
     return names.length ? names.slice(0, 4) : [...this.item.streams.values()].slice(0, 2).map((stream) => (stream.kind === "image" ? `${stream.name}.interval_ms` : stream.name));
   }
 
+  // Whether a tactile stream can be drawn as a hand: its taxels, or the raw cells among which they are.
+  isHand(stream) {
+    const { cells, num_raw_cells } = withLayout(this.heatmap, stream.layout);
+    return [cells[stream.side].length, num_raw_cells].includes(stream.size);
+  }
+
   setSignals(names) {
     this.signals = names;
     this.plots.setSignals(names);
@@ -142,7 +149,8 @@ export class Player {
     const [ours, theirs] = [this.item.streams.get(stream), raw.streams.get(stream)];
     if (!theirs) return null;
     if (ours.size === theirs.size || !/^\d/.test(what)) return name;
-    const cells = theirs.size === this.heatmap.num_raw_cells ? this.heatmap.raw_cells[ours.side] : null;
+    const { num_raw_cells, raw_cells } = withLayout(this.heatmap, theirs.layout);
+    const cells = theirs.size === num_raw_cells ? raw_cells[ours.side] : null;
     return cells && ours.size === cells.length ? `${stream}.${cells[Number(what)]}` : null;
   }
 

@@ -29,11 +29,17 @@ from dextouch.bridges.lerobot.layout import (
 from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
+from dextouch.tactile.layout import common_layout
 
 # Rows of the table of episodes that are written together.
 ROWS_AT_ONCE: Final = 100
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
+CARD: Final = (
+    "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
+    f"---\n\n# {{}}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from DexTouch "
+    "episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
+)
 # Of video that has to be encoded.
 VIDEO = VideoSettings(crf=23, preset="veryfast")
 GROUP_IMAGES: Final = 2
@@ -64,20 +70,15 @@ def export_lerobot(
 ) -> int:
     """Write episodes as one LeRobotDataset v3.0 and return the number of frames.
 
-    Args:
-        readers: of the episodes, in the order of the dataset; opened one at a time.
-        folder: of the dataset; must not exist.
-        repo_id: name of the dataset, `user/name`.
-        options: rate, cameras, quality.
+    Readers are opened one at a time, in the order of the dataset. `repo_id` is its name,
+    `user/name`.
 
     Raises:
         ConflictError: the folder exists.
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
-            one dataset.
-        UnknownNameError: a camera that an episode does not have.
+            one dataset, such as with a camera that one of them lacks.
         ShapeError: images with an odd side.
-        CorruptDataError: a damaged episode.
-        StorageError: the write failed.
+        CorruptDataError, StorageError: a damaged episode; the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
@@ -101,11 +102,7 @@ def export_lerobot(
 
 
 def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
-    """Rows of the data files from columns [n, *shape].
-
-    A feature of shape [1] is a plain value, one of another axis a fixed list, one of several axes
-    lists of lists.
-    """
+    """Rows of the data files from columns [n, *shape]; a feature of shape [1] is a plain value."""
     table = {}
     for name, values in columns.items():
         shape = [] if features[name]["shape"] == [1] else features[name]["shape"]
@@ -138,7 +135,6 @@ class _ParquetFiles:
         return self._number
 
     def close(self) -> None:
-        """Complete the file that is open."""
         if self._writer is not None:
             with disk_errors(f"complete {self._path}"):
                 self._writer.close()
@@ -148,8 +144,7 @@ class _ParquetFiles:
 class _Dataset:
     """Writes a new dataset episode by episode; `finish` writes the metadata.
 
-    The first episode decides about its cameras and whether its actions are commanded ones, beside
-    which measured ones are stored.
+    The first episode decides about cameras, and whether actions are commanded ones.
     """
 
     def __init__(self, folder: Path, first: EpisodeReader, options: ExportOptions) -> None:
@@ -169,7 +164,13 @@ class _Dataset:
         _check_cameras(first, self._cameras)
         self._has_measured = "action_commanded" in streams
         shapes = {name: streams[name].shape for name in self._cameras}
-        self._features = layout.dataset_features(shapes, self.fps, has_measured=self._has_measured)
+        self._tactile_layout = first.tactile_layout
+        self._features = layout.dataset_features(
+            shapes,
+            self.fps,
+            has_measured=self._has_measured,
+            num_taxels=self._tactile_layout.num_taxels,
+        )
         self.num_frames = self._num_episodes = 0
         self._tasks: dict[str, int] = {}
         self._total: dict[str, Statistics] = {}
@@ -184,7 +185,6 @@ class _Dataset:
         }
 
     def add(self, reader: EpisodeReader) -> None:
-        """Write one episode."""
         _check_cameras(reader, self._cameras)
         attributes, frames = reader.attributes, frames_of(reader, self._cameras, self.fps)
         where = f"episode {attributes.episode_id!r}"
@@ -193,6 +193,7 @@ class _Dataset:
                 f"{where}: got {frames.action_kind} actions; export episodes with commanded "
                 "actions and those without into different datasets"
             )
+        common_layout([self._tactile_layout, reader.tactile_layout], what=f"dataset, {where}")
         row: dict[str, Any] = {"episode_index": self._num_episodes, "length": len(frames)}
         row["tasks"] = [attributes.instruction or attributes.task]
         task_index = self._tasks.setdefault(row["tasks"][0], len(self._tasks))
@@ -256,7 +257,6 @@ class _Dataset:
         return {name: columns[name] for name in self._features if name in columns}
 
     def close(self) -> None:
-        """Complete the data, video and episode files."""
         for video in self._videos.values():
             video.close()
         self._write_rows()
@@ -269,11 +269,7 @@ class _Dataset:
             self._rows = []
 
     def finish(self, repo_id: str) -> None:
-        """Complete the files and write the metadata; `repo_id` is the dataset's name.
-
-        Raises:
-            StorageError: the write failed.
-        """
+        """Complete the files and write the metadata; raises StorageError if the write failed."""
         self.close()
         self._write_tasks()
         statistics = {
@@ -282,7 +278,7 @@ class _Dataset:
         }
         for name, content in ((layout.STATS_FILE, statistics), (layout.INFO_FILE, self._info())):
             self._write(name, json.dumps(content, indent=4, allow_nan=False) + "\n")
-        self._write(layout.CARD_FILE, _card(repo_id))
+        self._write(layout.CARD_FILE, CARD.format(repo_id))
 
     def _write_tasks(self) -> None:
         """A table whose pandas index is the task's text."""
@@ -322,17 +318,6 @@ class _Dataset:
         with disk_errors(f"write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-
-
-def _card(repo_id: str) -> str:
-    front = (
-        "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n"
-        "  data_files: data/*/*.parquet\n---\n"
-    )
-    return (
-        f"{front}\n# {repo_id}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from "
-        "DexTouch episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
-    )
 
 
 def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:

@@ -29,16 +29,17 @@ from dextouch.schemas import (
     first_problems,
 )
 from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
-from dextouch.tactile.layout import NUM_TAXELS, SIDES
+from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout
 
 ImageUnit = Literal["h264", "jpeg", "rgb8"]
 HEAD = "camera_head"
+TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 _CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
-# Usual feature of a role, and the shape of its rows.
+# Usual feature of a role, and the shape of its rows; -1 is the number of taxels.
 _ROLES = {
     "action": (layout.ACTION, (ACTION_DIM,)),
     "state": (layout.STATE, (ACTION_DIM,)),
-    "tactile": (layout.TACTILE, (2, NUM_TAXELS)),
+    "tactile": (layout.TACTILE, (2, -1)),
 }
 # What our own exports keep beside LeRobot's features; None: one number a camera.
 _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
@@ -75,12 +76,8 @@ def import_lerobot(
 ) -> list[str]:
     """Write every episode of a dataset into the store and return their ids.
 
-    Each episode appears complete or not at all; after an error, earlier episodes remain.
-
-    Args:
-        folder: root of the dataset; nothing outside it is read.
-        store: destination.
-        options: feature names, ids, image unit, and values missing in foreign datasets.
+    Each episode appears complete or not at all; after an error, earlier episodes remain. Nothing
+    outside the folder is read.
 
     Raises:
         NotFoundError: a file is missing.
@@ -92,7 +89,8 @@ def import_lerobot(
         ConflictError: an id exists already.
     """
     source = LeRobotFolder(folder)
-    features = _map_features(source.info, options.mapping)
+    first = source.sidecar(source.episodes[0]) if source.episodes else None
+    features = _map_features(source.info, options.mapping, _tactile_layout(first))
     ids: list[str] = []
     for entry in source.episodes:
         sidecar = source.sidecar(entry)
@@ -117,7 +115,16 @@ def import_lerobot(
     return ids
 
 
-def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
+def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
+    """Layout of the taxels of an episode of ours; datasets of other origin have `dextouch_v1`."""
+    streams = () if sidecar is None else sidecar.attributes.streams
+    touch = [one.tactile_layout for one in streams if one.name in TOUCH_STREAMS]
+    return touch[0] if touch else DEXTOUCH_V1
+
+
+def _map_features(
+    info: DatasetInfo, names: Mapping[str, str], tactile: TactileLayout
+) -> dict[str, str]:
     """The dataset's features by role; roles and cameras that it has no feature for are absent."""
     for ours, theirs in names.items():
         if ours not in _ROLES and not _CAMERA_NAME.fullmatch(ours):
@@ -126,7 +133,8 @@ def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]
             raise UnknownNameError("feature of the dataset", theirs, list(info.features))
     roles: dict[str, str] = {}
     problems = []
-    for ours, (usual, shape) in _ROLES.items():
+    for ours, (usual, sizes) in _ROLES.items():
+        shape = tuple(tactile.num_taxels if size < 0 else size for size in sizes)
         name = names.get(ours, usual)
         got = info.features.get(name)
         if got is not None and got.dtype in {"float32", "float64"} and got.numbers() == shape:
@@ -181,6 +189,7 @@ class _Content:
     t_ref_ns: Int64[np.ndarray, " n"]
     numbers: dict[str, tuple[StreamKind, str, np.ndarray, Bool[np.ndarray, " n"]]]
     cameras: dict[str, tuple[VideoSpan, Int64[np.ndarray, " n"]]]
+    tactile_layout: TactileLayout
 
 
 def _content(
@@ -189,10 +198,9 @@ def _content(
     features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
 ) -> tuple[_Content, AnchorPoses | None]:
-    """An episode's numbers and where its videos are.
+    """An episode's numbers, where its videos are, and the poses that its actions are relative to.
 
-    Actions are relative to the measured poses of the first frame; these are returned where they are
-    not those that the dataset's description gives.
+    These are the measured ones of the first frame; None where the dataset's description gives them.
     """
     where = f"{source.folder}: episode {entry.index}"
     columns = _columns(source, entry, features)
@@ -203,7 +211,7 @@ def _content(
     if (np.diff(t_ns) <= 0).any():
         raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
     measured, commanded, anchor = _actions(columns, features, sidecar, where)
-    content = _Content(t_ns, {}, {})
+    content = _Content(t_ns, {}, {}, _tactile_layout(sidecar))
     if "tactile" in features:
         valid = columns.get(layout.VALID, np.ones((entry.length, 2))).astype(bool)
         kpa = columns[features["tactile"]].astype(np.float32)
@@ -235,7 +243,10 @@ def _store(
             writer.add_stream(StreamDescriptor.model_validate(known))
 
         for name, (kind, unit, values, keep) in content.numbers.items():
-            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit)
+            more = {}
+            if kind == "tactile" and content.tactile_layout != DEXTOUCH_V1:
+                more["layout"] = content.tactile_layout
+            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit, **more)
             writer.append(name, values=values[keep], t_ref_ns=content.t_ref_ns[keep])
         for name, (span, stamps_ns) in content.cameras.items():
             add(name, kind="image", shape=span.shape, dtype="uint8", unit=images)

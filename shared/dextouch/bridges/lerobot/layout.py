@@ -113,18 +113,21 @@ def _video_feature(shape: Sequence[int], fps: int) -> Feature:
 
 
 def dataset_features(
-    cameras: Mapping[str, Sequence[int]], fps: int, *, has_measured: bool
+    cameras: Mapping[str, Sequence[int]],
+    fps: int,
+    *,
+    has_measured: bool,
+    num_taxels: int = NUM_TAXELS,
 ) -> Features:
-    """Every feature of an export, by name.
+    """Every feature of an export, by name, for cameras with images of shape [height, width, 3].
 
-    `cameras` holds the shape [height, width, 3] of each camera's images; with `has_measured`
-    actions are commanded ones, and measured ones are stored beside them.
+    With `has_measured` actions are commanded ones, and measured ones are stored beside them.
     """
     names = action_names()
     pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
     features = {IMAGES + name: _video_feature(shape, fps) for name, shape in cameras.items()}
     features[STATE] = pose
-    features[TACTILE] = _feature("float32", [2, NUM_TAXELS], ["hand", "taxel_kpa"])
+    features[TACTILE] = _feature("float32", [2, num_taxels], ["hand", "taxel_kpa"])
     features[ACTION] = pose
     if has_measured:
         features[MEASURED] = pose
@@ -142,11 +145,7 @@ def file_place(number: int) -> tuple[int, int]:
 
 
 def fill_path(template: str, **values: int | str) -> str:
-    """Substitute the fields of a path template; only plain fields are supported.
-
-    Raises:
-        InvalidInputError: a field that is not among `values`, or any other brace.
-    """
+    """Fill in the plain fields of a path template; raises InvalidInputError for any other brace."""
     with suppress(KeyError, ValueError):
         if _TEMPLATE.fullmatch(template):
             return template.format(**values)
@@ -165,11 +164,7 @@ def numbered_path(folder: Path, template: str, number: int, **values: str) -> Pa
 
 
 def confined(folder: Path, relative: str) -> Path:
-    """Resolve a path below `folder`, following links.
-
-    Raises:
-        CorruptDataError: it leads out of the folder.
-    """
+    """Resolve a path below `folder`, following links; raises CorruptDataError if it leads out."""
     root = folder.resolve()
     if "\0" in relative:
         raise CorruptDataError(f"{folder}: got a path with a zero byte")
@@ -185,7 +180,7 @@ class EpisodeFrames:
 
     `columns` [n, …] are those of `dataset_features`: STATE float32 [67] holds absolute
     measured poses and joints; ACTION and MEASURED float32 [67] are relative to the measured poses
-    of the episode's step 0; TACTILE float32 [2, 320] in kPa, VALID bool [2], STAMP int64 and
+    of the episode's step 0; TACTILE float32 [2, taxels] in kPa, VALID bool [2], STAMP int64 and
     IMAGE_DT int64 [cameras], the image's stamp minus the frame's, in ns.
     """
 
@@ -294,8 +289,8 @@ def _at(
 
 def _tactile(
     reader: EpisodeReader, t_ns: np.ndarray
-) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
-    kpa = np.zeros((len(t_ns), 2, NUM_TAXELS), dtype=np.float32)
+) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
+    kpa = np.zeros((len(t_ns), 2, reader.tactile_layout.num_taxels), dtype=np.float32)
     valid = np.zeros((len(t_ns), 2), dtype=bool)
     for hand, side in enumerate(SIDES):
         name = f"tactile_{side}"
@@ -307,11 +302,7 @@ def _tactile(
 
 
 def value_statistics(values: np.ndarray) -> Statistics:
-    """Of numbers [frame, ...]: everything but the last axis is pooled, as LeRobot does it.
-
-    Args:
-        values: at least one frame; finite.
-    """
+    """Of finite numbers [frame, ...]: all but the last axis is pooled, as LeRobot does it."""
     rows = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
     if values.ndim == 1:
         rows = np.asarray(values, dtype=np.float64)[:, None]

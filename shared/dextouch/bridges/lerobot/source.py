@@ -77,10 +77,8 @@ class EpisodeEntry:
 class LeRobotFolder:
     """A dataset on disk; only its metadata is read up front.
 
-    Raises:
-        NotFoundError: a file of the metadata is missing.
-        InvalidInputError: another version of the format.
-        CorruptDataError: metadata that is damaged or has paths that leave the folder.
+    Raises NotFoundError for a missing file of the metadata, InvalidInputError for another version
+    of the format, CorruptDataError for damaged metadata, or paths that leave the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -93,9 +91,7 @@ class LeRobotFolder:
     def columns(self, entry: EpisodeEntry, names: list[str]) -> dict[str, np.ndarray]:
         """Columns [n, *shape] of one episode by feature.
 
-        Raises:
-            NotFoundError: the data file is missing.
-            CorruptDataError: it does not hold the episode's frames in order.
+        Raises NotFoundError without the data file, CorruptDataError if that lacks frames in order.
         """
         path = self.data_file(entry)
         table = self._rows(path, entry)
@@ -116,10 +112,9 @@ class LeRobotFolder:
         return columns
 
     def sidecar(self, entry: EpisodeEntry) -> layout.Sidecar | None:
-        """An episode's sidecar; None where the dataset was not written by DexTouch.
+        """An episode's sidecar, None in a foreign dataset.
 
-        Raises:
-            CorruptDataError: an invalid sidecar file.
+        Raises CorruptDataError for an invalid file.
         """
         name = layout.SIDECAR_PATH.format(episode_index=entry.index)
         path = layout.confined(self.folder, name)
@@ -146,8 +141,7 @@ class LeRobotFolder:
     def span(self, entry: EpisodeEntry, key: str) -> VideoSpan:
         """File and time span of an episode's images of one camera.
 
-        Raises:
-            CorruptDataError: missing from the table of episodes.
+        Raises CorruptDataError if they are missing from the table of episodes.
         """
         if self.info.video_path is None:
             raise CorruptDataError(f"{self.folder}: has video features but no video_path")

@@ -60,10 +60,8 @@ class CameraVideo:
     def append(self, access_units: Sequence[bytes], *, where: str) -> VideoLocation:
         """Mux the access units of one episode, one per image, without B-frames.
 
-        Raises:
-            CorruptDataError: the first image is not an entry point.
-            ShapeError: images of another size.
-            StorageError: the write failed.
+        Raises CorruptDataError if the first image is no entry point, ShapeError for images of
+        another size, StorageError if the write failed.
         """
         parameters = parameter_sets(access_units[0]) if access_units else b""
         if not parameters:
@@ -132,9 +130,8 @@ class VideoSpan:
 def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Decode the images of a span one by one; any codec that PyAV's build supports.
 
-    Raises:
-        NotFoundError: no such file.
-        CorruptDataError: damaged, truncated, of another size, or without an image in its place.
+    Raises NotFoundError without the file, CorruptDataError if it is damaged, truncated, of another
+    size, or without an image in its place.
     """
     with _opened(span) as (container, stream):
         frames = ((frame.pts, frame) for frame in container.decode(stream))
@@ -152,10 +149,7 @@ def read_units(span: VideoSpan) -> list[bytes] | None:
 
     None where the video is not 4:2:0 H.264, begins in the middle of a GOP, or has B-frames: its
     packets come in the order of decoding, and `read_images` finds out whether an image is missing.
-
-    Raises:
-        NotFoundError: no such file.
-        CorruptDataError: damaged, truncated, of another size, or without an image in its place.
+    Raises as that.
     """
     units: list[bytes] = []
     with _opened(span) as (container, stream):
@@ -263,10 +257,9 @@ def _missing(span: VideoSpan, done: int, place: int) -> CorruptDataError:
 
 
 def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> list[bytes] | None:
-    """The stored access units of a camera, where they can be remuxed without encoding.
+    """The stored access units of a camera, where they can be remuxed without encoding, else None.
 
-    None where the stream is not H.264, images are skipped or repeated, or the first one cannot be
-    decoded without those before it.
+    They cannot where images are skipped or repeated, or the first one needs those before it.
     """
     consecutive = bool((np.diff(indices) == 1).all())
     if reader.streams[camera].unit != "h264" or not consecutive:

@@ -115,7 +115,6 @@ def _facts(folder: Path, place: str) -> Facts:
 
 
 def _named(name: str, place: str) -> tuple[str, str]:
-    """Kind and id from the name of a folder."""
     match = _AROUND[place].fullmatch(name) if place in _AROUND else None
     if match is None:
         return PLACES[place], name.removesuffix(".new")
@@ -177,8 +176,7 @@ class IdentifierSearch:
 class DeletionRequest:
     """Scope of a deletion: an operator or a recording, with all data derived from it.
 
-    Raises:
-        InvalidInputError: both or neither were given.
+    Raises InvalidInputError if both or neither were given.
     """
 
     operator: str | None = None
@@ -297,17 +295,9 @@ def plan_deletion(
 
 
 def _victim(facts: Facts, reason: str) -> Victim:
-    is_take = facts.kind == "recording"
-    return Victim(
-        kind=facts.kind,
-        id=facts.item_id,
-        place=facts.place,
-        folder=facts.folder.name,
-        sha256=facts.sha256,
-        reason=reason,
-        station=facts.station if is_take else None,
-        started=facts.started if is_take else "",
-    )
+    of_take = (facts.station, facts.started) if facts.kind == "recording" else (None, "")
+    identity = (facts.kind, facts.item_id, facts.place, facts.folder.name, facts.sha256)
+    return Victim(*identity, reason, *of_take)
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
@@ -315,14 +305,6 @@ def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
     if request.operator is None:
         return []
     return [facts for facts in all_facts(root) if facts.reviewer == request.operator]
-
-
-def _remove_reviewer(facts: Facts) -> None:
-    """Remove the reviewer's name from a review; the verdict stays."""
-    path = facts.folder / REVIEW_FILE
-    with disk_errors(f"remove the reviewer of {facts.item_id}"):
-        fields = json.loads(path.read_bytes())
-        replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
 
 
 def _reason(facts: Facts, request: DeletionRequest) -> str | None:
@@ -370,15 +352,9 @@ def delete_for_good(
     What the service of the store must refuse from now on is remembered before anything is removed.
 
     Uploads and stages locked by a writer are kept and listed as remaining: stop the writer and
-    repeat. Reviews that the operator wrote of other people's items lose their name. Checkpoints are
-    only searched.
-
-    Args:
-        root: of the store.
-        request: operator or recording.
-        receipt_path: new file outside the store.
-        checkpoints: folder with models that may have been trained on the deleted data.
-        unsent: delete an operator of whom the store holds nothing, but a station may.
+    repeat. Reviews that the operator wrote of other people's items lose their name. `checkpoints`,
+    whose models may have been trained on the deleted data, are only searched. With `unsent` an
+    operator is deleted of whom the store holds nothing, but a station may.
 
     Raises:
         NotFoundError: nothing in the store matches, and the operator reviewed nothing.
@@ -441,7 +417,7 @@ def _remove_all(
 ) -> list[Facts]:
     """Remove what a request covers until nothing more appears; returns the reviews without names.
 
-    `known` grows by what is found, and `remember` is called before anything is removed.
+    `known` grows, and `remember` is called before anything is removed.
     """
     reviewed = list[Facts]()
     for _ in range(_MAX_ROUNDS):
@@ -451,7 +427,11 @@ def _remove_all(
         remember()
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
-            _remove_reviewer(facts)
+            # The verdict stays.
+            path = facts.folder / REVIEW_FILE
+            with disk_errors(f"remove the reviewer of {facts.item_id}"):
+                fields = json.loads(path.read_bytes())
+                replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
             reviewed.append(facts)
         if not any(went):
             break
@@ -473,8 +453,8 @@ def _search(
 ) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Searched are all attributes files, the names of folders, and of checkpoints the headers of
-    safetensors and the JSON beside them.
+    Searched are attributes files, names of folders, and of checkpoints JSON and safetensors'
+    headers.
     """
     found, files = [], []
     facts = all_facts(root)

@@ -8,7 +8,6 @@ records a station has worked off, and which of their takes it could not remove y
 import hashlib
 import os
 import secrets
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,9 +34,9 @@ _SCRYPT_COST: Final = 2**14
 
 @dataclass(frozen=True)
 class TakeFacts:
-    """By what a take is recognised; `started` is `take_start` of it.
+    """By what a take is recognised; of a damaged one ids alone are known.
 
-    Of a damaged one the ids alone are known.
+    `started` is its `take_start`.
     """
 
     recording_id: str
@@ -68,10 +67,7 @@ class DeletedTake(FrozenModel):
 
 
 class DeletionRecord(FrozenModel):
-    """A deletion of an operator or of a recording.
-
-    `operator_digest` is None of a recording, and of an operator who may record again.
-    """
+    """A deletion; `operator_digest` is None of a recording, and of one who may record again."""
 
     record_version: Literal[1] = 1
     deleted_at: AwareDatetime
@@ -107,32 +103,15 @@ def take_start(started_at: datetime | str | None, started_t_host_ns: int | None)
 
 
 class DeletionRecords:
-    """The deletions that a store remembers, read anew whenever a file has changed. Thread-safe.
-
-    Args:
-        root: folder of the store.
-    """
+    """The deletions that a store remembers, read anew whenever a file has changed. Thread-safe."""
 
     def __init__(self, root: Path) -> None:
         self._folder = root / FOLDER
-        self._lock = threading.Lock()
-        self._files: dict[str, tuple[tuple[int, int, int], DeletionRecord]] = {}
         self._salt = b""
 
     def read(self) -> Mapping[str, DeletionRecord]:
-        """All records by key, oldest first.
-
-        Raises:
-            CorruptDataError: a damaged record.
-        """
-        with self._lock:
-            known, self._files = self._files, {}
-            for path, stamp in _stamps(self._folder / "records"):
-                before = known.get(path.stem)
-                is_same = before is not None and before[0] == stamp
-                record = before[1] if is_same and before else _read(path, DeletionRecord)
-                self._files[path.stem] = (stamp, record)
-            found = {key: record for key, (_, record) in self._files.items()}
+        """All records by key, oldest first; raises CorruptDataError for a damaged one."""
+        found = {path.stem: _record(path, at) for path, at in _stamps(self._folder / "records")}
         return dict(sorted(found.items(), key=lambda item: item[1].deleted_at))
 
     @property
@@ -211,9 +190,8 @@ class DeletionRecords:
     def confirm(self, station: str, *, revision: str, held: Mapping[str, Sequence[str]]) -> None:
         """Note that a station holds no covered takes any more, except those in `held` by record.
 
-        Raises:
-            ConflictError: there was a deletion after that of `revision`.
-            InvalidInputError: `held` names an unknown record.
+        Raises ConflictError after a deletion later than `revision`, InvalidInputError for an
+        unknown record in `held`.
         """
         records = self.read()
         if revision != self.revision:
@@ -297,6 +275,12 @@ def _read(path: Path, model: type[M]) -> M:
             f"deletions: {path} is damaged ({error}); restore it from a backup: without it takes "
             "of deleted operators could be uploaded again"
         ) from error
+
+
+# Many more than a store has deletions.
+@lru_cache(maxsize=4096)
+def _record(path: Path, _stamp: tuple[int, int, int]) -> DeletionRecord:
+    return _read(path, DeletionRecord)
 
 
 def _fingerprint(salt: bytes, take: TakeFacts) -> str:

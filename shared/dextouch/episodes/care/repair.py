@@ -56,7 +56,7 @@ UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
 # Called after every storage chunk with the number of bytes read.
 Progress = Callable[[int], None]
-WHOLE, MENDED, SALVAGED, LEFT = "whole", "mended", "salvaged", "left"
+WHOLE, REPAIRED, SALVAGED, LEFT = "whole", "repaired", "salvaged", "left"
 LOST = "lost_to_damage"
 
 
@@ -99,8 +99,7 @@ def inspect_group(
 ) -> ItemReport:
     """Read a committed group completely and list all damage.
 
-    Raises:
-        NotFoundError: there is no such group, or it was deleted meanwhile.
+    Raises NotFoundError if there is no such group, or it was deleted meanwhile.
     """
     try:
         contents = open_contents(files, kind)
@@ -236,9 +235,9 @@ def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
 class RepairReport:
     """Result of the repair of one item.
 
-    `action` is `whole` (nothing to do), `mended` (restored as it was before the damage), `salvaged`
-    (the readable samples are in `new_id`, the damaged group in the trash) or `left` (unchanged,
-    `notes` say why). `lost` counts the samples that a salvage dropped.
+    `action` is `whole` (nothing to do), `repaired` (restored as it was before the damage),
+    `salvaged` (the readable samples are in `new_id`, the damaged group in the trash) or `left`
+    (unchanged, `notes` say why). `lost` counts the samples that a salvage dropped.
     """
 
     kind: str
@@ -252,10 +251,9 @@ class RepairReport:
 def repair_group(
     root: Path, kind: Kind, item_id: str, *, copy: GroupFiles | None = None
 ) -> RepairReport:
-    """Repair a committed group from a copy of the same content, or salvage its readable samples.
+    """Repair a group from a copy of the same content, or salvage its readable samples.
 
-    Raises:
-        ConflictError: a copy of other content.
+    Raises ConflictError for a copy of other content.
     """
     files = LocalGroup(root / f"{kind}s" / item_id)
     findings = inspect_group(files, kind).findings
@@ -268,15 +266,15 @@ def repair_group(
         _repair_from(files, kind, copy)
     _rewrite_metadata(files, kind)
     if all(finding.foreign for finding in inspect_group(files, kind).findings):
-        return RepairReport(kind, item_id, MENDED, notes=notes)
+        return RepairReport(kind, item_id, REPAIRED, notes=notes)
     return _salvage(root, kind, files.folder, notes)
 
 
 def repair_uploads(root: Path) -> list[RepairReport]:
-    """Salvage damaged uploads.
+    """Salvage damaged uploads; intact ones are unchanged, since their station continues them.
 
-    Intact ones are unchanged, since their station continues them. The readable samples of damaged
-    ones become a recording `ID-salvaged-N`, so that the station can send everything again.
+    Their readable samples become a recording `ID-salvaged-N`: the station can send everything
+    again.
     """
     reports = []
     for spool in unheld_folders(root / UPLOADS):
@@ -313,13 +311,8 @@ def _write_salvaged(
 ) -> tuple[str, dict[str, int]]:
     """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
-    If an interrupted repair has done so already, its group is returned.
-
-    Returns:
-        The new id, and the number of dropped samples by stream.
-
-    Raises:
-        InvalidInputError: no sample is readable.
+    Returns its id, also if an interrupted repair wrote it, and the number of dropped samples by
+    stream. Raises InvalidInputError if no sample is readable.
     """
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     streams = on_one_grid(streams) if kind == "episode" else list(streams)
@@ -330,7 +323,8 @@ def _write_salvaged(
         with suppress(StorageError):
             if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
                 return folder.name, lost
-    free = _free_id(root, kind, item_id)
+    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    free = next(name for name in names if not (root / f"{kind}s" / name).exists())
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
     with EpisodeWriter(
@@ -351,12 +345,6 @@ def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, objec
         return {"quality": attributes.quality | figures}
     entries = (LedgerEntry(stream=name, event=LOST, count=count) for name, count in lost.items())
     return {"ledger": (*attributes.ledger, *entries)}
-
-
-def _free_id(root: Path, kind: Kind, item_id: str) -> str:
-    """The first id `ID-salvaged-1`, `ID-salvaged-2` … that is not in use."""
-    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
-    return next(name for name in names if not (root / f"{kind}s" / name).exists())
 
 
 def _rewrite_metadata(files: LocalGroup, kind: Kind) -> None:
@@ -410,7 +398,6 @@ def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
 
 
 def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[int | None]]:
-    """Damaged arrays with their damaged storage chunks; None for the whole array."""
     found: dict[str, frozenset[int | None]] = {}
     for finding in inspect_group(files, kind).findings:
         if finding.array is not None:
@@ -432,8 +419,7 @@ def _known(
 ) -> tuple[Attributes, Mapping[str, ArrayEntry], str | None]:
     """Trustworthy attributes, arrays and content hash of a damaged group.
 
-    Raises:
-        StorageError: another version, or attributes that are damaged.
+    Raises StorageError for another version, or damaged attributes.
     """
     what = f"{kind} {files.item_id}"
     record, group = _commit_of(files, kind), files.get(METADATA_FILE)

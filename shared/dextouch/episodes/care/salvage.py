@@ -44,10 +44,9 @@ Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SalvagedStream:
-    """The readable samples of one stream.
+    """The readable samples of one stream; `kept` is the mask of samples to keep.
 
-    `kept` is the mask of samples to keep; `read` returns values and stamps of the kept ones in a
-    range that starts and ends at multiples of `block`.
+    `read` gives those of a range that starts and ends at multiples of `block`.
     """
 
     descriptor: StreamDescriptor
@@ -136,19 +135,15 @@ def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
             [_holds(attributes.streams, row, body_at(data, row)) for row in rows], bool
         )
     mine = [rows["stream"] == number for number in range(len(attributes.streams))]
-    closed_with = _sealed_samples(spool)
+    seal = None
+    with suppress(FileNotFoundError, CorruptDataError):
+        seal = read_seal(spool)
+    # Samples by stream that it had when it was closed, as far as it says.
+    closed_with = {} if seal is None else seal.num_samples
     return [
         _spooled(spool, stream, rows[own], holds[own], closed_with.get(stream.name, 0))
         for stream, own in zip(attributes.streams, mine, strict=True)
     ]
-
-
-def _sealed_samples(spool: Path) -> dict[str, int]:
-    """Samples by stream that a spool had when it was closed, as far as it says."""
-    seal = None
-    with suppress(FileNotFoundError, CorruptDataError):
-        seal = read_seal(spool)
-    return {} if seal is None else seal.num_samples
 
 
 def _read_rows(

@@ -153,11 +153,7 @@ def read_mapping(path: Path) -> HandMapping:
 
 
 def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
-    """Load a hand from a URDF or MJCF file and a mapping file.
-
-    Args:
-        model_path: URDF (`robot`) or MJCF (`mujoco`), a single file; meshes are not read.
-        mapping_path: TOML: side, wrist and fingers (docs/hands.md).
+    """Load a hand from a URDF or MJCF file, without meshes, and a mapping file (docs/hands.md).
 
     Returns:
         The hand with joints in the mapping's order, the model's joint angles, and our wrist frame:

@@ -8,7 +8,8 @@ const { STATIC, CASES } = process.env;
 const { fitted, orbitCamera, project, turned, zoomed } = await import(`${STATIC}/projection.js`);
 const { readPoses, scene } = await import(`${STATIC}/poses.js`);
 const { PADS, padForces, statesOf, taxelName, trusted } = await import(`${STATIC}/taxels.js`);
-const { cameras, message, sides, pressures, forces, names } = JSON.parse(readFileSync(CASES, "utf8"));
+const { withLayout } = await import(`${STATIC}/layouts.js`);
+const { cameras, message, sides, pressures, forces, names, heatmap, layout, canvases, own_layout, own_canvases } = JSON.parse(readFileSync(CASES, "utf8"));
 
 const near = (got, expected, tolerance) => got.forEach((value, index) => assert.ok(Math.abs(value - expected[index]) < tolerance, `got ${got}, expected ${expected}`));
 
@@ -66,13 +67,15 @@ test("keypoints of the dashboard's message are where NumPy says", () => {
   hands[0].points_world.forEach((point, node) => near(point, sides.left[node], 1e-6));
 });
 
+const { pads } = heatmap;
+
 test("forces of the pads are those of dextouch.tactile", () => {
   assert.equal(PADS.length, 6);
-  near(padForces(Float32Array.from(pressures), 2), forces, 1e-4);
+  near(padForces(Float32Array.from(pressures), 2, pads), forces, 1e-4);
 });
 
 test("taxels are named by pad, row and column", () => {
-  for (const [taxel, pad, row, column] of names) assert.match(taxelName(taxel), new RegExp(`^${pad}( tip)?, row ${row}, column ${column}$`));
+  for (const [taxel, pad, row, column] of names) assert.match(taxelName(taxel, pads), new RegExp(`^${pad}( tip)?, row ${row}, column ${column}$`));
 });
 
 test("a taxel shows the gravest of its states, and unknown ones are left out", () => {
@@ -82,4 +85,26 @@ test("a taxel shows the gravest of its states, and unknown ones are left out", (
 test("taxels out of order count for no force, those with the gain of their pad do", () => {
   const states = statesOf({ saturated: [0], refused: [1] });
   assert.deepEqual([...trusted(Float32Array.of(1700, 20, 30), states)], [0, 20, 30]);
+});
+
+test("taxels of another glove are drawn where dextouch.tactile draws them", () => {
+  for (const [one, drawn] of [[layout, canvases], [own_layout, own_canvases]]) {
+    const { cells, rows, columns, raw_cells } = withLayout(heatmap, one);
+    for (const side of ["left", "right"]) {
+      const canvas = new Array(rows * columns).fill(-1);
+      cells[side].forEach((cell, taxel) => { canvas[cell] = taxel; });
+      assert.deepEqual(canvas, drawn[side]);
+      assert.deepEqual(raw_cells[side], one.raw_cells[side]);
+    }
+  }
+  assert.equal(withLayout(heatmap, null), heatmap);
+});
+
+test("taxels of another glove have its names and areas", () => {
+  const found = withLayout(heatmap, layout).pads;
+  assert.equal(taxelName(14, found), "thumb tip, row 3, column 5");
+  assert.equal(taxelName(75 + 9, found), "palm, row 2, column 1");
+  const touch = new Float32Array(138).fill(0);
+  touch[0] = touch[137] = 10;
+  near(padForces(touch, 2, found), [0.12, 0, 0, 0, 0, 0.8], 1e-6);
 });

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch.nn import functional
 
-from benchmarks.evaluator.measuring import sharpness
+from benchmarks.evaluator.playing import sharpness
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.schemas import CHUNK_STEPS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.evaluator.measuring import sharpness
+from benchmarks.evaluator.playing import sharpness
 from dextouch.errors import InvalidInputError
 from services.world_model.rendering.configuration import RendererTraining
 from services.world_model.rendering.network import RendererNetwork

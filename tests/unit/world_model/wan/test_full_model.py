@@ -4,19 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from dextouch.errors import InvalidInputError, LimitExceededError
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
-from services.world_model.pretrained_video import (
-    TRANSFORMER_RULES,
-    autoencoder_rules,
-    load_pretrained,
-    original_names,
-)
+from services.world_model.pretrained_video import load_pretrained
 from services.world_model.training.dataset import WindowPosition
 from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
 
@@ -59,23 +53,6 @@ def test_the_autoencoder_is_frozen_and_the_transformer_is_not(model):
     assert not any(p.requires_grad for p in model.codec.parameters())
     assert all(p.requires_grad for p in model.video.parameters())
     assert all(p.requires_grad for p in model.layers.parameters())
-
-
-def test_the_original_layout_gives_the_same_model(
-    tmp_path, full_config, model, transformer, autoencoder
-):
-    for network, rules, stem in (
-        (transformer, TRANSFORMER_RULES, "diffusion_pytorch_model"),
-        (autoencoder, autoencoder_rules(full_config.wan.vae_blocks), "Wan2.2_VAE"),
-    ):
-        tensors = network.state_dict()
-        names = original_names(tensors, rules)
-        save_file({names[n]: t for n, t in tensors.items()}, tmp_path / f"{stem}.safetensors")
-    torch.manual_seed(0)
-    other = JointWorldModel(full_config).eval()
-    load_pretrained(other, tmp_path)
-    there = other.state_dict()
-    assert all(torch.equal(there[n], t) for n, t in model.state_dict().items())
 
 
 @pytest.mark.long

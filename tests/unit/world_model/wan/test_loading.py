@@ -16,13 +16,7 @@ from dextouch.errors import (
 from services.networks import weight_files
 from services.world_model.network.configuration import WanConfig
 from services.world_model.network.video import empty_autoencoder, empty_transformer
-from services.world_model.pretrained_video import (
-    TRANSFORMER_RULES,
-    autoencoder_rules,
-    find_weights,
-    load_weights,
-    original_names,
-)
+from services.world_model.pretrained_video import load_weights
 
 STEM = "diffusion_pytorch_model"
 
@@ -35,40 +29,20 @@ def empty(wan_config):
     return empty_transformer(wan_config, **TINY)
 
 
-def _store(folder, network, rules=None):
-    tensors = network.state_dict()
-    if rules is not None:
-        names = original_names(tensors, rules)
-        tensors = {names[name]: tensor for name, tensor in tensors.items()}
+def _store(folder, network):
     folder.mkdir(exist_ok=True)
-    save_file(tensors, folder / f"{STEM}.safetensors")
+    save_file(network.state_dict(), folder / f"{STEM}.safetensors")
     return folder
 
 
 def _load(network, folder, **options):
-    load_weights(
-        network,
-        find_weights(folder, stem=STEM, where="video expert"),
-        TRANSFORMER_RULES,
-        where="video expert",
-        **options,
-    )
+    load_weights(network, folder, where="video expert", **options)
 
 
-@pytest.mark.parametrize("rules", [None, TRANSFORMER_RULES], ids=["diffusers", "original"])
-def test_both_layouts_load_strictly_without_a_random_start(tmp_path, transformer, empty, rules):
-    _load(empty, _store(tmp_path, transformer, rules))
+def test_weights_load_strictly_without_a_random_start(tmp_path, transformer, empty):
+    _load(empty, _store(tmp_path, transformer))
     loaded = empty.state_dict()
     assert all(torch.equal(loaded[n], t) for n, t in transformer.state_dict().items())
-
-
-def test_the_autoencoder_loads_from_its_original_names(tmp_path, autoencoder, wan_config):
-    rules = autoencoder_rules(wan_config.vae_blocks)
-    _store(tmp_path, autoencoder, rules)
-    empty = empty_autoencoder(wan_config)
-    load_weights(empty, find_weights(tmp_path, stem=STEM, where="vae"), rules, where="vae")
-    loaded = empty.state_dict()
-    assert all(torch.equal(loaded[n], t) for n, t in autoencoder.state_dict().items())
 
 
 def test_shards_written_by_diffusers_load(tmp_path, transformer, empty):
@@ -78,7 +52,7 @@ def test_shards_written_by_diffusers_load(tmp_path, transformer, empty):
     assert torch.equal(empty.proj_out.weight, transformer.proj_out.weight)
     next(iter(tmp_path.glob("*-00002-*"))).unlink()
     with pytest.raises(NotFoundError, match=r"1 of .* files are missing"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
 
 
 def test_weights_take_the_precision_of_the_network_but_norms_and_times_stay_float32(
@@ -131,24 +105,34 @@ def test_the_full_size_needs_ten_gigabytes():
     assert weight_files.memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
 
 
+def test_the_published_size_has_its_tensors_and_weights():
+    network = empty_transformer(WanConfig(), num_layers=30, num_heads=24, head_width=128)
+    tensors = network.state_dict()
+    assert len(tensors) == 825
+    assert sum(tensor.numel() for tensor in tensors.values()) == 4_999_787_712
+    coder = empty_autoencoder(WanConfig()).state_dict()
+    assert len(coder) == 196
+    assert sum(tensor.numel() for tensor in coder.values()) == 704_688_668
+
+
 def test_damaged_pickled_and_absent_files_are_told_apart(tmp_path, transformer, empty):
     with pytest.raises(NotFoundError, match="no folder"):
-        find_weights(tmp_path / "none", stem=STEM, where="video expert")
+        _load(empty, tmp_path / "none")
     with pytest.raises(NotFoundError, match=r"no diffusion_pytorch_model\*\.safetensors"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
     (tmp_path / "Wan2.2_VAE.pth").write_bytes(b"pickle")
     with pytest.raises(InvalidInputError, match="can run code"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
     (tmp_path / f"{STEM}.safetensors").write_bytes(b"\x00" * 64)
     with pytest.raises(CorruptDataError, match="not a safetensors file"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
     index = tmp_path / f"{STEM}.safetensors.index.json"
     index.write_text(json.dumps({"weight_map": {"a": "../elsewhere.safetensors"}}))
     with pytest.raises(CorruptDataError, match="outside its folder"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
     index.write_text("[]")
     with pytest.raises(CorruptDataError, match="unreadable"):
-        find_weights(tmp_path, stem=STEM, where="video expert")
+        _load(empty, tmp_path)
     index.unlink()
     broken = {name: tensor.clone() for name, tensor in transformer.state_dict().items()}
     broken["proj_out.bias"][3] = float("nan")

@@ -1,0 +1,335 @@
+"""Server of a bridge: sends the readings of one SDK to every station that connects.
+
+Nothing waits for a station: each connection has a queue that drops its oldest packets when it is
+full, and a thread that empties it.
+"""
+
+import contextlib
+import json
+import socket
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.clock import PeriodicCall, StationClock
+from services.acquisition.devices import finger_tracker, numbers, pose_tracker
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.sdk_link import RESTART_NS, BridgeHello
+from services.acquisition.sdk_bridges.source import Reading, Source
+
+MAGICS = {
+    "finger_tracker": finger_tracker.MAGIC,
+    "pose_tracker": pose_tracker.POSE_MAGIC,
+    "numbers": numbers.MAGIC,
+}
+# The station takes 200 ms of silence for a loss, and expects a sign of life every 50 ms.
+LIFE_PERIOD_NS = 40_000_000
+# Chosen: 0.5 s of one device at 1 kHz. What waits for longer than 0.2 s stations drop anyway.
+QUEUE_PACKETS = 512
+# Chosen: as many packets as a queue holds; the kernel would keep megabytes that become old.
+SEND_BYTES = 65536
+# Chosen: a station that takes nothing for so long hangs, and connects again when it does not.
+SEND_TIMEOUT_S = 2.0
+# Chosen: several stations and a test or two; each costs a thread.
+MAX_STATIONS = 8
+# Chosen: a tracker that is switched on again is back soon, and the SDK is not flooded.
+RETRY_S = 2.0
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class Summary:
+    """What a bridge did.
+
+    Attributes:
+        seconds: from its start to its end.
+        sent: readings of each device, also of those that had none.
+        restarts: how often the clock of each device went back by more than a second.
+        old: readings whose stamps did not advance, by device; they were not sent.
+        dropped: packets that a full queue lost, all stations together.
+        not_sent: readings that the source left out, by the reason.
+        delay_ms: smallest and mean time from stamp to sending; None where the stamps are on another
+            clock.
+    """
+
+    seconds: float = 0.0
+    sent: Counter[str] = field(default_factory=Counter)
+    restarts: Counter[str] = field(default_factory=Counter)
+    old: Counter[str] = field(default_factory=Counter)
+    dropped: int = 0
+    not_sent: dict[str, int] = field(default_factory=dict)
+    delay_ms: tuple[float, float] | None = None
+
+    def lines(self) -> list[str]:
+        """The summary as lines for people."""
+        lines = [
+            f"{device}: {count} samples sent, {count / max(self.seconds, 1e-9):.1f} Hz"
+            f"; {self.old[device]} old, {self.restarts[device]} restarts of the clock"
+            for device, count in sorted(self.sent.items())
+        ] or ["no samples"]
+        lines += [f"not sent: {count} {reason}" for reason, count in sorted(self.not_sent.items())]
+        if self.dropped:
+            lines.append(f"lost: {self.dropped} packets, because a station did not read in time")
+        if self.delay_ms is not None:
+            lines.append(
+                "from stamp to sending: {:.2f} ms at least, {:.2f} ms on average".format(
+                    *self.delay_ms
+                )
+            )
+        return lines
+
+    def as_json(self) -> dict[str, object]:
+        """The summary for `--json`."""
+        counts = {name: dict(getattr(self, name)) for name in ("sent", "restarts", "old")}
+        return {**vars(self), **counts}
+
+
+class StationLink:
+    """One station: a queue of packets and the thread that sends them."""
+
+    def __init__(self, link: socket.socket, hello: bytes) -> None:
+        self._link, self._hello = link, hello
+        self._packets: deque[bytes] = deque(maxlen=QUEUE_PACKETS)
+        self._has_some = threading.Event()
+        self.is_open = True
+        link.settimeout(SEND_TIMEOUT_S)
+        threading.Thread(target=self._run, name="bridge-station", daemon=True).start()
+
+    def put(self, packet: bytes) -> bool:
+        """Queue a packet; whether an older one had to go for it."""
+        is_full = len(self._packets) == QUEUE_PACKETS
+        self._packets.append(packet)
+        self._has_some.set()
+        return is_full
+
+    def close(self) -> None:
+        """End the connection."""
+        self.is_open = False
+        self._has_some.set()
+        with contextlib.suppress(OSError):  # it may be gone
+            self._link.shutdown(socket.SHUT_RDWR)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError), self._link:  # the station is gone, or hangs
+            self._link.sendall(self._hello)
+            while self.is_open:
+                self._has_some.wait()
+                self._has_some.clear()
+                waiting = []
+                with contextlib.suppress(IndexError):  # until it is empty
+                    while True:
+                        waiting.append(self._packets.popleft())
+                self._link.sendall(b"".join(waiting))
+        self.is_open = False
+
+
+def _clear_path(path: Path) -> None:
+    """Remove the socket that a killed bridge has left behind.
+
+    Raises:
+        InvalidInputError: a running bridge has it.
+    """
+    if not path.is_socket():
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+        try:
+            link.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+    raise InvalidInputError(f"{path}: another bridge listens here; choose another --path")
+
+
+class BridgeServer:
+    """Listens for stations and sends them packets and signs of life.
+
+    Args:
+        hello: of the source.
+        address: a host and port (0: any free one), or the path of a local socket.
+        clock: of this host.
+
+    Raises:
+        InvalidInputError: the address is in use or not one of this host.
+    """
+
+    def __init__(
+        self, hello: BridgeHello, address: tuple[str, int] | Path, *, clock: StationClock
+    ) -> None:
+        self.summary = Summary()
+        self._hello, self._clock = hello, clock
+        self._expect_devices()
+        self._path: Path | None = None
+        self._lock = threading.Lock()
+        self._stations: list[StationLink] = []
+        self._sequence = 0
+        self._last_ns: dict[str, int] = {}
+        self._sent_ns = 0
+        self._delays_ns = (0, 0, 0)
+        self._listener = self._listen(address)
+        self._life = PeriodicCall(
+            self._show_life, period_ns=LIFE_PERIOD_NS // 2, clock=clock, name="bridge-life"
+        )
+        self._life.start()
+        threading.Thread(target=self._accept, name="bridge-accept", daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        """Where stations connect, for people and, if it is a port, its number at the end."""
+        if self._path is not None:
+            return str(self._path)
+        host, port = self._listener.getsockname()[:2]
+        return f"{host}:{port}"
+
+    def announce(self, hello: BridgeHello) -> None:
+        """Say another hello: stations must connect again if the devices are others now."""
+        if hello != self._hello:
+            self._hello = hello
+            self._expect_devices()
+            with self._lock:
+                for station in self._stations:
+                    station.close()
+
+    def send(self, reading: Reading, *, has_station_time: bool) -> None:
+        """Send a reading to all stations, unless its stamp does not advance; never waits for one.
+
+        A stamp that goes back by more than a second is a clock that started anew.
+        """
+        device, t_ns = reading.device, reading.t_device_ns
+        # Packets have no negative times: such a stamp is from before the clock's start.
+        if t_ns < 0:
+            self.summary.old[device] += 1
+            return
+        last_ns = self._last_ns.get(device)
+        if last_ns is not None and t_ns <= last_ns:
+            if t_ns >= last_ns - RESTART_NS:
+                self.summary.old[device] += 1
+                return
+            self.summary.restarts[device] += 1
+        self._last_ns[device] = t_ns
+        self._put(reading.place, t_ns, reading.payload)
+        self.summary.sent[device] += 1
+        if has_station_time:
+            delay_ns, (count, least_ns, sum_ns) = self._sent_ns - t_ns, self._delays_ns
+            least_ns = min(delay_ns, least_ns) if count else delay_ns
+            self._delays_ns = (count + 1, least_ns, sum_ns + delay_ns)
+            self.summary.delay_ms = (least_ns / 1e6, (sum_ns + delay_ns) / (count + 1) / 1e6)
+
+    def close(self) -> None:
+        """End all connections and stop listening."""
+        self._life.stop()
+        with contextlib.suppress(OSError):  # the thread that accepts is woken by this alone
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        with self._lock:
+            for station in self._stations:
+                station.close()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def _expect_devices(self) -> None:
+        self.summary.sent.update({device.serial_number: 0 for device in self._hello.devices})
+
+    def _put(self, place: int, t_device_ns: int, payload: bytes) -> None:
+        with self._lock:
+            packet = Packet(VERSION, place, self._sequence, t_device_ns, payload)
+            data = encode_packet(MAGICS[self._hello.kind], packet)
+            self._sequence += 1
+            self._sent_ns = self._clock.now_ns()
+            self._stations = [station for station in self._stations if station.is_open]
+            self.summary.dropped += sum(station.put(data) for station in self._stations)
+
+    def _show_life(self) -> None:
+        if self._clock.now_ns() - self._sent_ns >= LIFE_PERIOD_NS:
+            self._put(SOURCES["none"], max(self._last_ns.values(), default=0), b"")
+
+    def _listen(self, address: tuple[str, int] | Path) -> socket.socket:
+        try:
+            if not isinstance(address, Path):
+                return socket.create_server(address, backlog=MAX_STATIONS)
+            _clear_path(address)
+            listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                listener.bind(str(address))
+                listener.listen(MAX_STATIONS)
+            except OSError:
+                listener.close()
+                raise
+        except OSError as error:
+            raise InvalidInputError(
+                f"cannot listen at {address}: {error}; choose another --port or --path"
+            ) from error
+        self._path = address
+        return listener
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                link, _ = self._listener.accept()
+                with self._lock:
+                    self._stations = [station for station in self._stations if station.is_open]
+                    if len(self._stations) == MAX_STATIONS:
+                        link.close()
+                        continue
+                    link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
+                    if self._path is None:
+                        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    line = json.dumps(self._hello.model_dump(mode="json", exclude_none=True))
+                    self._stations.append(StationLink(link, line.encode() + b"\n"))
+
+
+def run_bridge(
+    source: Source,
+    address: tuple[str, int] | Path,
+    *,
+    stop: threading.Event,
+    say: Say,
+    clock: StationClock | None = None,
+) -> Summary:
+    """Serve a source until `stop` is set, opening it again whenever it is lost.
+
+    It listens as soon as the source was opened once. While the source is away, stations get signs
+    of life and no samples.
+
+    Args:
+        source: the SDK.
+        address: where stations connect: host and port, or the path of a local socket.
+        stop: ends it.
+        say: shows a line to people.
+        clock: of this host.
+
+    Raises:
+        InvalidInputError: nothing can listen at the address.
+        UnavailableError: the SDK's library is not installed.
+    """
+    clock = clock or StationClock()
+    start_ns = clock.now_ns()
+    server: BridgeServer | None = None
+    try:
+        while not stop.is_set():
+            try:
+                hello = source.open()
+                if server is None:
+                    server = BridgeServer(hello, address, clock=clock)
+                server.announce(hello)
+                devices = ", ".join(f"{d.serial_number} ({d.source})" for d in hello.devices)
+                say(f"{hello.software}: serving {devices} at {server.address}")
+                say(f"clock: {source.clock}")
+                while not stop.is_set():
+                    for reading in source.read():
+                        server.send(reading, has_station_time=source.has_station_time)
+            except DeviceError as error:
+                say(f"{error.message}; trying again every {RETRY_S:.0f} s")
+                source.close()
+                stop.wait(RETRY_S)
+    finally:
+        source.close()
+        if server is not None:
+            server.close()
+    summary = Summary() if server is None else server.summary
+    summary.seconds = (clock.now_ns() - start_ns) / 1e9
+    summary.not_sent = dict(source.not_sent)
+    return summary
