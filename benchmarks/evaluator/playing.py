@@ -88,13 +88,13 @@ def play_in_twin(
     touch, sent = [started.observation.tactile_kpa], []
     poses, images = [stage_poses(twin, state)], []
     seen = started.observation
-    looks = _begin(policy, start)
+    uses_images = _begin(policy, start)
     for first in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, first, twin)
-        shows_end = looks == "last" or first + CHUNK_STEPS == NUM_STEPS
+        shows_end = uses_images == "last" or first + CHUNK_STEPS == NUM_STEPS
         head = CHUNK_STEPS - 4 if shows_end else CHUNK_STEPS
         # Images are slow, so only those that are used are rendered.
-        selector = ReturnSelector() if looks == "all" else _NO_IMAGES
+        selector = ReturnSelector() if uses_images == "all" else _NO_IMAGES
         step = twin.step(state, chunk[:head], seed=start.seed, selector=selector)
         parts = [step]
         if shows_end:
@@ -137,16 +137,16 @@ def play_in_imagination(
     started = world.reset(first)
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
-    looks = _begin(policy, start)
+    uses_images = _begin(policy, start)
     shown: list[Observation] = []
     for at in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, at, world)
-        if looks == "all" or at + CHUNK_STEPS == NUM_STEPS:
+        if uses_images == "all" or at + CHUNK_STEPS == NUM_STEPS:
             step = last = world.step(state, chunk, seed=start.seed + at)
         else:
             # A world is functional: two calls give touch of all steps and only the last image.
             step = last = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
-            if shows_chunks or looks == "last":
+            if shows_chunks or uses_images == "last":
                 last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
         if shows_chunks:
             images.append(last.observation.images[HEAD_CAMERA][-1])
@@ -172,8 +172,8 @@ def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last"
     if isinstance(policy, np.ndarray):
         return "no"
     ask(policy.reset, start, where="policy: reset")
-    looks = getattr(policy, "looks", True)
-    return "last" if looks == "last" else "all" if looks else "no"
+    uses_images = getattr(policy, "uses_images", True)
+    return "last" if uses_images == "last" else "all" if uses_images else "no"
 
 
 def _chunk(

@@ -255,11 +255,11 @@ class TakeFindings:
 
         They are warnings: whether a take is complete is judged by its own samples.
         """
-        told = {(problem.stream, problem.code) for problem in known}
+        known_codes = {(problem.stream, problem.code) for problem in known}
         found = []
         for entry in self.entries(streams):
             codes = IN_THE_CHECK.get(entry.event, (entry.event,))
-            if any((entry.stream, code) in told for code in codes):
+            if any((entry.stream, code) in known_codes for code in codes):
                 continue
             times = "once" if entry.count == 1 else f"{entry.count} times"
             text = f"{entry.event} found {times}. {CODES[entry.event].advice}"

@@ -119,9 +119,9 @@ def fit_combination(
     Raises:
         InvalidInputError: no endings, or arrays of different lengths.
     """
-    told, outcomes = _pair(probe, success)
+    of_probe, outcomes = _pair(probe, success)
     estimated, _ = _pair(world, success)
-    odds, weights = (np.stack([log_odds_of(told), log_odds_of(estimated)], axis=1), np.zeros(2))
+    odds, weights = (np.stack([log_odds_of(of_probe), log_odds_of(estimated)], axis=1), np.zeros(2))
     slopes, bias = _platt(odds, outcomes > 0.5)
     if min(slopes) > 0:
         weights[:] = slopes
@@ -130,10 +130,10 @@ def fit_combination(
         (slope,), bias = _platt(odds[:, better, None], outcomes > 0.5)
         weights[better] = max(slope, 0.0)
     fitted = Combination(probe_weight=weights[0], world_weight=weights[1], bias=bias, margin=margin)
-    agreed = ~fitted.contradictory(told, estimated)
+    agreed = ~fitted.contradictory(of_probe, estimated)
     if not agreed.any():
         return fitted.model_copy(update={"band": WHOLE_BAND})
-    joint = fitted.probabilities(told, estimated)[agreed]
+    joint = fitted.probabilities(of_probe, estimated)[agreed]
     for allowed in (risk, 2 * risk):
         band = undecided_band(joint, outcomes[agreed], risk=allowed, widest=WHOLE_BAND)
         if np.mean(np.abs(joint - 0.5) > band) >= LEAST_DECIDED:

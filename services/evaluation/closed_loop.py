@@ -256,8 +256,11 @@ class RolloutRunner:
                 answer = ask(actor.act, rollout.observation, where=acting)
                 chunk = action_chunk(answer, description, where=acting)[:left]
                 commanded.append(chunk)
-                looks, multiple = getattr(actor, "looks", True), description.chunk_multiple
-                for observation in self._step(rollout, chunk, left, looks=looks, multiple=multiple):
+                images = getattr(actor, "uses_images", True)
+                multiple = description.chunk_multiple
+                for observation in self._step(
+                    rollout, chunk, left, images=images, multiple=multiple
+                ):
                     seen.append(observation)
                     for name, value in reported_milestones(rollout.reported).items():
                         milestones[name] = max(value, milestones.get(name, 0.0))
@@ -272,19 +275,19 @@ class RolloutRunner:
         )
 
     def _step(
-        self, rollout: Rollout, chunk: np.ndarray, left: int, *, looks: bool | str, multiple: int
+        self, rollout: Rollout, chunk: np.ndarray, left: int, *, images: bool | str, multiple: int
     ) -> Iterator[Observation]:
         """Advance by a chunk; images, which take most of the time, only where they are needed.
 
-        `left` is the number of steps to the end of the rollout, including this chunk, `looks` the
-        attribute of the policy (`dextouch.clients.Policy`), `multiple` that of the world's chunks.
+        `left` is the number of steps to the end of the rollout, including this chunk, `images` the
+        policy's `uses_images` (`dextouch.clients.Policy`), `multiple` the world's chunk multiple.
         """
         cameras, is_last = self.worlds.cameras, len(chunk) == left
-        if self.shows_all or looks is True or (looks and is_last):
-            shown = ReturnSelector(cameras=cameras if looks else (HEAD_CAMERA,))
+        if self.shows_all or images is True or (images and is_last):
+            shown = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
             yield rollout.step(chunk, selector=shown, validated=True)
             return
-        if looks:
+        if images:
             newest = ReturnSelector(cameras=cameras, steps="last")
             yield rollout.step(chunk, selector=newest, validated=True)
             return

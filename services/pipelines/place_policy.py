@@ -216,7 +216,7 @@ class PlacePolicy:
     """
 
     # Images after the first one are of no use to it.
-    looks = False
+    uses_images = False
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata

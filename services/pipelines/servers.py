@@ -112,9 +112,9 @@ async def serve_all(
     for place, _ in placed:
         place.socket.close()
     for place, app in placed:
-        told = getattr(app.state, "start_error", None)
-        if told is not None:
-            raise UnavailableError(f"{place.name} did not start: {told.message}") from told
+        error = getattr(app.state, "start_error", None)
+        if error is not None:
+            raise UnavailableError(f"{place.name} did not start: {error.message}") from error
     failures = [error for task in tasks.values() if (error := task.exception()) is not None]
     if failures or (ended and not stop.is_set()):
         raise UnavailableError(

@@ -212,7 +212,7 @@ def test_the_region_of_an_object_by_hand():
 class LooksAtAll(ColourServo):
     """The same policy, to which worlds show every step."""
 
-    looks = True
+    uses_images = True
 
 
 def test_a_policy_that_looks_last_acts_as_if_it_saw_every_step():

@@ -161,11 +161,11 @@ def mock_glove(
     unit_seed = place.seed if place.unit_seed is None else place.unit_seed
     layout = place.stream.descriptor.layout
     glove = calibration or GloveCalibration.seeded(side, unit_seed, layout or DEXTOUCH_V1)
-    told: Side = worn_side or side
-    source = TactileGloveSource(place.stream, side=told, calibration=glove, faults=place.faults)
+    worn: Side = worn_side or side
+    source = TactileGloveSource(place.stream, side=worn, calibration=glove, faults=place.faults)
     # The device is made of its port, and tells its time to what answers there.
     answers = GloveAnswers(
-        told, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
+        worn, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
     )
     port = PtyPort(name, answer=answers.answer)
     device = MockDevice(place, source, port)

@@ -89,7 +89,7 @@ class PoseEstimate:
         return float(np.sqrt(np.diag(self.covariance)[3:].sum()))
 
     @property
-    def doubt(self) -> str:
+    def excessive_sigma(self) -> str:
         """Sigmas beside their limits if the pose is too uncertain to be used; else empty."""
         sigma_rad, sigma_m = self.sigma_rotation_rad, self.sigma_translation_m
         if sigma_rad <= MAX_SIGMA_ROTATION_RAD and sigma_m <= MAX_SIGMA_TRANSLATION_M:

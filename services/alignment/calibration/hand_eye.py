@@ -212,7 +212,7 @@ def solve_hand_eye(
         board_scale=bundle.scale,
         sigma_board_scale=float(np.sqrt(bundle.covariance[12, 12])),
     )
-    if not result.doubt:
+    if not result.excessive_sigma:
         return result
     # In the tracker's axes, as the operator turns the tracker.
     turned = adjoint(result.T_tracker_camera)
@@ -221,7 +221,7 @@ def solve_hand_eye(
     axis = AXIS_NAMES[int(np.argmax(np.abs(worst)))]
     others = [name for name in AXIS_NAMES if name != axis]
     raise DegenerateMotionError(
-        f"{TASK}: the uncertainty of the mount is {result.doubt}; the "
+        f"{TASK}: the uncertainty of the mount is {result.excessive_sigma}; the "
         f"rotation about the tracker's {axis} axis is least certain: rotate it more about "
         f"{' and '.join(others)}, take more views, and move the board closer",
         missing_axes=others,
@@ -359,11 +359,11 @@ def solve_robot_base(
         T_world_base=bundle.Z,
         T_effector_tracker=invert(bundle.X),
     )
-    if result.doubt:
+    if result.excessive_sigma:
         raise DegenerateMotionError(
-            f"{BASE_TASK}: the uncertainty of the base is {result.doubt}; turn the effector by 30 "
-            "degrees and more about all its axes, take more pairs over more of the workspace, and "
-            "hold the robot still for each",
+            f"{BASE_TASK}: the uncertainty of the base is {result.excessive_sigma}; turn the "
+            "effector by 30 degrees and more about all its axes, take more pairs over more of the "
+            "workspace, and hold the robot still for each",
             missing_axes=list(AXIS_NAMES),
         )
     return result
@@ -378,11 +378,11 @@ def _check_places(Ts_base_effector: np.ndarray) -> None:
         return
     is_seen = spread_m[0] >= MIN_SECOND_SPREAD_M
     names = missing_axes(axes[1:] if is_seen else axes)
-    told = "/".join(f"{value * 1e3:.0f}" for value in spread_m)
+    spread_mm = "/".join(f"{value * 1e3:.0f}" for value in spread_m)
     raise DegenerateMotionError(
-        f"{BASE_TASK}: places of the effector spread {told} mm along three directions, expected "
-        f"the second at least {MIN_SECOND_SPREAD_M * 1e3:.0f}; also move the effector by 20 cm and "
-        f"more along the base's {' and '.join(names)} axis",
+        f"{BASE_TASK}: places of the effector spread {spread_mm} mm along three directions, "
+        f"expected the second at least {MIN_SECOND_SPREAD_M * 1e3:.0f}; also move the effector by "
+        f"20 cm and more along the base's {' and '.join(names)} axis",
         spread_m=[float(value) for value in spread_m],
         missing_axes=names,
     )

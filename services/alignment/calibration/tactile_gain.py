@@ -165,11 +165,12 @@ def calibrate_glove(
     counted = found.num_by_state()
     num_taxels = tare.layout.num_taxels
     if 1 - counted.get("ok", 0) / num_taxels > MAX_FAULTY:
-        told = ", ".join(f"{number} {name}" for name, number in counted.items())
+        states = ", ".join(f"{number} {name}" for name, number in counted.items())
         raise InvalidInputError(
-            f"glove {tare.side}: of {num_taxels} taxels {told}; expected at most {MAX_FAULTY:.0%} "
-            "not ok. Unproven: press them too. Imprecise: press harder, at least 5 kPa. Saturated: "
-            "press less. Nonlinear: let each press settle. Dead or stuck: repair the glove",
+            f"glove {tare.side}: of {num_taxels} taxels {states}; expected at most "
+            f"{MAX_FAULTY:.0%} not ok. Unproven: press them too. Imprecise: press harder, at least "
+            "5 kPa. Saturated: press less. Nonlinear: let each press settle. Dead or stuck: repair "
+            "the glove",
             num_by_state=counted,
         )
     return found
@@ -330,16 +331,19 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
     used = points.used[:-1] & good & (gain > 0)
     highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
     has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
-    told = used.any(axis=1)
-    if not told.any():
+    is_informative = used.any(axis=1)
+    if not is_informative.any():
         return np.zeros(len(gain))
-    P = points.pressure_kpa[:-1][told, 0]
+    P = points.pressure_kpa[:-1][is_informative, 0]
     response_kpa = (points.counts[:-1] - points.counts[-1]) / np.where(gain > 0, gain, 1.0)
     seen_kpa = np.array(
-        [np.median(r[u]) for r, u in zip(response_kpa[told], used[told], strict=True)]
+        [
+            np.median(r[u])
+            for r, u in zip(response_kpa[is_informative], used[is_informative], strict=True)
+        ]
     )
-    sigma_kpa = np.maximum(points.sigma_kpa[:-1][told, 0], MIN_PRESSURE_SIGMA * P)
-    time = np.flatnonzero(told) / max(len(told) - 1, 1)
+    sigma_kpa = np.maximum(points.sigma_kpa[:-1][is_informative, 0], MIN_PRESSURE_SIGMA * P)
+    time = np.flatnonzero(is_informative) / max(len(is_informative) - 1, 1)
     # What each does to gains: a bend by its RMS about the line, a drift by its half, an offset by
     # what it is of the highest pressure.
     trends = {
@@ -394,9 +398,9 @@ def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
     response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
     usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
     least = np.array(usual)[:, None]
-    told = used & (least >= MIN_MOVE_COUNTS)
-    silent = told & (np.abs(response) < SILENT_RATIO * least)
-    return told.any(axis=0) & (silent == told).all(axis=0)
+    is_informative = used & (least >= MIN_MOVE_COUNTS)
+    silent = is_informative & (np.abs(response) < SILENT_RATIO * least)
+    return is_informative.any(axis=0) & (silent == is_informative).all(axis=0)
 
 
 def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

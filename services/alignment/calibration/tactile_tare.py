@@ -206,9 +206,9 @@ def classify_taxels(
             block = np.asarray(take[start : start + BLOCK], dtype=np.float64)
             moved = np.abs(tare.select(block) - zero)
             around = _least_neighbour(moved, tare.layout)
-            told = around >= needed
-            evidence += told.sum(axis=0)
-            silent += (told & (moved < SILENT_RATIO * around)).sum(axis=0)
+            is_informative = around >= needed
+            evidence += is_informative.sum(axis=0)
+            silent += (is_informative & (moved < SILENT_RATIO * around)).sum(axis=0)
             moves += (moved >= needed).sum(axis=0)
     is_silent = (evidence >= MIN_EVIDENCE) & (silent >= MIN_SILENT * evidence)
     is_silent &= moves < MIN_OWN_MOVES

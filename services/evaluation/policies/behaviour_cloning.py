@@ -289,13 +289,13 @@ class BehaviourCloningPolicy:
     """Sends the next 16 actions, given the newest image, touch and pose.
 
     The only state between `reset` calls is the rollout's first image and anchor. Of an observation
-    it needs the last step only (`looks`).
+    it needs the last step only (`uses_images`).
 
     Raises:
         InvalidInputError: the weights do not match the shape in the metadata.
     """
 
-    looks = "last"
+    uses_images = "last"
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata

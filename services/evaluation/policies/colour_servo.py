@@ -136,7 +136,7 @@ class ColourServo:
     touch after hooking or closing goes up and stops.
     """
 
-    looks = "last"
+    uses_images = "last"
     tasks = tuple(_PLANS)
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ class ReplayPolicy:
             measured poses of step 0.
     """
 
-    looks = False
+    uses_images = False
 
     def __init__(self, actions: Mapping[tuple[str, int], np.ndarray]) -> None:
         self._actions = {
@@ -81,7 +81,7 @@ class ReplayPolicy:
 class HoldPolicy:
     """The weakest baseline: keeps the pose of the first observation."""
 
-    looks = False
+    uses_images = False
 
     def __init__(self) -> None:
         self._pose: np.ndarray | None = None

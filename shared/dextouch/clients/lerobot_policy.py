@@ -48,7 +48,7 @@ class LeRobotPolicy:
     ShapeError for actions of another width.
     """
 
-    looks = "last"
+    uses_images = "last"
 
     def __init__(self, path: str, *, chunk_steps: int = 16) -> None:
         from lerobot.configs.policies import PreTrainedConfig

@@ -37,7 +37,7 @@ class OpenPiPolicy:
         UnavailableError: the server does not answer.
     """
 
-    looks = "last"
+    uses_images = "last"
 
     def __init__(
         self,

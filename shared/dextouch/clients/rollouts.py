@@ -252,9 +252,9 @@ class PolicyStart:
 class Policy(Protocol):
     """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
 
-    A policy with an attribute `looks` that is False gets no images after the first step, so that
-    worlds need not render them. With `looks = "last"` it may get nothing but the last step of each
-    chunk. `tasks` names those it supports; `python -m benchmarks evaluator` skips all others.
+    A policy whose attribute `uses_images` is False gets no images after the first step, so that
+    worlds need not render them. With `uses_images = "last"` it may get nothing but the last step of
+    each chunk. `tasks` names those it supports; `python -m benchmarks evaluator` skips all others.
     """
 
     def reset(self, start: PolicyStart) -> None:

@@ -196,7 +196,7 @@ def test_policies_that_do_not_look_are_good_and_bad_ones():
     assert list(policies) == [
         "script 0 mm", "script 30 mm", "tilt 0.5", "hold", "retreat", "another scene's actions",
     ]  # fmt: skip
-    assert not any(policy.looks for policy in policies.values())
+    assert not any(policy.uses_images for policy in policies.values())
     seed, task = plan.seeds[0], "stand_bottle"
     start = PolicyStart(task, "", seed, anchor(), np.eye(3))
     now = observation(seed=0)

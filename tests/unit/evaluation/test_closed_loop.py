@@ -205,7 +205,7 @@ def test_rubric_scores_by_reported_and_by_probable_milestones(client, policies, 
 class SeesAll(BehaviourCloningPolicy):
     """The same policy, to which worlds show every step."""
 
-    looks = True
+    uses_images = True
 
 
 def test_a_policy_that_looks_last_scores_as_if_it_saw_every_step(client, probe, policy_checkpoint):
@@ -342,7 +342,7 @@ def test_worlds_that_do_not_fit_are_refused_before_the_first_rollout(
 class Watching(HoldPolicy):
     """Notes what it is shown."""
 
-    looks = True
+    uses_images = True
 
     def __init__(self, chunk_steps):
         super().__init__()
@@ -376,7 +376,7 @@ def test_cameras_are_those_that_every_world_has(client, probe):
 class NotLooking(Watching):
     """The same, without eyes."""
 
-    looks = False
+    uses_images = False
 
 
 @pytest.mark.parametrize("chunk_steps", [12, 16])
