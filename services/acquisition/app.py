@@ -20,7 +20,12 @@ from services.acquisition.health.metrics import HealthCollector, RecorderCollect
 from services.acquisition.memory import keep_for_life
 from services.acquisition.practice import PRACTICE_PATH, Practice
 from services.acquisition.recorder import Recorder
-from services.acquisition.retention import DeletedTakes, OperatorNames
+from services.acquisition.retention import (
+    DeletedTakes,
+    OperatorNames,
+    remove_take,
+    spooled_takes,
+)
 from services.acquisition.routes import live_router, recorder_router, station_router, uploads_router
 from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
@@ -45,7 +50,10 @@ def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
 
 
 def practice_app(settings: AcquisitionSettings) -> FastAPI:
-    """A mock station to practise calibration with; its takes are not uploaded."""
+    """A mock station to practise calibration with.
+
+    Its takes are not uploaded, so that those of the last time are removed.
+    """
     from services.acquisition.mock_station import MockStation
     from services.acquisition.mocks import pattern
     from services.acquisition.mocks.faults import FaultScript
@@ -54,7 +62,8 @@ def practice_app(settings: AcquisitionSettings) -> FastAPI:
     practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
     with disk_errors(f"make the spool {spool}"):
         spool.mkdir(parents=True, exist_ok=True)
-    recover_spool(spool)
+    for take in spooled_takes(spool):
+        remove_take(take)
     mock = MockStation(
         pattern.practice_streams(settings.seed, layout=_mock_layout(settings)),
         FaultScript(devices=pattern.PRACTICE_FAULTS),

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import Matrix
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import TAXEL_UNIT, StreamDescriptor
 
 # In the calibration's map, of a taxel that no cell measures.
 NO_CELL = -1
@@ -39,13 +39,16 @@ def mapped_cells(
 ) -> Int64[np.ndarray, " taxels"] | None:
     """For each taxel the number of its cell, -1 for none; None where no map (1 x taxels) is known.
 
-    The map of the calibration comes before that of the stream's layout.
+    The map of the calibration comes before that of the stream's layout; a stream that is already in
+    kPa has its taxels in order.
 
     Raises:
         NotFoundError: the map is of another size.
         InvalidInputError: it names a cell that the glove has not.
     """
     num_cells, name = math.prod(descriptor.shape), f"{descriptor.name}_cells"
+    if descriptor.layout is not None and descriptor.unit == TAXEL_UNIT:
+        return np.arange(num_cells)
     if name not in calibration:
         layout, side = descriptor.layout, descriptor.side
         return None if layout is None or side is None else layout.raw_indices(side)
@@ -71,6 +74,8 @@ def glove_record(
     """
     names = [f"{descriptor.name}_{what}" for what in ("tare_counts", "gain_counts_per_kpa")]
     if descriptor.kind != "tactile" or names[0] not in calibration:
+        return None
+    if descriptor.layout is not None and descriptor.unit == TAXEL_UNIT:
         return None
     layout = descriptor.tactile_layout
     kpa_per_unit = None if descriptor.layout is None else layout.nominal_kpa_per_unit

@@ -117,7 +117,7 @@ def find_rules() -> Path:
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine that is checked, and how it is asked; `ports` are those of `dextouch up`."""
+    """The machine that is checked, and the functions that read it; `ports` are of `dextouch up`."""
 
     root: Path = Path("/")
     may_open: Callable[[Path], bool] = may_open

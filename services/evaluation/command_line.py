@@ -155,7 +155,10 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         UnknownNameError: arguments for a policy that was not requested.
     """
     policies = load_policies(
-        settings.policy, settings.policy_arguments, [*settings.scripts, *settings.builtin]
+        settings.policy,
+        settings.policy_arguments,
+        [*settings.scripts, *settings.builtin],
+        other_option="--scripts NAME=STORE",
     )
     for name, url in settings.scripts.items():
         found = select_episodes(

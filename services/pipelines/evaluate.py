@@ -163,6 +163,8 @@ def _policies(options: argparse.Namespace) -> dict[str, Policy]:
     """
     held = ["hold"] if options.hold else []
     others = [REPLAY, *(name for name, _ in options.cloned), *held]
-    policies = load_policies(options.policy, options.policy_arguments, others)
+    policies = load_policies(
+        options.policy, options.policy_arguments, others, other_option="--cloned NAME=CHECKPOINT"
+    )
     policies |= {name: trained_policy(path) for name, path in options.cloned}
     return policies | {name: HoldPolicy() for name in held}

@@ -44,7 +44,7 @@ from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PLAYED_KINDS, ReplayStream
 from services.acquisition.path_latency import add_latencies
 from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
-from services.alignment.calibration.tactile_tare import measure_tare
+from services.alignment.calibration.tactile_tare import measure_tare, reading_step
 from services.alignment.retargeting import warm_up
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.episode_builder import build_episode
@@ -156,8 +156,8 @@ def measure_gloves(
         if not isinstance(clock, VirtualClock):
             found = _path_delays(station, [f"tactile_{side}" for side in gloves])
     for side, glove in gloves.items():
-        rest, *pressed = _parts(take, side)
         layout = glove.descriptor.tactile_layout
+        rest, *pressed = (part / reading_step(layout) for part in _parts(take, side))
         tare = measure_tare(rest, side=side, layout=layout)
         everywhere = np.ones(layout.num_taxels, dtype=np.bool_)
         presses = [
@@ -204,7 +204,7 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
 
 
 def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
-    """Counts of the rest and of every press."""
+    """Readings of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)
     # By the number of the sample: when it came depends on the machine's other work.

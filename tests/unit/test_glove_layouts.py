@@ -17,7 +17,8 @@ from services.acquisition.clock import StationClock
 from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
 from services.acquisition.devices.kinds import build_drivers, device_kind
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
-from services.acquisition.glove_record import glove_record
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder
+from services.acquisition.glove_record import glove_record, mapped_cells
 from services.acquisition.health.cells import cell_judge
 from services.acquisition.health.station import needed_matrices
 from services.acquisition.mocks.gloves import (
@@ -232,6 +233,29 @@ def test_the_settings_of_a_glove_name_its_layout(tmp_path):
         "tactile_left_tare_counts",
         "tactile_left_gain_counts_per_kpa",
     ]
+
+
+def test_a_wuji_glove_takes_only_layouts_of_what_it_sends():
+    plain = small_layout(unit="full_scale", full_scale=1.0).model_dump() | {"num_raw_cells": 768}
+    layout = TactileLayout.model_validate(plain | {"kpa_per_unit": 50.0})
+    decoder = WujiGloveDecoder("left", layout=layout)
+    assert decoder.descriptors[0].unit == "full_scale"
+    # Half of full scale is 25 kPa.
+    record = {"tactile_left_tare_counts": ((0.0,) * 768,)}
+    glove = TactileCalibration.from_record(record, "left", layout=layout)
+    np.testing.assert_allclose(glove.to_kpa(np.full((1, 768), 0.5)), 25.0)
+    for wrong in ({"unit": "kPa", "kpa_per_unit": None}, {"full_scale": 50.0}):
+        other = TactileLayout.model_validate(layout.model_dump() | wrong)
+        with pytest.raises(InvalidInputError, match=r"expected 'full_scale' and 1, .*kpa_per_unit"):
+            WujiGloveDecoder("left", layout=other)
+
+
+def test_taxels_in_kpa_are_in_order_and_need_no_record():
+    descriptor = played(small_layout(), np.zeros((1, 138))).descriptor
+    assert needed_matrices([descriptor]) == []
+    np.testing.assert_array_equal(mapped_cells(descriptor, {}), range(138))
+    # A tare of raw cells, such as that of the glove itself, says nothing of them.
+    assert glove_record(descriptor, {"tactile_left_tare_counts": ((0.0,) * 150,)}) is None
 
 
 @pytest.mark.parametrize("unit", ["N", "mbar"])

@@ -8,7 +8,7 @@ import fastcrc
 import numpy as np
 from jaxtyping import Float32
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
@@ -26,6 +26,9 @@ MARK = b"\xaa\x55"
 PACKET_BYTES = 3088
 GRID = (24, 32)
 NUM_CELLS = GRID[0] * GRID[1]
+# Unit and largest value of the cells.
+UNIT = "full_scale"
+FULL_SCALE = 1.0
 # mark, length of the whole packet, hand, three bytes that say nothing
 HEAD = struct.Struct("<2sHB3x")
 # after the cells: sequence, milliseconds since the device started
@@ -100,19 +103,19 @@ class WujiGloveDecoder(StreamDecoder[WujiPacket]):
     maps them to the taxels of `dextouch_v1`.
     """
 
-    cells = CellLayout(1.0, GRID)
+    cells = CellLayout(FULL_SCALE, GRID)
 
     def __init__(
         self, side: Side, *, label: str | None = None, layout: TactileLayout | None = None
     ) -> None:
         if layout is not None:
-            check_raw_cells(layout, NUM_CELLS, device=f"glove_{side}")
+            _check_layout(layout, device=f"glove_{side}")
         descriptor = glove_stream(
             side,
             label,
             shape=(NUM_CELLS,),
             dtype="float32",
-            unit="full_scale",
+            unit=UNIT,
             layout=layout,
             nominal_rate_hz=NOMINAL_RATE_HZ,
             capabilities=ClockCapabilities(
@@ -136,6 +139,21 @@ class WujiGloveDecoder(StreamDecoder[WujiPacket]):
                 event="wrong_side",
             )
         return Sample(t_host_ns, packet.cells, packet.time_ms * TICK_NS, packet.sequence)
+
+
+def _check_layout(layout: TactileLayout, *, device: str) -> None:
+    """Check that a layout has the cells, unit and full scale of what the glove sends.
+
+    Raises:
+        InvalidInputError: it has others, by which conversion would make wrong pressures.
+    """
+    check_raw_cells(layout, NUM_CELLS, device=device)
+    if (layout.unit, layout.full_scale) != (UNIT, FULL_SCALE):
+        raise InvalidInputError(
+            f"{device}: got layout {layout.name!r} with unit {layout.unit!r} and full_scale "
+            f"{layout.full_scale:g}, expected {UNIT!r} and {FULL_SCALE:g}, since this glove sends "
+            "shares 0 … 1 of full scale; the pressure at full scale goes to kpa_per_unit"
+        )
 
 
 def crc16(data: bytes) -> int:

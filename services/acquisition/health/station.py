@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.schemas import Matrix
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import TAXEL_UNIT, StreamDescriptor
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.glove_record import is_ours
 from services.acquisition.health.evaluation import (
@@ -163,7 +163,8 @@ def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:
         if descriptor.name == "camera_head":
             needed.append("K_head")
         has_layout = descriptor.layout is not None
-        if descriptor.kind == "tactile" and (descriptor.unit == "counts" or has_layout):
+        is_raw = descriptor.unit != TAXEL_UNIT
+        if descriptor.kind == "tactile" and is_raw and (descriptor.unit == "counts" or has_layout):
             needed.append(f"{descriptor.name}_tare_counts")
             if not (has_layout and descriptor.tactile_layout.nominal_kpa_per_unit is not None):
                 needed.append(f"{descriptor.name}_gain_counts_per_kpa")

@@ -7,7 +7,7 @@ nothing around it moved it stays `unproven`.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
@@ -255,7 +255,7 @@ def _restless(
     return (shift > allowed) | (level.clipped > MAX_CLIPPED)
 
 
-@cache
+@lru_cache(maxsize=8)
 def _neighbours(layout: TactileLayout) -> Int64[np.ndarray, "taxels 8"]:
     """Taxels around each taxel on its own pad, anatomical order; −1 where there is none."""
     tables, first = [], 0

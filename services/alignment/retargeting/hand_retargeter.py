@@ -160,8 +160,8 @@ def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
     """
     low, high = INDEX_PROXIMAL_RANGE_M
     if not low <= index_proximal_m <= high:
-        looks = low * 1e3 <= index_proximal_m <= high * 1e3
-        hint = "these look like millimetres" if looks else "check nodes"
+        is_in_mm = low * 1e3 <= index_proximal_m <= high * 1e3
+        hint = "these look like millimetres" if is_in_mm else "check nodes"
         raise InvalidInputError(
             f"{where}: the index finger's proximal bone measures {index_proximal_m:.4g}, expected "
             f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.NODES",

@@ -117,9 +117,11 @@ def _judge(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Finding:
 def _where_from(name: str) -> str:
     """Advice for a matrix of unknown age, which may not come from this command."""
     if name.endswith("_latency_ns"):
+        # Gloves do not show how they turn, but when they are tapped.
+        command = "latency" if name.startswith(("tactile_", "keypoints_")) else "time"
         return (
             "measured by the station where the device answers time requests, a camera's is its "
-            "settings' latency_ms; else: dextouch station calibrate time"
+            f"settings' latency_ms; else: dextouch station calibrate {command}"
         )
     if name.startswith("T_tracker_") and "_wrist_" in name:
         return "not of this command: measure where the wrist sits on its tracker"

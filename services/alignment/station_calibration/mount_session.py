@@ -181,7 +181,9 @@ class MountSession:
             self._folder.rename(self._folder.with_name(name))
 
     def _why_not(self, sighting: Sighting, view: BoardView | None) -> str:
-        T = sighting.T_after
+        T, is_full = sighting.T_after, len(self.views) >= MAX_PLACES
+        # Otherwise the next drop would be followed by a place that nobody wants any more.
+        self._wants_place = self._wants_place and not is_full
         # The first that applies.
         reasons = (
             (not sighting.image, "the camera sends no image"),
@@ -191,11 +193,11 @@ class MountSession:
             ),
             (T is None, "the tracker is not seen"),
             (not self.is_still, "moving, or blurred: hold still"),
-            (self._wants_place, ""),
             (
-                len(self.views) >= MAX_PLACES,
+                is_full,
                 f"{MAX_PLACES} places are kept: drop some, or write the mount as it is",
             ),
+            (self._wants_place, ""),
             (self._is_kept(T), "this place is kept: go on to the next one"),
         )
         return next((words for applies, words in reasons if applies), "")
@@ -231,9 +233,9 @@ class MountSession:
     def _read(self, board: str) -> None:
         """Read the places of an ended session, or begin one."""
         path = self._folder / BOARD_FILE
-        if path.is_file() and (begun := path.read_text(encoding="utf-8")) != board:
+        if path.is_file() and (kept_board := path.read_text(encoding="utf-8")) != board:
             raise InvalidInputError(
-                f"hand-eye: the kept places are of the board {begun!r}, got {board!r}; enter "
+                f"hand-eye: the kept places are of the board {kept_board!r}, got {board!r}; enter "
                 "that board, or begin anew"
             )
         with disk_errors(f"write {path}"):

@@ -81,10 +81,16 @@ KINDS: Final = (
         "",
     ),
     (
+        r"((?:tactile|keypoints)_[a-z0-9_]+)_latency_ns",
+        "Latency of {0}",
+        "Record ten taps on a hard table, then: {command} latency --stream {0} --reference TRACKER "
+        "--take TAKE {to}",
+        "",
+    ),
+    (
         r"([a-z0-9_]+)_latency_ns",
         "Latency of {0}",
-        "Turn trackers and cameras together for ten seconds; gloves: tap a table, then: {command} "
-        "latency --stream {0} --reference STREAM --take TAKE {to}",
+        "Turn all trackers and cameras together for ten seconds.",
         "time",
     ),
     (
@@ -236,7 +242,7 @@ def overview(place: StationLocation) -> CalibrationOverview:
     known = {finding.name: finding for finding in judge(matrices)}
     details = _details(place.folder)
     wanted = _wanted(streams)
-    if not any(name.endswith("_latency_ns") for name in known) and _can_turn(streams):
+    if not any(map(_is_path_delay, known)) and _can_turn(streams):
         wanted.append(PATH_DELAYS)
     names = [*wanted, *(name for name in known if name not in wanted)]
     items = [_item(name, known.get(name), details, place) for name in names]
@@ -249,6 +255,12 @@ def overview(place: StationLocation) -> CalibrationOverview:
         practice=place.practice,
         note=note,
     )
+
+
+def _is_path_delay(name: str) -> bool:
+    """Whether this is what a shake measures; delays of gloves are not."""
+    stream = name.removesuffix("_latency_ns")
+    return stream != name and (stream in TRACKERS or stream.startswith("camera_"))
 
 
 def _can_turn(streams: Sequence[str]) -> bool:

@@ -1,4 +1,4 @@
-"""What a guided calibration run is asked for and says of itself: bodies of its routes."""
+"""Bodies of the routes of guided calibration runs: their requests, answers and state."""
 
 from typing import Literal
 

@@ -194,10 +194,18 @@ class GuidedRun:
 
         Raises:
             ConflictError: it asks nothing.
+            InvalidInputError: a text that is none of the answers to this question.
         """
         with self._lock:
-            if self._status.state != "asking":
-                raise ConflictError(f"calibration run: {self._status.state}, it asks nothing")
+            asked = self._status
+            if asked.state != "asking":
+                raise ConflictError(f"calibration run: {asked.state}, it asks nothing")
+            known = ("", *(choice.answer for choice in asked.choices))
+            if not asked.takes_text and text not in known:
+                raise InvalidInputError(
+                    f"calibration run: got the answer {text!r}, expected one of {list(known)}; an "
+                    f"empty one starts {asked.action!r}"
+                )
             self._set(state="running", **_NO_QUESTION)
             self._answers.put(text)
         return self._status
@@ -282,6 +290,7 @@ class GuidedRun:
             task,
             spool=self._place.spool,
             store=self._place.store_url,
+            is_practice=self._place.practice == "on",
             wait=self._wait,
             announce=partial(self._count_down, "Recording"),
         )

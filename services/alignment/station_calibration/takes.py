@@ -1,4 +1,4 @@
-"""Records takes for calibrations at a running station, and what their operators are asked."""
+"""Recorder of calibration takes at a running station, and questions to its operator."""
 
 import json
 import time
@@ -20,7 +20,7 @@ Request = Callable[..., Reply]
 
 
 class Question(NamedTuple):
-    """What an operator is asked, and how it can be answered.
+    """Question to an operator, and how it can be answered.
 
     Attributes:
         text: the question, or what to do before the answer.
@@ -53,22 +53,24 @@ class TakeRecorder:
         task: of the takes.
         spool: folder in which the station keeps its takes, if it is on this machine.
         store: store that the takes are uploaded to.
+        is_practice: whether the devices are those to practise with, whose takes are not uploaded.
         wait: sleeps.
         announce: called with the duration of a take (s) when it begins.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all but two by name
         self,
         request: Request,
         task: str,
         *,
         spool: Path,
         store: str | None,
+        is_practice: bool = False,
         wait: Callable[[float], None] = time.sleep,
         announce: Callable[[float], None] = lambda _: None,
     ) -> None:
         self._request, self._task = request, task
-        self._spool, self._store = spool, store
+        self._spool, self._store, self._is_practice = spool, store, is_practice
         self._wait, self._announce = wait, announce
 
     def record(
@@ -114,6 +116,12 @@ class TakeRecorder:
 
     def _await_upload(self, name: str) -> str:
         """Wait for the upload and return the take's id in the store."""
+        if self._is_practice:
+            raise NotFoundError(
+                f"take {name!r}: not in {self._spool.resolve()}, and takes of practice devices are "
+                "not uploaded; run the alignment service on the station's machine, with "
+                "--station-spool of the station's own spool (DEXTOUCH_ALIGNMENT_STATION_SPOOL)"
+            )
         if self._store is None:
             raise NotFoundError(
                 f"take {name!r}: not in {self._spool.resolve()}; name the station's spool "

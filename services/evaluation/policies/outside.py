@@ -168,11 +168,15 @@ class PolicySource:
 
 
 def load_policies(
-    addresses: Sequence[str], arguments: Mapping[str, Mapping[str, Any]], others: Sequence[str]
+    addresses: Sequence[str],
+    arguments: Mapping[str, Mapping[str, Any]],
+    others: Sequence[str],
+    *,
+    other_option: str,
 ) -> dict[str, Policy]:
     """Custom policies by name, with the arguments of their factories by name.
 
-    `others` are the names of all policies beside them.
+    `others` are the names of all policies beside them, which `other_option` gives.
 
     Raises:
         InvalidInputError: two policies of one name, or one that does not load.
@@ -182,11 +186,10 @@ def load_policies(
     names = [source.name for source in sources]
     if unknown := sorted(set(arguments) - set(names)):
         raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
-    names += others
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise InvalidInputError(
-            f"policies: {repeated[0]!r} is given twice; rename one, --policy NAME=MODULE:FACTORY"
-        )
+    given = [*names, *others]
+    if repeated := sorted({name for name in given if given.count(name) > 1}):
+        option = "--policy NAME=MODULE:FACTORY" if repeated[0] in names else other_option
+        raise InvalidInputError(f"policies: {repeated[0]!r} is given twice; rename one, {option}")
     return {source.name: source.load(arguments.get(source.name, {})) for source in sources}
 
 

@@ -4,7 +4,6 @@ FastAPI documents parameters, models and successful responses. The rest follows 
 `RequireScope` the security scheme, `takes` the request body, method and parameters the refusals.
 """
 
-import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from functools import partial
@@ -54,7 +53,6 @@ from dextouch.serving.logs import hide_secrets, masked
 from dextouch.serving.refusals import REFUSED, RefusalLog, WrongKeys
 from dextouch.serving.served_folder import ServedFolder
 from dextouch.serving.settings import ServiceSettings
-from dextouch.serving.spans import SPANS
 
 logger = structlog.get_logger(__name__)
 
@@ -153,7 +151,6 @@ def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Life
             app.state.running = True
             yield
             app.state.running = False
-        await asyncio.to_thread(SPANS.close)
 
     return around
 

@@ -139,5 +139,5 @@ def serve(
     check_address(service, settings)
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
     SPANS.configure(service)
-    run(create_app(settings), settings)
+    run(SPANS.close_with(create_app(settings)), settings)
     return 0

@@ -4,14 +4,16 @@ Configured means that OTEL_EXPORTER_OTLP_ENDPOINT (or …_TRACES_ENDPOINT) is se
 extra `tracing`. Without either, this module imports nothing.
 """
 
+import asyncio
 import os
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 import structlog
+from fastapi import FastAPI
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
@@ -52,6 +54,19 @@ class Spans:
         provider = sdk.TracerProvider(resource=resource, shutdown_on_exit=False)
         provider.add_span_processor(export.BatchSpanProcessor(otlp.OTLPSpanExporter()))
         self.provider, self.tracer = provider, provider.get_tracer("dextouch")
+
+    def close_with(self, app: FastAPI) -> FastAPI:
+        """Close when this application of the process has ended; others below it share the spans."""
+        lifespan = app.router.lifespan_context
+
+        @asynccontextmanager
+        async def around(app: FastAPI) -> AsyncIterator[None]:
+            async with lifespan(app):
+                yield
+            await asyncio.to_thread(self.close)
+
+        app.router.lifespan_context = around
+        return app
 
     def close(self) -> None:
         """Export the spans that wait; gives up after FLUSH_S, since the collector may be gone."""

@@ -135,4 +135,5 @@ def create_serving_app(
     """The application of one of several processes, which computes a first chunk in each world."""
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
     SPANS.configure(name)
-    return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
+    app = create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
+    return SPANS.close_with(app)

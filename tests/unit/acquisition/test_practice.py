@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from services.acquisition import app as station_app
 from services.acquisition.mocks import pattern
+from services.acquisition.retention import spooled_takes
 from services.acquisition.settings import AcquisitionSettings
 
 HEADS = {"head"}
@@ -46,7 +47,17 @@ async def test_practice_devices_are_there_while_they_are_on(settings, tmp_path):
         reply = await client.post("/practice/v1/recorder/arm", json=armed)
         assert reply.json()["state"] == "armed"
         assert (await client.get("/v1/recorder")).json()["state"] == "idle"
-        assert (tmp_path / "spool_practice").is_dir()
+        named = {"recording_id": "rest"}
+        for action in ("record", "stop", "save"):
+            body = named | ({"accept_incomplete": True} if action == "save" else {})
+            reply = await client.post(f"/practice/v1/recorder/{action}", json=body)
+            assert reply.status_code == 200, reply.text
+        spool = tmp_path / "spool_practice"
+        assert spooled_takes(spool) == [spool / "rest"]
+        assert (await client.post("/v1/practice/stop")).json() == {"state": "off"}
+        # Takes of the time before are not uploaded, and would stay for ever.
+        await client.post("/v1/practice/start")
+        assert spooled_takes(spool) == []
         assert (await client.post("/v1/practice/stop")).json() == {"state": "off"}
         assert (await client.get("/practice/v1/health")).status_code == 404
 

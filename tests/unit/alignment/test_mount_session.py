@@ -8,6 +8,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from services.acquisition.mocks import pattern
+from services.alignment.station_calibration import mount_session
 from services.alignment.station_calibration.mount_session import (
     MountSession,
     Sighting,
@@ -104,6 +105,20 @@ def test_a_place_is_taken_by_order_and_the_last_one_is_dropped(options, images):
     session.drop()
     assert session.num_kept == num_kept_places(options.photos) == 0
     assert list(options.photos.glob("*.jpg")) == []
+
+
+def test_no_more_places_are_taken_than_the_session_keeps(options, images, monkeypatch):
+    monkeypatch.setattr(mount_session, "MAX_PLACES", 1)
+    session = MountSession(options)
+    show(session, images[0], 0)
+    session.take()
+    show(session, images[1], 1)
+    assert (session.num_kept, session.hint[:16]) == (1, "1 places are kep")
+    # The order is not kept for later.
+    session.drop()
+    show(session, images[1], 1)
+    show(session, images[1], 1)
+    assert session.num_kept == 1
 
 
 def test_an_ended_session_goes_on_with_its_places_or_puts_them_aside(options, images):

@@ -9,11 +9,13 @@ import pytest
 
 from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from services.alignment.station_calibration.judgement import judge
 from services.alignment.station_calibration.record import write_entry
 from services.alignment.station_calibration.routes import overview
 from services.alignment.station_calibration.runs import CalibrationRuns, RunRequest, StationLocation
 
 GLOVE = RunRequest(kind="glove", subject="left")
+SHAKEN = ("head", "wrist_left", "camera_head", "tactile_left", "keypoints_left")
 STREAMS = ("head", "tactile_left", "camera_head", "keypoints_left")
 
 
@@ -95,6 +97,14 @@ def test_one_run_at_a_time_and_none_writes_when_it_is_ended(runs, place):
     until(runs, "asking")
 
 
+def test_a_text_is_refused_where_the_question_takes_none(runs):
+    runs.start(GLOVE)
+    until(runs, "asking")
+    with pytest.raises(InvalidInputError, match="got the answer 'drop', expected one of"):
+        runs.present().answer("drop")
+    assert runs.status().state == "asking"
+
+
 @pytest.mark.parametrize(
     ("request_", "error", "why"),
     [
@@ -154,6 +164,33 @@ def test_what_is_there_is_judged_and_what_the_devices_need_is_missing(place):
     assert mount.run == RunRequest(kind="mount", subject="head")
     assert mount.num_kept_places == 0
     assert not overview(place).is_simulated
+
+
+def test_a_delay_of_a_glove_is_measured_by_taps_and_does_not_stand_for_others(place, monkeypatch):
+    monkeypatch.setattr("tests.unit.alignment.test_station_calibration.STREAMS", SHAKEN)
+
+    def items(*streams):
+        for stream in streams:
+            write_entry(place.folder, f"{stream}_latency", {f"{stream}_latency_ns": 1e6}, {})
+        return {item.name: item for item in overview(place).items}
+
+    known = items("tactile_left", "keypoints_left")
+    assert known["path_delays"].run == RunRequest(kind="time", subject="all")
+    for name in ("tactile_left_latency_ns", "keypoints_left_latency_ns"):
+        assert known[name].run is None
+        assert "station calibrate latency --stream" in known[name].step
+    known = items("camera_head")
+    assert "path_delays" not in known
+    assert known["camera_head_latency_ns"].run == RunRequest(kind="time", subject="all")
+
+
+@pytest.mark.parametrize(
+    ("stream", "command"),
+    [("tactile_left", "latency"), ("keypoints_right", "latency"), ("head", "time")],
+)
+def test_the_advice_for_a_delay_of_unknown_age_names_the_command_that_measures_it(stream, command):
+    (finding,) = judge({f"{stream}_latency_ns": ((1e6,),)})
+    assert finding.reasons[0].endswith(f"dextouch station calibrate {command}")
 
 
 def test_what_is_older_than_a_week_is_due(place):

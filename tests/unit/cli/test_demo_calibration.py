@@ -6,6 +6,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt
+from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.gloves import GloveCalibration
@@ -14,6 +15,7 @@ from services.alignment.settings import AlignmentOptions
 from services.pipelines import demo_takes as recording
 from services.pipelines import mock_takes
 from tests.unit.bridges.takes import write_episode
+from tests.unit.other_gloves import small_layout
 
 pytestmark = pytest.mark.long
 
@@ -38,6 +40,18 @@ def test_tare_and_gain_are_close_to_the_gloves_own_but_measured(measured, side):
     # The pressures were known to 1 %, and are the same for all taxels.
     assert 0 < abs(errors.mean()) <= 3 * mock_takes.PRESSURE_SIGMA
     assert errors.std() <= 0.002
+
+
+def test_a_glove_of_another_unit_is_measured_in_it(tmp_path):
+    # Of this full scale the smallest step is half a digit.
+    layout = small_layout(unit="digits", full_scale=65535 / 2)
+    streams = pattern_streams(1.0, layout=layout)
+    found = mock_takes.measure_gloves(streams, tmp_path, seed=SEED, clock=VirtualClock())
+    truth, wired = GloveCalibration.seeded("left", SEED, layout), list(layout.raw_cells.left)
+    (tare,) = np.array(found["tactile_left_tare_counts"])
+    assert np.abs(tare - truth.tare_counts)[wired].max() <= 0.5
+    (gain,) = np.array(found["tactile_left_gain_counts_per_kpa"])
+    np.testing.assert_allclose(gain[wired], truth.gain_counts_per_kpa[wired], rtol=0.03)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

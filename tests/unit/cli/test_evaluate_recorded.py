@@ -27,6 +27,14 @@ def test_two_policies_of_one_name_are_refused(name):
         policies("--policy", f"{name}={HOLD}", "--hold", "--policy", f"{name}={HOLD}")
 
 
+@pytest.mark.parametrize(
+    "words", [["--cloned", "a=x", "--cloned", "a=y"], ["--cloned", "hold=x", "--hold"]]
+)
+def test_two_cloned_policies_of_one_name_are_renamed_by_their_own_option(words):
+    with pytest.raises(InvalidInputError, match="rename one, --cloned NAME=CHECKPOINT"):
+        policies(*words)
+
+
 def test_arguments_of_an_unknown_policy_are_refused():
     with pytest.raises(UnknownNameError, match="yours"):
         policies("--policy", f"mine={HOLD}", "--policy-arguments", '{"yours": {}}')

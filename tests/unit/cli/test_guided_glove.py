@@ -253,6 +253,15 @@ def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
     assert bench.sent[-1] == "GET /v1/uploads"
 
 
+def test_takes_of_practice_devices_on_another_machine_are_not_waited_for(bench, tmp_path):
+    there = TakeRecorder(
+        bench.request, "t", spool=tmp_path, store="s", is_practice=True, wait=bench.wait
+    )
+    with pytest.raises(NotFoundError, match="practice devices are not uploaded; run the alignment"):
+        there.record("a", "words", 0.1, str)
+    assert "GET /v1/uploads" not in bench.sent
+
+
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
     given, ask = options(tmp_path), operator(bench, [])[0]
     leads = glove.Guide(given, recorder(bench, given), ask=ask)
