@@ -124,8 +124,8 @@ class WatchedStation:
             cause, advice = ("no answer", "") if overview else self._failure
             return Tile(name=self.name, cause=cause, advice=advice, hours_today=self._hours_today)
         fresh = [camera for camera in overview.cameras if camera.age_s <= self._timeout_s]
-        # Of what they share, the station's name alone is the dashboard's.
-        shown = overview.model_dump(include=Tile.model_fields.keys() - {"name"})
+        # The name is the dashboard's own for the station; layouts would be dumped as text.
+        shown = overview.model_dump(include=Tile.model_fields.keys() - {"name", "layouts"})
         return Tile(
             **shown,
             name=self.name,

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+from pydantic import Field
 from pydantic_core import to_json
 
 from dextouch import schemas
 from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.streams import unpack
+from dextouch.tactile import LayoutDescription
 from services.dashboard.feeds import Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings
 
@@ -35,6 +37,9 @@ class WorldView(FrozenModel):
     tasks: tuple[str, ...]
     model_rate_hz: float
     predicts_touch: bool
+    tactile_layout: LayoutDescription | None = Field(
+        default=None, exclude_if=lambda one: one is None
+    )
 
 
 class ListedRollout(schemas.WatchedRollout):
@@ -111,7 +116,7 @@ class RolloutFeeds:
                 reason = f"no answer from {upstream.address}; is the service running?"
             return RolloutsView(problems=(f"{service}: {reason}",))
         worlds = {world.name: world for world in described.worlds}
-        shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch")
+        shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch", "tactile_layout")
         return RolloutsView(
             worlds=tuple(
                 WorldView(service=service, **{name: getattr(world, name) for name in shown})

@@ -194,7 +194,7 @@ def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
                     names = _view(await websocket.receive_text())
-                    found = [(name, find(name)) for name in names for find in known]
+                    found = [(name, _topic(name, known)) for name in names]
                     wanted = {name: topic for name, topic in found if topic is not None}
                     for name in senders.keys() - wanted.keys():
                         senders.pop(name).cancel()
@@ -208,6 +208,11 @@ def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
             await asyncio.gather(*tasks, return_exceptions=True)
 
     return router
+
+
+def _topic(name: str, finders: Sequence[TopicFinder]) -> Topic | None:
+    """The first topic of a name that a finder knows."""
+    return next((topic for find in finders if (topic := find(name)) is not None), None)
 
 
 async def _send(websocket: WebSocket, topic: Topic, sessions: Sessions) -> None:

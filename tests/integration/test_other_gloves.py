@@ -45,8 +45,8 @@ def recorded(store, gloves, layout, tmp_path):
         take = station.run_take(PROMPT, recording_id="take")
         overview = station_overview(station.station).model_dump(mode="json")
     # What the dashboard draws live hands by.
-    told = json.loads(layout.model_dump_json())
-    assert overview["layouts"] == {"left": told, "right": told}
+    text = layout.model_dump_json()
+    assert overview["layouts"] == {"left": text, "right": text}
     spool = SpoolReader(take.spool_path)
     attributes = spool.attributes.model_copy(update={"streams": ()})
     with store.writer(kind="recording", attributes=attributes) as writer:

@@ -44,3 +44,28 @@ def small_layout(*, unit="N", full_scale=4.0, range_kpa=50.0, seed=3):
         range_kpa=range_kpa,
         nominal_rate_hz=50,
     )
+
+
+def largest_layout():
+    """A palm of 64 × 64 = 4096 taxels, as many as a layout may have, wired at random."""
+    rng = np.random.default_rng(4)
+    order = {side: tuple(rng.permutation(4096).tolist()) for side in ("left", "right")}
+    pad = TactilePad(
+        part="palm",
+        rows=64,
+        columns=64,
+        pitch_m=(0.001, 0.001),
+        taxel_area_m2=1e-6,
+        origin=(0, 0),
+    )
+    return TactileLayout(
+        name="largest",
+        pads=(pad,),
+        num_raw_cells=4096,
+        raw_cells=RawCells(**order),
+        canvas=(64, 64),
+        unit="kPa",
+        full_scale=100.0,
+        range_kpa=100.0,
+        nominal_rate_hz=50,
+    )

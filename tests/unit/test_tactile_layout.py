@@ -8,6 +8,7 @@ from dextouch.streams import StreamDescriptor
 from dextouch.tactile import layout
 from services.acquisition.mocks.gloves import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream
+from tests.unit.other_gloves import small_layout
 
 
 @pytest.mark.parametrize("side", layout.SIDES)
@@ -145,3 +146,17 @@ def test_hand_canvas_holds_every_taxel_once_and_mirrors():
     rgb = layout.colour(right)
     assert rgb.shape == (28, 26, 3)
     assert (rgb[np.isnan(right)] == rgb[0, 0]).all()
+
+
+@pytest.mark.parametrize("shape", [(), (16,), (15, 15), (2, 16, 15)])
+def test_pads_of_other_shapes_are_not_joined(shape):
+    with pytest.raises(ShapeError, match=r"palm: got shape .*, expected \[\.\.\., 15, 16\]"):
+        layout.join_pads(np.zeros((5, 4, 4)), np.zeros(shape))
+
+
+@pytest.mark.parametrize("unit", ["N", "kPa"])
+def test_facts_of_a_layout_cannot_be_changed(unit):
+    glove = small_layout(unit=unit)
+    for fact in (layout.taxel_areas_m2(), glove.areas_m2, glove.nominal_kpa_per_unit):
+        with pytest.raises(ValueError, match="read-only"):
+            fact[0] = 1.0

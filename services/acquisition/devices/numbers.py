@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
-from dextouch.tactile.layout import Side
+from dextouch.tactile.layout import NUM_TAXELS, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import (
     DeviceKind,
@@ -104,6 +104,13 @@ class NumbersSettings(TrackerSettings):
             raise ValueError(f"shape: got {self.shape}, expected 1 … {MAX_CHANNELS} numbers")
         if self.stream.startswith("camera_"):
             raise ValueError(f"stream: got {self.stream!r}, expected another name: cameras give it")
+        is_touch = (self.stream_kind, self.unit) == ("tactile", "kPa")
+        if is_touch and self.shape != (NUM_TAXELS,):
+            raise ValueError(
+                f"shape: got {self.shape} of a tactile stream in kPa, expected ({NUM_TAXELS},), "
+                "the taxels of dextouch_v1; record another glove in its own unit as a `scalar`, "
+                "or with a driver that takes a `layout`"
+            )
         is_pose = (self.shape, self.unit) == (POSE_SHAPE, POSE_UNIT)
         if is_pose is not (self.stream_kind == "pose") or (is_pose and self.frame is None):
             raise ValueError(

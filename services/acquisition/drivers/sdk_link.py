@@ -29,6 +29,8 @@ RESTART_NS = 1_000_000_000
 MAX_DRIFT_PPM = 200
 # Chosen: a packet of 8 KiB, as many numbers as a large tactile array has cells.
 MAX_CHANNELS = 1024
+# Letters of the name of a bridge's software; chosen: a name, a version and a path.
+MAX_SOFTWARE = 256
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Why packets of a tracker become no sample.
@@ -83,7 +85,7 @@ class BridgeHello(FrozenModel):
     protocol: Literal["dextouch-bridge"]
     version: int
     kind: BridgeKind
-    software: str = Field(max_length=256)
+    software: str = Field(max_length=MAX_SOFTWARE)
     devices: tuple[BridgedDevice, ...] = Field(min_length=1)
     frame: FrameConvention
     length_unit: Literal["m", "cm", "mm"]

@@ -27,11 +27,11 @@ def build_source(options: argparse.Namespace) -> Source:
     """The source that a command line names.
 
     Raises:
-        InvalidInputError: no device or outlet is named.
+        InvalidInputError: no device or outlet is named, or a device twice.
     """
     name = options.source
     if name in {"openvr", "libsurvive"}:
-        devices = dict(options.devices)
+        devices = _placed(options.devices)
         if not devices and not options.list:
             raise InvalidInputError(
                 "no device is named: give --device SERIAL=PLACE, such as --device "
@@ -51,6 +51,21 @@ def build_source(options: argparse.Namespace) -> Source:
     if name == "manus":
         return ManusGloves(sides, library=options.library or MANUS)
     return OpenXrHands(sides, library=options.library or OPENXR)
+
+
+def _placed(devices: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Places of devices by their serial numbers."""
+    serials = [serial for serial, _ in devices]
+    # Any number of devices may have no place.
+    places = [place for _, place in devices if place != "none"]
+    for what, names in (("device", serials), ("place", places)):
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise InvalidInputError(
+                f"--device: got the {what} {', '.join(repeated)} more than once, expected each "
+                "once; give every device its own place, or `none`"
+            )
+    return dict(devices)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -22,6 +22,7 @@ from services.acquisition.sdk_bridges.source import (
     Source,
     hello,
     load_library,
+    placed_devices,
     pose_reading,
 )
 
@@ -93,16 +94,11 @@ class LibsurviveTrackers(Source):
         arguments: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._devices = {
-            name: BridgedDevice.model_validate(
-                {"index": index, "serial_number": name, "source": source}
-            )
-            for index, (name, source) in enumerate(devices.items())
-        }
+        self._devices = placed_devices(devices)
         self._path, self._arguments = library, ("dextouch", *arguments)
         self._library: ctypes.CDLL | None = None
         self._context: int | None = None
-        # By libsurvive's pointer; None of objects that nobody asked for.
+        # By libsurvive's pointer; None of objects that are not served.
         self._found: dict[int, BridgedDevice | None] = {}
 
     def open(self) -> BridgeHello:

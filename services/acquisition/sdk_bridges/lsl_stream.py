@@ -15,7 +15,7 @@ from typing import Any
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES
-from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgedDevice, BridgeHello
+from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgeHello
 from services.acquisition.sdk_bridges.source import (
     OUR_AXES,
     Reading,
@@ -94,7 +94,7 @@ class LslStream(Source):
         return hello(
             kind="numbers",
             software=f"liblsl {lsl.library_version()}, outlet {info.name()} at {info.hostname()}",
-            devices=(BridgedDevice(index=0, serial_number=self._value, source="none"),),
+            devices=({"index": 0, "serial_number": self._value, "source": "none"},),
             frame=OUR_AXES,
             channels=num_channels,
         )

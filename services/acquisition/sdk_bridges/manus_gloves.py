@@ -171,7 +171,7 @@ class ManusGloves(Source):
 
     clock = (
         "this host's raw monotonic clock in the SDK's callback; the SDK's publishTime (UTC, ms) "
-        "only tells new data from repeated data"
+        "only distinguishes new data from repeated data"
     )
 
     def __init__(

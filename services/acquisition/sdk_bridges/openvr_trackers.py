@@ -21,6 +21,7 @@ from services.acquisition.sdk_bridges.source import (
     Source,
     hello,
     import_sdk,
+    placed_devices,
     pose_reading,
 )
 
@@ -56,12 +57,7 @@ class OpenVrTrackers(Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = {
-            serial: BridgedDevice.model_validate(
-                {"index": index, "serial_number": serial, "source": source}
-            )
-            for index, (serial, source) in enumerate(devices.items())
-        }
+        self._devices = placed_devices(devices)
         self._origin = origin
         self._clock = clock or StationClock()
         self._pace = Pace(NOMINAL_RATE_HZ, self._clock)

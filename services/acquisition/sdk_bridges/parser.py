@@ -16,6 +16,8 @@ SUMMARIES: Final = {
     "lsl": "numbers of a Lab Streaming Layer outlet",
 }
 PLACES: Final = ("left", "right", "head", "none")
+# TCP has 16 bits for it.
+MAX_PORT: Final = 65_535
 HANDS: Final = ("left", "right")
 
 _NEEDS: Final = {
@@ -29,12 +31,12 @@ and that no other program uses the dongles. A device is named by its serial numb
 (LHR-1A2B3C4D) or by libsurvive's name (T20, T21, WM0, HMD); --list shows both.""",
     "manus": """\
 Needs the integrated library of the MANUS Core SDK 2.4 or 3.x (docs.manus-meta.com), a licence
-for it on the dongle, and its udev rules. Gloves are told apart by their hand; the axes of
+for it on the dongle, and its udev rules. Gloves are distinguished by their hand; the axes of
 their wrist are calibrated with `dextouch station calibrate wrist`.""",
     "openxr": """\
 Needs the OpenXR loader (Debian: libopenxr-loader1) and an active runtime with the extensions
 XR_EXT_hand_tracking, XR_MND_headless and XR_KHR_convert_timespec_time, such as Monado. Hands
-are told apart by the runtime.""",
+are distinguished by the runtime.""",
     "lsl": """\
 Needs the Python module pylsl (pip install 'dextouch-wm[bridges]'), which brings liblsl. The
 outlet is named by its name, type or source_id; --list shows those of the network. The
@@ -67,6 +69,13 @@ def named_place(text: str) -> tuple[str, str]:
             f"got {text!r}, expected SERIAL=PLACE with a place of {', '.join(PLACES)}"
         )
     return serial, place
+
+
+def port_number(text: str) -> int:
+    """Parse a TCP port, 0 … 65535, for argparse."""
+    if not text.isdecimal() or not 0 <= int(text) <= MAX_PORT:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a port of 0 … {MAX_PORT}")
+    return int(text)
 
 
 def bridge_parser() -> argparse.ArgumentParser:
@@ -147,7 +156,7 @@ def _add_source(commands: "argparse._SubParsersAction[CommandParser]", source: s
     address = parser.add_mutually_exclusive_group()
     address.add_argument(
         "--port",
-        type=int,
+        type=port_number,
         default=PORTS[source],
         metavar="PORT",
         help=f"where stations connect; 0: any free one (default: {PORTS[source]})",

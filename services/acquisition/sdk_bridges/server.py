@@ -37,6 +37,8 @@ SEND_TIMEOUT_S = 2.0
 MAX_STATIONS = 8
 # Chosen: a tracker that is switched on again is back soon, and the SDK is not flooded.
 RETRY_S = 2.0
+# Chosen: files that were open are closed soon, and waiting costs nothing.
+ACCEPT_RETRY_S = 0.1
 
 Say = Callable[[str], None]
 
@@ -169,6 +171,7 @@ class BridgeServer:
         self._last_ns: dict[str, int] = {}
         self._sent_ns = 0
         self._delays_ns = (0, 0, 0)
+        self._is_closed = threading.Event()
         self._listener = self._listen(address)
         self._life = PeriodicCall(
             self._show_life, period_ns=LIFE_PERIOD_NS // 2, clock=clock, name="bridge-life"
@@ -220,6 +223,7 @@ class BridgeServer:
 
     def close(self) -> None:
         """End all connections and stop listening."""
+        self._is_closed.set()
         self._life.stop()
         with contextlib.suppress(OSError):  # the thread that accepts is woken by this alone
             self._listener.shutdown(socket.SHUT_RDWR)
@@ -266,19 +270,29 @@ class BridgeServer:
         return listener
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
-            while True:
+        while not self._is_closed.is_set():
+            try:
                 link, _ = self._listener.accept()
-                with self._lock:
-                    self._stations = [station for station in self._stations if station.is_open]
-                    if len(self._stations) == MAX_STATIONS:
-                        link.close()
-                        continue
-                    link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
-                    if self._path is None:
-                        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    line = json.dumps(self._hello.model_dump(mode="json", exclude_none=True))
-                    self._stations.append(StationLink(link, line.encode() + b"\n"))
+                try:
+                    self._welcome(link)
+                except OSError:
+                    link.close()
+                    raise
+            # Closed, the station is gone again, or too many files are open.
+            except OSError:
+                self._is_closed.wait(ACCEPT_RETRY_S)
+
+    def _welcome(self, link: socket.socket) -> None:
+        with self._lock:
+            self._stations = [station for station in self._stations if station.is_open]
+            if len(self._stations) == MAX_STATIONS:
+                link.close()
+                return
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
+            if self._path is None:
+                link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            line = json.dumps(self._hello.model_dump(mode="json", exclude_none=True))
+            self._stations.append(StationLink(link, line.encode() + b"\n"))
 
 
 def run_bridge(

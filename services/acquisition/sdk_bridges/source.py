@@ -12,15 +12,18 @@ from types import ModuleType
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pydantic import ValidationError
 
-from dextouch.errors import UnavailableError
+from dextouch.errors import InvalidInputError, UnavailableError
 from dextouch.geometry.rotations import rotation_from_quaternion
+from dextouch.schemas import first_problems
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import VALIDITY
 from services.acquisition.devices.pose_tracker import POSE_PAYLOAD, TrackingResult
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.sdk_link import (
+    MAX_SOFTWARE,
     PROTOCOL,
     PROTOCOL_VERSION,
     BridgedDevice,
@@ -142,10 +145,36 @@ def load_library(path: str, functions: Functions, *, install: str) -> ctypes.CDL
 
 
 def hello(**about: object) -> BridgeHello:
-    """The first line of the connections of a bridge: `BridgeHello` without the protocol."""
-    return BridgeHello.model_validate(
-        {"protocol": PROTOCOL, "version": PROTOCOL_VERSION, "length_unit": "m", **about}
-    )
+    """The first line of the connections of a bridge: `BridgeHello` without the protocol.
+
+    A name of the software that is too long is cut.
+
+    Raises:
+        InvalidInputError: something else is outside of its limits, such as a device's name.
+    """
+    about["software"] = str(about["software"])[:MAX_SOFTWARE]
+    fixed = {"protocol": PROTOCOL, "version": PROTOCOL_VERSION, "length_unit": "m"}
+    try:
+        return BridgeHello.model_validate({**fixed, **about})
+    except ValidationError as error:
+        raise InvalidInputError(f"bridge: {first_problems(error)}") from error
+
+
+def placed_devices(places: Mapping[str, str]) -> dict[str, BridgedDevice]:
+    """Devices by their serial numbers, from where each sits.
+
+    Raises:
+        InvalidInputError: a serial number or a place that is none.
+    """
+    try:
+        return {
+            serial: BridgedDevice.model_validate(
+                {"index": index, "serial_number": serial, "source": place}
+            )
+            for index, (serial, place) in enumerate(places.items())
+        }
+    except ValidationError as error:
+        raise InvalidInputError(f"--device: {first_problems(error)}") from error
 
 
 def place_of(device: BridgedDevice) -> int:

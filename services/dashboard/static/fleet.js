@@ -111,7 +111,7 @@ const link = new LiveLink({
     show(shown);
   },
   onBinary: (buffer) => {
-    // uint8 kind (3), uint8 place in the list, uint16 0, float32 kPa of the left, then of the right hand.
+    // uint8 kind (3), uint8 place in the list, uint16 number of taxels of the left hand, float32 kPa of the left, then of the right hand.
     const view = new DataView(buffer);
     if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4), view.getUint16(2, true));
   },

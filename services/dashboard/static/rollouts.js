@@ -27,6 +27,10 @@ function topicOf(rollout) {
   return `rollout/${rollout.service}/${rollout.watch_id}`;
 }
 
+function worldOf({ service, world }) {
+  return listed.worlds.find((one) => one.service === service && one.name === world);
+}
+
 function watch(rollout) {
   if (watched) link.show(watched.topic, false);
   watched = rollout ? { topic: topicOf(rollout), rollout } : null;
@@ -108,6 +112,7 @@ function showStep(index) {
   }
   for (const [side, hand] of Object.entries(hands)) {
     const touch = touchOf(steps, index, side);
+    hand.use(worldOf(watched.rollout)?.tactile_layout ?? null);
     if (touch) hand.update(touch);
     else hand.clear("the policy asks for no touch");
   }

@@ -3,7 +3,6 @@
 Windows also have a form on the wire (msgpack).
 """
 
-import json
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes, StreamContent
 from dextouch.streams import HEAD_CAMERA, SampleBatch, pack, unpack
+from dextouch.tactile import MAX_LAYOUT_TEXT
 from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout, common_layout
 
 R = TypeVar("R")
@@ -157,7 +157,7 @@ def encode_window(window: Window) -> bytes:
         "instruction": window.instruction,
     }
     if window.tactile_layout != DEXTOUCH_V1:
-        fields["tactile_layout"] = window.tactile_layout.model_dump(mode="json")
+        fields["tactile_layout"] = window.tactile_layout.model_dump_json()
     return pack(fields, arrays)
 
 
@@ -201,8 +201,13 @@ def _layout_of(field: object) -> TactileLayout:
     """The layout that a window names; `dextouch_v1` where it names none."""
     if field is None:
         return DEXTOUCH_V1
+    if not isinstance(field, str) or len(field) > MAX_LAYOUT_TEXT:
+        raise InvalidInputError(
+            f"window: 'tactile_layout' is a {type(field).__name__}, expected JSON of at most "
+            f"{MAX_LAYOUT_TEXT} letters"
+        )
     try:
-        return TactileLayout.model_validate_json(json.dumps(field))
+        return TactileLayout.model_validate_json(field)
     except MALFORMED as error:
         raise InvalidInputError(f"window: 'tactile_layout' is not a layout ({error})") from error
 

@@ -8,7 +8,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
-from dextouch.tactile import LayoutDescription
+from dextouch.tactile import LayoutDescription, LayoutText
 
 RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
@@ -300,7 +300,8 @@ class StationOverview(FrozenModel):
     """A station in a few values.
 
     `cause` is the widest cause of its level, `age_s` that of the newest sample of any stream.
-    `layouts` are those of its gloves by hand, where they are not `dextouch_v1`.
+    `layouts` are those of its gloves by hand, where they are not `dextouch_v1`; in messages each is
+    one JSON text.
     """
 
     station: str
@@ -313,7 +314,7 @@ class StationOverview(FrozenModel):
     disk_left_s: float | None = None
     disk_free_bytes: float | None = None
     cameras: tuple[CameraLive, ...] = ()
-    layouts: dict[str, LayoutDescription] = Field(default={}, exclude_if=not_)
+    layouts: dict[str, LayoutText] = Field(default={}, exclude_if=not_)
 
 
 class HealthEvent(FrozenModel):

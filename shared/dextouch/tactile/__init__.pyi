@@ -1,7 +1,9 @@
 from . import layout as layout
 from .description import MAX_CELLS as MAX_CELLS
+from .description import MAX_LAYOUT_TEXT as MAX_LAYOUT_TEXT
 from .description import PADS as PADS
 from .description import LayoutDescription as LayoutDescription
+from .description import LayoutText as LayoutText
 from .description import RawCells as RawCells
 from .description import TactilePad as TactilePad
 from .layout import CONTACT_THRESHOLD_KPA as CONTACT_THRESHOLD_KPA

@@ -11,7 +11,8 @@ from collections import Counter
 from functools import cached_property
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, model_validator
+from pydantic_core import from_json
 
 from dextouch.frozen_model import FrozenModel
 
@@ -27,6 +28,8 @@ MAX_CELLS: Final = 4096
 MAX_PAD_CELLS: Final = 64
 # Longest distance between two taxels: chosen, the width of a hand.
 MAX_PITCH_M: Final = 0.1
+# Of a layout as one JSON text: of 4096 taxels it takes some 43 kB, most of it the cells.
+MAX_LAYOUT_TEXT: Final = 64 * 2**10
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Cell = Annotated[int, Field(ge=0, lt=MAX_CELLS)]
@@ -159,7 +162,8 @@ class LayoutDescription(FrozenModel):
                     "each"
                 )
 
-    @property
+    # Worlds compare it with every chunk.
+    @cached_property
     def num_taxels(self) -> int:
         """Taxels of one hand."""
         return sum(pad.num_taxels for pad in self.pads)
@@ -198,3 +202,19 @@ class LayoutDescription(FrozenModel):
     def fingerprint(self) -> str:
         """SHA-256 of all that the layout says; equal layouts have equal ones."""
         return hashlib.sha256(json.dumps(self.model_dump(), sort_keys=True).encode()).hexdigest()
+
+
+def _of_text(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    if len(value) > MAX_LAYOUT_TEXT:
+        raise ValueError(f"got {len(value)} letters, expected at most {MAX_LAYOUT_TEXT}")
+    return from_json(value)
+
+
+# A layout that messages hold as one JSON text: their lists have at most 1024 items, its cells 4096.
+LayoutText = Annotated[
+    LayoutDescription,
+    BeforeValidator(_of_text),
+    PlainSerializer(LayoutDescription.model_dump_json, return_type=str),
+]

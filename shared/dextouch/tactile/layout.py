@@ -74,23 +74,27 @@ class TactileLayout(LayoutDescription):
 
     @cached_property
     def areas_m2(self) -> Float64[np.ndarray, " taxels"]:
-        """Sensing area of each taxel in m² (force = pressure × area)."""
-        return np.concatenate([np.full(pad.num_taxels, pad.taxel_area_m2) for pad in self.pads])
+        """Sensing area of each taxel in m² (force = pressure × area); read-only."""
+        areas = [np.full(pad.num_taxels, pad.taxel_area_m2) for pad in self.pads]
+        return _read_only(np.concatenate(areas))
 
     @cached_property
     def nominal_kpa_per_unit(self) -> Float64[np.ndarray, " taxels"] | None:
-        """Pressure of one unit of each taxel's reading; None where only calibration knows it."""
+        """Pressure of one unit of each taxel's reading; None where only calibration knows it.
+
+        Read-only.
+        """
         if self.unit == NEWTON:
-            return 1.0 / (_PASCAL_PER_KPA * self.areas_m2)
+            return _read_only(1.0 / (_PASCAL_PER_KPA * self.areas_m2))
         scale = KPA_PER_UNIT.get(self.unit, self.kpa_per_unit)
-        return None if scale is None else np.full(self.num_taxels, scale)
+        return None if scale is None else _read_only(np.full(self.num_taxels, scale))
 
     @cached_property
     def _indices(self) -> dict[Side, Int64[np.ndarray, " taxels"]]:
-        found = {side: np.array(getattr(self.raw_cells, side), dtype=np.int64) for side in SIDES}
-        for indices in found.values():
-            indices.flags.writeable = False
-        return found
+        return {
+            side: _read_only(np.array(getattr(self.raw_cells, side), dtype=np.int64))
+            for side in SIDES
+        }
 
     def raw_indices(self, side: Side) -> Int64[np.ndarray, " taxels"]:
         """Raw cell of each taxel; read-only.
@@ -231,6 +235,11 @@ class TactileLayout(LayoutDescription):
         return canvas if side == "right" else canvas[:, ::-1]
 
 
+def _read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
+
+
 def _dextouch_v1() -> TactileLayout:
     """Layout of our own glove.
 
@@ -337,7 +346,7 @@ def common_layout(layouts: Sequence[TactileLayout], *, what: str) -> TactileLayo
 
 
 def described(layouts: Sequence[TactileLayout]) -> str:
-    """Names of layouts with what tells them apart, for messages."""
+    """Names of layouts with their number of taxels and fingerprint, for messages."""
     return ", ".join(
         f"{one.name!r} ({one.num_taxels} taxels, {one.fingerprint[:8]})" for one in layouts
     )
@@ -347,7 +356,7 @@ def described(layouts: Sequence[TactileLayout]) -> str:
 
 
 def taxel_areas_m2() -> np.ndarray:
-    """Sensing area of each of the 320 taxels in m² (force = pressure × area)."""
+    """Sensing area of each of the 320 taxels in m² (force = pressure × area); read-only."""
     return DEXTOUCH_V1.areas_m2
 
 
@@ -383,8 +392,15 @@ def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
-    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16]."""
-    return DEXTOUCH_V1.join([np.asarray(fingertips), np.asarray(palm)[..., None, :, :]])
+    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16].
+
+    Raises:
+        ShapeError: other shapes.
+    """
+    palm = np.asarray(palm)
+    if palm.shape[-2:] != PALM_SHAPE:
+        raise ShapeError(f"palm: got shape {palm.shape}, expected [..., 15, 16]")
+    return DEXTOUCH_V1.join([np.asarray(fingertips), palm[..., None, :, :]])
 
 
 def pad_forces_n(tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:

@@ -16,6 +16,7 @@ from dextouch.schemas import (
     decode_observation,
     encode_observation,
 )
+from dextouch.tactile import LayoutDescription
 from dextouch.worlds.world import StartedRollout, SteppedRollout
 
 MAX_SNAPSHOT_BYTES = 2**28
@@ -36,8 +37,11 @@ class CopyFirstWorld:
         image_height_px: int = 64,
         image_width_px: int = 64,
         model_rate_hz: float = 15.0,
+        tactile_layout: LayoutDescription | None = None,
     ) -> None:
-        shape = (tasks, cameras, image_height_px, image_width_px, model_rate_hz)
+        shape: tuple[object, ...] = (tasks, cameras, image_height_px, image_width_px, model_rate_hz)
+        if tactile_layout is not None:
+            shape += (tactile_layout.fingerprint,)
         self._description = WorldDescription(
             name="copy-first",
             kind="baseline",
@@ -49,13 +53,20 @@ class CopyFirstWorld:
             model_rate_hz=model_rate_hz,
             action_kinds=("measured", "commanded"),
             starts_from=("observation",),
+            tactile_layout=tactile_layout,
         )
 
     @staticmethod
     def beside(other: WorldDescription) -> "CopyFirstWorld":
-        """Create the baseline for the tasks and cameras of another world."""
-        size = {"image_height_px", "image_width_px", "model_rate_hz"}
-        return CopyFirstWorld(**other.model_dump(include={"tasks", "cameras"} | size))
+        """Create the baseline for the tasks, cameras and gloves of another world."""
+        return CopyFirstWorld(
+            tasks=other.tasks,
+            cameras=other.cameras,
+            image_height_px=other.image_height_px,
+            image_width_px=other.image_width_px,
+            model_rate_hz=other.model_rate_hz,
+            tactile_layout=other.tactile_layout,
+        )
 
     @property
     def description(self) -> WorldDescription:

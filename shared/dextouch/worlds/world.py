@@ -179,7 +179,7 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
     wanted = {camera: images[camera] for camera in description.cameras if camera in images}
     observation = replace(start.observation, images=wanted)
     size_px = None if description.scales_images else _size_px(description)
-    _check_fits(observation, size_px, description.cameras, where="start")
+    _check_fits(observation, description, size_px, description.cameras, where="start")
     return replace(start, observation=observation)
 
 
@@ -239,13 +239,14 @@ def check_answer(
             f"{num_steps} from {first_step}"
         )
     try:
-        _check_fits(observation, _size_px(description), cameras, where=where)
+        _check_fits(observation, description, _size_px(description), cameras, where=where)
     except (ShapeError, DegenerateRotationError) as error:
         raise DexTouchError(error.message) from error
 
 
 def _check_fits(
     observation: Observation,
+    description: WorldDescription,
     size_px: tuple[int, int] | None,
     cameras: tuple[str, ...],
     *,
@@ -253,6 +254,13 @@ def _check_fits(
 ) -> None:
     arrays = {name: getattr(observation, name) for name in OBSERVED_ARRAYS}
     check_observation_arrays(**arrays, where=where)
+    if (num_taxels := observation.tactile_kpa.shape[-1]) != description.num_taxels:
+        layout = description.tactile_layout
+        raise ShapeError(
+            f"{where}: tactile_kpa holds {num_taxels} taxels of one hand, expected "
+            f"{description.num_taxels} of layout "
+            f"{'dextouch_v1' if layout is None else layout.name!r}"
+        )
     if set(observation.images) != set(cameras):
         raise ShapeError(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"

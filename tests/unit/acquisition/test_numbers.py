@@ -119,6 +119,13 @@ def test_settings_of_no_stream_are_refused(change):
         driver_of(**{**SCALAR, **change})
 
 
+def test_touch_in_kpa_has_the_taxels_of_our_glove():
+    touch = {**SCALAR, "stream": "tactile_left", "stream_kind": "tactile", "unit": "kPa"}
+    assert driver_of(**{**touch, "shape": (320,)}).descriptors[0].shape == (320,)
+    with pytest.raises(ValidationError, match=r"shape: got \(138,\) .* expected \(320,\)"):
+        driver_of(**{**touch, "shape": (138,)})
+
+
 def test_a_pose_names_its_frame():
     with pytest.raises(ValidationError, match="such as 'world'"):
         driver_of(**{**POSE, "frame": None})

@@ -10,12 +10,14 @@ from dashboard_fakes import broken_upstream
 from fastapi import FastAPI, Response
 
 from dextouch.errors import NotFoundError
+from dextouch.schemas import StationOverview
 from dextouch.streams import pack
 from services.dashboard.app import create_app
 from services.dashboard.feeds import Feeds
 from services.dashboard.fleet import Fleet
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream
+from tests.unit.other_gloves import largest_layout
 
 LEFT = np.arange(320, dtype=np.float32)
 CAMERA = {"name": "camera_head", "image_index": 7, "age_s": 0.1, "height_px": 4, "width_px": 4}
@@ -40,7 +42,7 @@ class FakeStation:
         if self.hangs.is_set():
             await asyncio.sleep(3600)
         arrays = {"tactile_left": LEFT}
-        return Response(pack({"station": "its own name", **self.fields}, arrays))
+        return Response(pack({**self.fields, "station": "its own name"}, arrays))
 
     async def _recorder(self):
         self.asked.append("recorder")
@@ -85,6 +87,16 @@ async def test_a_tile_shows_the_take():
     ((tile,), _) = await tiles(fleet_of({"a": station.upstream}))
     assert {name: tile[name] for name in fields} == fields
     assert (tile["camera"]["age_s"], tile["gloves"]) == (0.1, ["left"])
+
+
+async def test_a_glove_of_the_largest_layout_is_drawn_by_it():
+    layout = largest_layout()
+    overview = StationOverview(
+        station="a", level="OK", cause="", recorder="idle", layouts={"left": layout}
+    )
+    station = FakeStation("OK", **overview.model_dump(mode="json", exclude={"level"}))
+    ((tile,), _) = await tiles(fleet_of({"a": station.upstream}))
+    assert tile["layouts"] == {"left": json.loads(layout.model_dump_json())}
 
 
 async def test_a_station_that_hangs_is_stale_and_holds_up_no_other():

@@ -8,13 +8,14 @@ import pytest
 
 from dextouch.schemas import ReturnSelector, RolloutInfo, answer_parts, decode_answer
 from dextouch.streams import pack
-from dextouch.worlds import WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from services.dashboard import rollout_feeds
 from services.dashboard.app import create_app
 from services.dashboard.feeds import Feeds
 from services.dashboard.rollout_feeds import MAX_TOPICS, RolloutFeeds, steps_message
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream
+from tests.unit.other_gloves import small_layout
 from tests.unit.worlds.fakes import CAMERAS, SumWorld, observation
 
 SETTINGS = DashboardSettings(station_period_s=0.05)
@@ -106,6 +107,17 @@ async def test_services_that_fail_do_not_hide_the_others(world):
     assert view.problems == ("world_model: GET /v1/worlds answered 500 without a reason",)
     none = await RolloutFeeds(Feeds({}, SETTINGS), SETTINGS).listed()
     assert "DEXTOUCH_DASHBOARD_TWIN_URL" in none.problems[0]
+
+
+async def test_worlds_say_the_layout_of_their_gloves():
+    layout = small_layout()
+    world = CopyFirstWorld(tasks=("stand_bottle",), tactile_layout=layout)
+    app = create_world_app({"a": world, "b": SumWorld()}, WorldServiceSettings())
+    async with app.router.lifespan_context(app):
+        feeds = Feeds({"twin": upstream_of("twin", app)}, SETTINGS)
+        worlds = (await RolloutFeeds(feeds, SETTINGS).listed()).model_dump(mode="json")["worlds"]
+    told = {world["name"]: world.get("tactile_layout") for world in worlds}
+    assert told == {"a": json.loads(layout.model_dump_json()), "b": None}
 
 
 async def test_a_watched_rollout_is_fetched_again_only_after_it_changed(world):

@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from services.dashboard.feeds import Topic
+from services.dashboard.routes import _topic
 
 
 class Source:
@@ -109,3 +110,11 @@ async def test_a_source_that_fails_is_asked_again_after_a_period_too(source):
     source.fails = True
     assert [await topic.newest() for _ in range(3)] == [[], [], []]
     assert source.count == 1
+
+
+def test_the_first_finder_of_a_name_gives_its_topic(topic):
+    def other(name):
+        raise AssertionError(f"a later finder was called for {name}")
+
+    assert _topic("news", ({}.get, {"news": topic}.get, other)) is topic
+    assert _topic("none", ({}.get,)) is None

@@ -1,6 +1,7 @@
 """The server of all bridges: slow and several stations, addresses, summaries."""
 
 import asyncio
+import errno
 import json
 import socket
 import struct
@@ -16,6 +17,7 @@ from dextouch.errors import DeviceError, InvalidInputError, UnavailableError
 from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgedDevice, parse_hello
+from services.acquisition.sdk_bridges import server as server_module
 from services.acquisition.sdk_bridges.server import (
     MAX_STATIONS,
     QUEUE_PACKETS,
@@ -76,6 +78,10 @@ def port_of(server):
     return int(server.address.rpartition(":")[2])
 
 
+def fail(failures):
+    raise failures.pop()
+
+
 def pose(t_ns):
     return pose_reading(DEVICE, t_ns, NUMBERS)
 
@@ -129,6 +135,31 @@ def test_all_stations_count_the_same_packets(listening, connect, read):
     assert numbers[0] == numbers[1] == sorted(set(numbers[0]))
     for driver in drivers:
         assert (driver.statistics.lost, driver.statistics.restarts) == (0, 0)
+
+
+def test_one_failed_accept_does_not_end_listening(monkeypatch, connect):
+    failures = [OSError(errno.EMFILE, "too many open files"), ConnectionAbortedError()]
+    accept = socket.socket.accept
+    monkeypatch.setattr(
+        socket.socket, "accept", lambda one: accept(one) if not failures else fail(failures)
+    )
+    server = BridgeServer(HELLO, ("127.0.0.1", 0), clock=StationClock())
+    connect(kind="pose_tracker", stream="wrist_left", port=port_of(server))
+    assert not failures
+    server.close()
+
+
+def test_a_link_that_cannot_be_set_up_is_closed(monkeypatch, listening, connect):
+    failures = [OSError(errno.EINVAL, "the station has gone")]
+    made = server_module.StationLink
+    monkeypatch.setattr(
+        server_module,
+        "StationLink",
+        lambda *about: made(*about) if not failures else fail(failures),
+    )
+    with socket.create_connection(("127.0.0.1", port_of(listening)), timeout=10) as link:
+        assert link.recv(1) == b""
+    connect(kind="pose_tracker", stream="wrist_left", port=port_of(listening))
 
 
 def test_stamps_that_do_not_advance_are_not_sent(listening):

@@ -15,6 +15,7 @@ from services.acquisition.sdk_bridges.manus_gloves import ManusGloves
 from services.acquisition.sdk_bridges.openvr_trackers import OpenVrTrackers
 from services.acquisition.sdk_bridges.openxr_hands import OpenXrHands
 from services.acquisition.sdk_bridges.parser import PORTS, bridge_parser
+from services.acquisition.sdk_bridges.source import OUR_AXES, hello
 
 
 def source_of(line):
@@ -50,6 +51,41 @@ def test_trackers_must_be_named(source):
 def test_an_outlet_must_be_named():
     with pytest.raises(InvalidInputError, match="--stream"):
         source_of("lsl")
+
+
+@pytest.mark.parametrize(
+    ("devices", "found"),
+    [("A=left --device A=right", "device A"), ("A=left --device B=left", "place left")],
+)
+@pytest.mark.parametrize("source", ["openvr", "libsurvive"])
+def test_devices_and_places_are_named_once(source, devices, found):
+    with pytest.raises(InvalidInputError, match=f"got the {found} more than once"):
+        source_of(f"{source} --device {devices}")
+
+
+def test_any_number_of_devices_have_no_place():
+    source_of("openvr --device A=none --device B=none")
+
+
+@pytest.mark.parametrize("source", ["openvr", "libsurvive"])
+def test_a_serial_number_that_is_too_long_is_refused(source):
+    with pytest.raises(InvalidInputError, match=r"--device: serial_number: .* 128 characters"):
+        source_of(f"{source} --device {'A' * 129}=left")
+
+
+def test_a_hello_of_a_long_path_is_cut_and_a_long_outlet_refused():
+    about = {"kind": "numbers", "frame": OUR_AXES, "channels": 1, "software": "/" * 1000}
+    device = {"index": 0, "serial_number": "EMG", "source": "none"}
+    assert hello(**about, devices=(device,)).software == "/" * 256
+    with pytest.raises(InvalidInputError, match=r"devices.0.serial_number: .* 128 characters"):
+        hello(**about, devices=(device | {"serial_number": "E" * 129},))
+
+
+@pytest.mark.parametrize("port", ["65536", "99999", "-1", "x", "1.5"])
+def test_a_port_is_one_of_tcp(port, capsys):
+    with pytest.raises(SystemExit):
+        bridge_parser().parse_args(["lsl", f"--port={port}"])
+    assert f"got '{port}', expected a port of 0 … 65535" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("place", ["LHR-1", "=left", "LHR-1=", "LHR-1=elbow"])
