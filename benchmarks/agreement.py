@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
-from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
@@ -89,7 +88,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 [(name, figure.text()) for name, figure in times_s.items()],
             ),
         ],
-        panels=[panel(found, times_s)],
         requirements=requirements(found, times_s),
         data={
             "coverage": [
@@ -188,16 +186,6 @@ def coverage_table(name: str, found: Found) -> ResultTable:
 def mean_held(found: Found, method: str, name: str) -> float:
     """Share of all simulated studies whose interval contains the true value."""
     return float(np.nanmean([tallies[method, name].held for tallies in found.values()]))
-
-
-def panel(found: Found, times_s: Mapping[str, Figure]) -> Panel:
-    """Time of a study against the distance of the coverage for Pearson's r from 95 %."""
-    points = [
-        Point.of(name, figure, abs(mean_held(found, name, "pearson") - 0.95), is_ours=name == OURS)
-        for name, figure in times_s.items()
-    ]
-    label = "distance from 0.95 of the share that holds the truth"
-    return Panel("95 % intervals of Pearson's r", "processor s a study", label, points)
 
 
 def requirements(found: Found, times_s: Mapping[str, Figure]) -> list[Requirement]:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from benchmarks.acquisition.decoders import (
     READ_SIZES,
-    WHOLE,
     DeviceTalk,
     Judgement,
     Line,
@@ -18,7 +17,6 @@ from benchmarks.acquisition.decoders import (
     measure_speed,
 )
 from benchmarks.acquisition.starved import NUM_STREAMS, Load, Way, run_ptys, run_starved
-from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_most
 from benchmarks.report import ResultTable, StageReport, cells
 from benchmarks.stages import Amounts, Bar
@@ -105,25 +103,6 @@ def starved_requirement(starved: Starved) -> Requirement:
     """Requirement on a HID device that a process of its own reads."""
     lost = 100 * starved["starved", "process"]["fingers"]
     return at_most("finger packets lost on a starved computer, reader process", lost, 1.0, "%")
-
-
-def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:
-    """Time against wrong packets, one panel per family."""
-    drawn = []
-    for family in dict.fromkeys(judgement.family for judgement in judgements):
-        points = [
-            Point.of(
-                found.way,
-                speeds[family, found.way, WHOLE],
-                100 * found.wrong_share,
-                is_ours=found.way == OURS,
-            )
-            for found in judgements
-            if found.family == family
-        ]
-        title = f"Decoding {family}"
-        drawn.append(Panel(title, "µs a packet", "wrong packets of those delivered (%)", points))
-    return drawn
 
 
 def requirements(
@@ -223,7 +202,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *tables(judgements, speeds, talks, driver_us, line=LINE, core_share=share),
             starved_table(starved),
         ],
-        panels=panels(judgements, speeds),
         requirements=[
             *requirements(judgements, driver_us, splits, share),
             starved_requirement(starved),

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_least, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.simulated.board_scenes import (
@@ -450,33 +449,6 @@ def tables(
     ]
 
 
-def panels(results: Results) -> list[Panel]:
-    """Time against rotation error, time against translation error; medians of all seeds."""
-    errors = (
-        ("Hand-eye, rotation", "median error (degrees)", "error_deg"),
-        ("Hand-eye, translation", "median error (mm)", "error_mm"),
-    )
-    return [
-        Panel(
-            title,
-            "processor ms a mount",
-            label,
-            [
-                Point(
-                    label=result.name,
-                    time=result.ms.median,
-                    time_low=float(np.percentile(result.ms.values, 10)),
-                    time_high=float(np.percentile(result.ms.values, 90)),
-                    error=getattr(result, key).median,
-                    is_ours=result.name.startswith("our"),
-                )
-                for result in results.values()
-            ],
-        )
-        for title, label, key in errors
-    ]
-
-
 def _spread(figure: Figure) -> str:
     return f"{figure.median:.3g} ({np.percentile(figure.values, 90):.3g})"
 
@@ -572,7 +544,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         packages=("numpy", "scipy", "opencv-contrib-python-headless"),
         options={**plan, "motion": asdict(motion)},
         tables=tables(results, cameras, refusals),
-        panels=panels(results),
         requirements=requirements(results, cameras, refusals),
         data={
             "hand_eye": results,

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from benchmarks.chart import Panel, Point
 from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
@@ -288,7 +287,6 @@ STAMPLESS: dict[str, Way] = {
 
 OURS_ONLINE, OURS_OFFLINE, ARRIVALS = "ours, online", "ours, offline", "arrival stamps"
 COARSE = "stamps of 1 ms"
-_TINY_US = 1e-3
 
 
 def tables(results: Sequence[Result], stampless: Sequence[Result]) -> list[ResultTable]:
@@ -301,23 +299,6 @@ def tables(results: Sequence[Result], stampless: Sequence[Result]) -> list[Resul
         _cost_table([*results, *stampless]),
     ]
     return [table for table in found if table.rows]
-
-
-def panels(results: Sequence[Result]) -> list[Panel]:
-    """Cost against error: without steps, and with them."""
-    quiet = {name for name, scene in SCENES.items() if not scene.step_ms}
-    return [
-        Panel(
-            title,
-            "µs a sample (median of the scenes)",
-            "RMS error (ms, worst scene)",
-            _chart_points([result for result in results if result.scene in scenes]),
-        )
-        for title, scenes in (
-            ("No step of the device's clock", quiet),
-            ("With a step", set(SCENES) - quiet),
-        )
-    ]
 
 
 def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list[Requirement]:
@@ -397,17 +378,6 @@ def _cost_table(results: Sequence[Result]) -> ResultTable:
     return ResultTable("Processor time, µs a sample", ("way", "", "median", "most"), rows)
 
 
-def _chart_points(results: Sequence[Result]) -> list[Point]:
-    points = []
-    for way in _ways(results):
-        mine = [result for result in results if result.way == way]
-        times = Figure.of([max(result.us_per_sample.median, _TINY_US) for result in mine])
-        error = max(result.rms_ms.median for result in mine)
-        is_ours = way in {OURS_ONLINE, OURS_OFFLINE}
-        points.append(Point.of(f"{way}: {error:.2g} ms", times, error, is_ours=is_ours))
-    return points
-
-
 AMOUNTS = Amounts(usual={"seconds": 600.0, "rounds": 5}, quick={"seconds": 60.0, "rounds": 1})
 # Online errors count after the warm-up, and a step comes in the middle.
 MIN_SECONDS = 2 * WARM_UP_S + 2
@@ -435,7 +405,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         packages=("numpy",),
         options={**plan, "seed": options.seed, "scenes": list(scenes)},
         tables=tables(results, stampless),
-        panels=panels(results),
         requirements=requirements(results, stampless),
         data={"results": [*results, *stampless]},
         notes=[

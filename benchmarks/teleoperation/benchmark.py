@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float64
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement, at_most, interleaved
 from benchmarks.report import ResultTable, StageReport, cells
 from benchmarks.simulated.hand_motions import RATE_HZ, Motion, robot_motion
@@ -225,15 +224,11 @@ def _report(
         *("method", "latency p50 ms", "p99 ms", "error deg", "speed rad/s"),
         *("fingers overlap %", "longest silence ms", "CPU ms a sample"),
     )
-    points = [
-        Point.of(name, cpu_ms[name], errors[name].median, is_ours=name != NAIVE) for name in plays
-    ]
     return StageReport(
         stage="teleoperation",
         packages=("numpy", "numba", "fastapi", "uvicorn", "websockets", "msgpack"),
         options=plan,
         tables=[ResultTable("A hand with faults, live", columns, rows)],
-        panels=[Panel("A live hand", "CPU ms a sample", "mean error of joints, deg", points)],
         requirements=_requirements(plays[OURS]),
         data={
             "plays": {

@@ -193,9 +193,9 @@ class RolloutRunner:
             ending = Ending.of(
                 played.ending, start.task, imagined=world != REAL, uncertainty=played.uncertainty
             )
+            verdict = self.own_probes.get(world, self.probe).verdict(ending)
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None
-        verdict = self.own_probes.get(world, self.probe).verdict(ending)
         milestones = played.milestones if world == REAL else verdict.milestones
         rubric = self.rubrics.get(start.task)
         score = RolloutScore(

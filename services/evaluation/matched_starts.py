@@ -12,6 +12,7 @@ from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, Unk
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, Observation, WorldDescription
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout, described
 from services.evaluation.scores import REAL, RolloutFailure
 
 
@@ -66,9 +67,9 @@ class StudyWorlds:
         Raises:
             UnknownNameError: a task that a world does not have.
             InvalidInputError: a real world that does not report success or does not start from
-                task and seed, an imagined one that does not start from its observations, images
-                of another size than the success classifier's, or a length that is not a multiple of
-                a world's chunk.
+                task and seed, an imagined one that does not start from its observations, touch of
+                a glove that success classifiers do not support, images of another size than
+                theirs, or a length that is not a multiple of a world's chunk.
         """
         real = self.descriptions[REAL]
         if not real.knows_success or "task_seed" not in real.starts_from:
@@ -95,6 +96,24 @@ class StudyWorlds:
                 )
             if name != REAL:
                 _check_imagined(name, world, real)
+        check_judged_touch(self.descriptions)
+
+
+def check_judged_touch(worlds: Mapping[str, WorldDescription]) -> None:
+    """Refuse worlds, by name, whose touch success classifiers cannot judge.
+
+    Raises:
+        InvalidInputError: the glove of a world is another one than `dextouch_v1`.
+    """
+    found = {
+        name: TactileLayout.of(one.tactile_layout) or DEXTOUCH_V1 for name, one in worlds.items()
+    }
+    if any(layout.fingerprint != DEXTOUCH_V1.fingerprint for layout in found.values()):
+        gloves = "; ".join(f"world {name!r} {described([one])}" for name, one in found.items())
+        raise InvalidInputError(
+            f"tactile layouts: got {gloves}; expected {DEXTOUCH_V1.name!r} of every world, the "
+            "only one that success classifiers support"
+        )
 
 
 def _check_imagined(name: str, world: WorldDescription, real: WorldDescription) -> None:

@@ -31,6 +31,7 @@ from services.evaluation.matched_starts import (
     MatchedStart,
     StudyWorlds,
     WorldAddress,
+    check_judged_touch,
     refuse_training_starts,
     start_digest,
 )
@@ -197,13 +198,15 @@ def score_recorded(
 
     Raises:
         ConflictError: a take was trained on.
-        InvalidInputError: a task that the world or the judge does not know, images of another size
-            than the judge's, or a take that is shorter than a chunk.
+        InvalidInputError: a task that the world or the judge does not know, touch of a glove that
+            judges do not support, images of another size than the judge's, or a take that is
+            shorter than a chunk.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
     for what, trained in {**judged, **(trained_on or {})}.items():
         refuse_training_starts(digests, trained_on=trained, what=what)
+    check_judged_touch({description.name: description})
     multiple = description.chunk_multiple
     for take in takes:
         task = take.start.task

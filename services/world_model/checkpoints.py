@@ -130,7 +130,8 @@ def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
     """
     if max_bytes is None:
         is_full_size = '"video_expert":"wan"' in notes_of(path).get(METADATA_KEY, "")
-        max_bytes = (available_memory() or sys.maxsize) if is_full_size else MAX_FILE_BYTES
+        max_bytes = available_memory() if is_full_size else MAX_FILE_BYTES
+        max_bytes = sys.maxsize if max_bytes is None else max_bytes
     tensors, metadata, digest = read_weights(
         path, CheckpointMetadata, METADATA_KEY, max_bytes=max_bytes
     )

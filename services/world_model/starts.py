@@ -217,6 +217,7 @@ class SceneReader:
         self._readers = checkpoint.dynamics.readers()
         self._metadata = checkpoint.metadata
         self.tasks = checkpoint.metadata.dynamics.tasks
+        self.tactile_layout = checkpoint.metadata.dynamics.tactile_layout
 
     @torch.no_grad()
     def objects(
@@ -237,7 +238,7 @@ class SceneReader:
             [request.first_tactile_kpa for request in requests],
             hands,
             [self.tasks.index(task) for task in tasks],
-            self._metadata.dynamics.tactile_layout,
+            self.tactile_layout,
         )
         readings = [reader(first) for reader in self._readers]
         poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))

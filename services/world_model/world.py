@@ -18,6 +18,7 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
+from dextouch.tactile.layout import described
 from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints, starts
@@ -50,7 +51,8 @@ class ModelWorld(BatchWorld[ModelState]):
     products; codecs are float32. With contact geometry, `reader` finds objects at a chunk's start.
 
     Raises:
-        InvalidInputError: a model with contact geometry, and no reader of all its tasks.
+        InvalidInputError: a model with contact geometry, and no reader of all its tasks and of the
+            layout of its glove.
     """
 
     def __init__(
@@ -66,14 +68,9 @@ class ModelWorld(BatchWorld[ModelState]):
         self._sampling = sampling
         self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
-        known = () if reader is None else reader.tasks
-        if config.use_contact_geometry and not set(metadata.tasks) <= set(known):
-            raise InvalidInputError(
-                f"world model {metadata.name}: is conditioned on objects, got start readers for "
-                f"{sorted(known)}, expected a state model of {sorted(metadata.tasks)}; name one "
-                "by --objects"
-            )
         self._reader = reader if config.use_contact_geometry else None
+        if config.use_contact_geometry:
+            _check_reader(reader, checkpoint.metadata)
         self._description = WorldDescription(
             name=metadata.name,
             kind="model",
@@ -268,6 +265,25 @@ def open_world(
             f"{sampler}, expected none: it predicts without sampling"
         )
     return StateWorld(checkpoints.read_state_checkpoint(file))
+
+
+def _check_reader(
+    reader: starts.SceneReader | None, metadata: checkpoints.CheckpointMetadata
+) -> None:
+    """Raise unless the reader knows the tasks and the glove of a model with contact geometry."""
+    where = f"world model {metadata.name}: is conditioned on objects"
+    known = () if reader is None else reader.tasks
+    if reader is None or not set(metadata.tasks) <= set(known):
+        raise InvalidInputError(
+            f"{where}, got start readers for {sorted(known)}, expected a state model of "
+            f"{sorted(metadata.tasks)}; name one by --objects"
+        )
+    got, expected = reader.tactile_layout, metadata.network.tactile_layout
+    if got.fingerprint != expected.fingerprint:
+        raise InvalidInputError(
+            f"{where}, got start readers for the glove {described([got])}, expected those of "
+            f"{described([expected])}; name a state model of this glove by --objects"
+        )
 
 
 def _placed(file: Path, placement: Placement) -> checkpoints.Checkpoint:

@@ -155,7 +155,7 @@ class DynamicsConfig(FrozenModel):
     reader_channels: int = Field(default=32, ge=8, le=256)
     reader_keypoints: int = Field(default=40, ge=4, le=256)
     width: int = Field(default=192, ge=8, le=1024)
-    touch_channels: int = Field(default=96, ge=4, le=MAX_CELLS)
+    touch_channels: int = Field(default=96, ge=1, le=MAX_CELLS)
     domains: tuple[Domain, ...] = Field(
         default=_ROBOT_ALONE, exclude_if=lambda domains: domains == _ROBOT_ALONE
     )

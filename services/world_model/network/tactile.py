@@ -322,9 +322,11 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         num_tips = layout.num_finger_taxels
         num_palm = layout.num_taxels - layout.num_finger_taxels
         if config.use_touch and config.palm_channels > num_palm:
+            fewer = "use fewer palm_channels, or " if num_palm else ""
             raise InvalidInputError(
                 f"tokenizer principal_axes: got palm_channels {config.palm_channels} for layout "
-                f"{layout.name!r}, expected at most {num_palm}, the taxels of its palm"
+                f"{layout.name!r}, expected at most {num_palm}, the taxels of its palm; {fewer}"
+                "train a tokenizer by `dextouch train tokenizer --tokenizer grid`"
             )
         super().__init__(num_tokens=1, channels=num_tips + config.palm_channels)
         self._num_tips = num_tips
@@ -338,10 +340,11 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         palms = roots[..., self._num_tips :].reshape(-1, len(self.palm_basis))
         # Not centred: the mean touch is not a touch that occurs.
         basis, rms = principal_axes(palms.T @ palms / len(palms), self.palm_basis.shape[1])
-        tips_rms = roots[..., : self._num_tips].square().mean().sqrt()
         self.palm_basis.copy_(basis)
         self.palm_scale.copy_(root_scale(rms) * PALM_SCALE)
-        self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
+        if self._num_tips:
+            tips_rms = roots[..., : self._num_tips].square().mean().sqrt()
+            self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
         self.peak_kpa.copy_(tactile_kpa.max())
 
     def encode(self, tactile_kpa: Pressures) -> Latents:

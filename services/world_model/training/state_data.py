@@ -212,15 +212,12 @@ def _grid(
     about = reader.attributes
     if clicks is None or about.task not in clicks.tasks:
         return SceneGrid(reader, image_px)
-    given = clicks.episodes.get(reader.item_id)
-    stored = None
-    given = stored = clicks.episodes.get(reader.item_id)
-    if given is None:
+    given = one = clicks.episodes.get(reader.item_id)
+    if one is None:
         held = (store for store in stores if store.exists(reader.item_id))
-        stored = next((store.clicks(reader.item_id) for store in held), None)
-    if stored is None:
+        one = next((store.clicks(reader.item_id) for store in held), None)
+    if one is None:
         return SceneGrid(reader, image_px, objects=clicks)
-    one = stored
     clicked = clicked_poses(about, clicks, one, may_lack_headings=given is None)
     each = zip(clicked.objects, clicked.known.tolist(), strict=True)
     missing = [found.name for found, known in each if not known and found.name in one.objects]

@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.clients import http_link
 from dextouch.clients.rollouts import RolloutClient
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import ConflictError, InvalidInputError, ShapeError, UnknownNameError
 from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
@@ -18,6 +18,7 @@ from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.rating.marks import Rubric
 from services.evaluation.success_classifier import SuccessClassifier, Verdict
 from tests.unit.evaluation import toy
+from tests.unit.other_gloves import small_layout
 from tests.unit.worlds.running import served
 
 pytestmark = pytest.mark.long
@@ -72,6 +73,7 @@ def client():
         "copy-first": CopyFirstWorld.beside(judge.description),
         "wide": toy.ToyWorld("wide", judge=False, cameras=toy.TWO_CAMERAS),
         "wide judge": wide_judge,
+        "small glove": toy.ToyWorld("small glove", judge=False, layout=small_layout()),
         "wide copy-first": CopyFirstWorld.beside(wide_judge.description),
     }
     with served(create_world_app(worlds, WorldServiceSettings())) as url, RolloutClient(url) as it:
@@ -202,6 +204,18 @@ def test_rubric_scores_by_reported_and_by_probable_milestones(client, policies, 
     assert scored("script", "dream") is None
 
 
+def test_an_ending_that_cannot_be_judged_is_a_failed_rollout(client, probe, monkeypatch):
+    def verdict(_, ending):
+        raise ShapeError(f"tactile of {ending.task}: got 138 taxels")
+
+    monkeypatch.setattr(SuccessClassifier, "verdict", verdict)
+    worlds = StudyWorlds.ask(WorldAddress(client, "judge"), {})
+    start = matched_start(worlds.addresses["real"], "reach", SEEDS[0], "")
+    failed, played = RolloutRunner(worlds, probe, 16).run(start, HoldPolicy(), "hold", "real")
+    assert (failed.error, failed.message) == ("ShapeError", "tactile of reach: got 138 taxels")
+    assert played is None
+
+
 class SeesAll(BehaviourCloningPolicy):
     """The same policy, to which worlds show every step."""
 
@@ -321,6 +335,7 @@ def test_a_real_world_that_does_not_repeat_itself_has_no_scores(client, probe):
         ("judge", "judge", 16, "starts from task_seed"),
         ("judge", "wide", 16, "camera_wrist_left"),
         ("judge", "dream", 18, "multiple of 4"),
+        ("judge", "small glove", 16, "'real' 'dextouch_v1' .320.*'small glove' 'small' .138"),
     ],
 )
 def test_worlds_that_do_not_fit_are_refused_before_the_first_rollout(

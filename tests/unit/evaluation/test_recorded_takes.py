@@ -23,6 +23,7 @@ from services.evaluation.recorded_takes import (
 from services.evaluation.scores import RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy, toy_store
+from tests.unit.other_gloves import small_layout
 from tests.unit.worlds.running import served
 
 SEEDS = range(3000, 3012)
@@ -175,6 +176,9 @@ def test_tasks_and_images_must_fit_world_and_judge(store, client, probe):
     larger = description.model_copy(update={"image_height_px": 64})
     with pytest.raises(InvalidInputError, match="images of 64 px"):
         score_recorded(takes, {}, address, larger, probe)
+    small = description.model_copy(update={"tactile_layout": small_layout()})
+    with pytest.raises(InvalidInputError, match=r"'right' 'small' .138 taxels"):
+        score_recorded(takes, {}, address, small, probe)
     short = [dataclasses.replace(takes[0], actions=takes[0].actions[:1])]
     multiple = description.model_copy(update={"chunk_multiple": 4})
     with pytest.raises(InvalidInputError, match="at least the 4"):

@@ -7,6 +7,7 @@ import numpy as np
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, reanchor
 from dextouch.streams.packing import pack
+from dextouch.tactile.layout import TactileLayout
 from dextouch.worlds.world import (
     EVERYTHING,
     Observation,
@@ -143,6 +144,7 @@ class ToyWorld:
         judge: bool,
         drift_m: float = 0.0,
         cameras: tuple[str, ...] = ("camera_head",),
+        layout: TactileLayout | None = None,
     ) -> None:
         self.judge = judge
         self.drift_m = drift_m
@@ -158,6 +160,7 @@ class ToyWorld:
             action_kinds=("commanded",),
             starts_from=("task_seed",) if judge else ("observation",),
             knows_success=judge,
+            tactile_layout=layout,
         )
 
     def reset(self, start: RolloutStart) -> StartedRollout[ToyState]:

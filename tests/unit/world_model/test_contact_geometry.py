@@ -24,6 +24,7 @@ from services.world_model.training.distribution import Processes
 from services.world_model.training.objective import own_context
 from services.world_model.world import ModelWorld
 from tests.contracts.test_world import untrained_state_checkpoint
+from tests.unit.other_gloves import small_layout
 from tests.unit.world_model.conftest import make_metadata
 from tests.unit.world_model.test_world import make_start
 
@@ -125,6 +126,12 @@ def test_a_served_model_needs_start_readers_of_its_tasks(checkpoint):
     for reader in (None, SceneReader(untrained_state_checkpoint())):
         with pytest.raises(InvalidInputError, match="--objects"):
             ModelWorld(checkpoint, reader=reader)
+
+
+def test_start_readers_of_another_glove_are_refused(checkpoint, reader):
+    reader.tactile_layout = small_layout()
+    with pytest.raises(InvalidInputError, match=r"'small' .138.*'dextouch_v1' .320.*--objects"):
+        ModelWorld(checkpoint, reader=reader)
 
 
 def test_a_rollout_reads_the_objects_of_every_chunk(checkpoint, reader, toy_episode, monkeypatch):

@@ -15,11 +15,12 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
     read_tokenizer,
 )
-from services.world_model.dynamics.features import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig, TouchCodec
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import build_tokenizer, canvas_cells
 from services.world_model.paper_settings import TrainTokenizerSettings
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
+from services.world_model.training.state_data import StateData, configured, load_scene_episodes
 from services.world_model.training.state_trainer import train_state
 from services.world_model.training.tokenizer_trainer import train_tokenizer
 from services.world_model.training.trainer import train_on
@@ -184,8 +185,55 @@ def test_sizes_beyond_the_glove_are_refused():
         DynamicsConfig(tasks=("a",), num_objects=(1,), touch_channels=139, layout=LAYOUT)
     with pytest.raises(InvalidInputError, match=r"palm_channels 64.*'small', expected at most 63"):
         build_tokenizer(NetworkConfig(palm_channels=64).with_layout(LAYOUT))
-    plain = LAYOUT.model_dump()
-    plain["raw_cells"] = {side: cells[:75] for side, cells in plain["raw_cells"].items()}
-    flat = TactileLayout.model_validate(plain | {"pads": plain["pads"][:5]})
     with pytest.raises(InvalidInputError, match="split_hands: got layout 'small' with pads"):
-        build_tokenizer(NetworkConfig(tokenizer="split_hands").with_layout(flat))
+        build_tokenizer(
+            NetworkConfig(tokenizer="split_hands").with_layout(part_of_layout(slice(5)))
+        )
+
+
+def part_of_layout(pads):
+    """The small glove with some of its pads."""
+    plain = LAYOUT.model_dump()
+    kept = plain["pads"][pads]
+    num_taxels = sum(pad["rows"] * pad["columns"] for pad in kept)
+    cells = {side: indices[:num_taxels] for side, indices in plain["raw_cells"].items()}
+    return TactileLayout.model_validate(plain | {"pads": kept, "raw_cells": cells})
+
+
+def test_principal_axes_hold_a_palm_alone():
+    layout = part_of_layout(slice(5, 6))
+    tokenizer = build_tokenizer(NetworkConfig(palm_channels=63).with_layout(layout))
+    touch = 50 * torch.rand(40, 2, 63, generator=torch.Generator().manual_seed(0))
+    tokenizer.fit(touch)
+    assert all(torch.isfinite(buffer).all() for buffer in tokenizer.buffers())
+    decoded = tokenizer.decode(tokenizer.encode(touch))
+    torch.testing.assert_close(decoded, touch, atol=1e-3, rtol=0)
+
+
+def test_fingertips_alone_need_the_tokenizer_that_the_error_names():
+    layout = part_of_layout(slice(5))
+    with pytest.raises(InvalidInputError, match=r"expected at most 0.*palm; train.*grid`$"):
+        build_tokenizer(NetworkConfig().with_layout(layout))
+    tokenizer = build_tokenizer(NetworkConfig(tokenizer="grid").with_layout(layout))
+    touch = torch.ones(2, 75)
+    tokenizer.fit(touch.expand(4, 2, 75))
+    assert tokenizer.decode(tokenizer.encode(touch)).shape == (2, 75)
+
+
+@pytest.mark.parametrize("num_taxels", [1, 3])
+def test_a_state_model_may_have_a_glove_of_few_taxels(num_taxels, tmp_path):
+    plain = LAYOUT.model_dump()
+    pad = plain["pads"][0] | {"rows": 1, "columns": num_taxels}
+    cells = {side: indices[:num_taxels] for side, indices in plain["raw_cells"].items()}
+    layout = TactileLayout.model_validate(plain | {"pads": [pad], "raw_cells": cells})
+    episode, store = make_episode(0), EpisodeStore(tmp_path)
+    touch_kpa = np.ascontiguousarray(episode.tactile_kpa[:, :, -num_taxels:])
+    measured = np.ones((2, num_taxels), dtype=bool)
+    few = replace(episode, tactile_kpa=touch_kpa, measured_taxels=measured, tactile_layout=layout)
+    write_episode(store, few, success=True)
+    (grid,) = load_scene_episodes(str(tmp_path))
+    config = configured(StateData([grid], [grid]), StateTrainSettings(episodes=("none",)))
+    codec = TouchCodec(config.touch_channels, num_taxels)
+    touch = torch.rand(20, num_taxels, generator=torch.Generator().manual_seed(0))
+    codec.fit(touch)
+    torch.testing.assert_close(codec.decode(codec.encode(touch)), touch)

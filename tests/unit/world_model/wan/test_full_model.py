@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError, LimitExceededError
-from services.world_model.checkpoints import read_checkpoint, write_checkpoint
+from services.networks.weight_files import write_weights
+from services.world_model import checkpoints
+from services.world_model.checkpoints import METADATA_KEY, read_checkpoint, write_checkpoint
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
@@ -53,6 +55,17 @@ def test_the_autoencoder_is_frozen_and_the_transformer_is_not(model):
     assert not any(p.requires_grad for p in model.codec.parameters())
     assert all(p.requires_grad for p in model.video.parameters())
     assert all(p.requires_grad for p in model.layers.parameters())
+
+
+def test_a_file_of_the_full_size_is_refused_without_memory(
+    tmp_path, full_config, metadata, monkeypatch
+):
+    path = tmp_path / "full.safetensors"
+    full = metadata.model_copy(update={"network": full_config})
+    write_weights(path, {"one": torch.ones(1)}, full, METADATA_KEY)
+    monkeypatch.setattr(checkpoints, "available_memory", lambda: 0)
+    with pytest.raises(LimitExceededError):
+        read_checkpoint(path)
 
 
 @pytest.mark.long
