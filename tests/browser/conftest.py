@@ -142,7 +142,7 @@ def serve():
 def serve_station(serve, monkeypatch):
     """Serve a station with two mock trackers; all ten streams would take a small machine whole."""
     streams = [s for s in pattern.pattern_streams() if s.descriptor.name in {"head", "wrist_left"}]
-    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+    monkeypatch.setattr(pattern, "pattern_streams", lambda **_: streams)
 
     def start(spool, **settings):
         return serve(create_station(AcquisitionSettings(spool=spool, mock=True, **settings)))

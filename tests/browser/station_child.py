@@ -13,8 +13,8 @@ from services.pipelines.servers import bind, serve_all
 
 def main(spool, name, *streams):
     whole = pattern.pattern_streams
-    pattern.pattern_streams = lambda round_s=pattern.ROUND_S: [
-        stream for stream in whole(round_s) if stream.descriptor.name in streams
+    pattern.pattern_streams = lambda round_s=pattern.ROUND_S, **given: [
+        stream for stream in whole(round_s, **given) if stream.descriptor.name in streams
     ]
     app = create_app(AcquisitionSettings(spool=Path(spool), mock=True, station=name))
     place = bind(name, host="127.0.0.1", port=0)

@@ -46,7 +46,9 @@ def address(serve, tmp_path, monkeypatch):
     monkeypatch.setattr(
         pattern,
         "pattern_streams",
-        lambda round_s=pattern.ROUND_S: [s for s in whole(round_s) if s.descriptor.name in few],
+        lambda round_s=pattern.ROUND_S, **given: [
+            s for s in whole(round_s, **given) if s.descriptor.name in few
+        ],
     )
     spool = tmp_path / "spool"
     station = serve(create_station(AcquisitionSettings(spool=spool, mock=True, seed=SEED)))

@@ -33,6 +33,8 @@ SCOPES = (
 PUBLIC = {"GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json"}
 # Needs a one-time token in place of a key.
 BY_TOKEN = {"episode_store": {"POST /v1/enrolments/exchange"}}
+# An application of its own, with the same keys (tests/unit/acquisition/test_practice.py).
+MOUNTED = {"acquisition": {"FOLDER /practice"}}
 # Scope by route. The dashboard is not here: all its routes below /v1 need a session.
 TABLE = {
     "acquisition": {
@@ -55,6 +57,9 @@ TABLE = {
         "GET /v1/uploads": "station",
         "GET /v1/uploads/{recording_id}": "station",
         "POST /v1/uploads/{recording_id}/retry": "station",
+        "GET /v1/practice": "station",
+        "POST /v1/practice/start": "station",
+        "POST /v1/practice/stop": "station",
     },
     "alignment": {
         "POST /v1/alignments": "align",
@@ -66,6 +71,10 @@ TABLE = {
         "GET /v1/calibration/run": "calibrate",
         "GET /v1/calibration/run/image": "calibrate",
         "POST /v1/calibration/run/answer": "calibrate",
+        "POST /v1/calibration/run/take": "calibrate",
+        "POST /v1/calibration/run/drop": "calibrate",
+        "POST /v1/calibration/practice/start": "calibrate",
+        "POST /v1/calibration/practice/stop": "calibrate",
         "POST /v1/calibration/run/finish": "calibrate",
         "POST /v1/calibration/run/cancel": "calibrate",
     },
@@ -239,7 +248,8 @@ def test_every_route_has_a_scope_or_is_public(keyed):
     """Add a row for a new route: which scope should it need?"""
     service, app = keyed
     pages = RATING_PAGE if service == "rating" else set()
-    assert operations(app) == set(TABLE[service]) | PUBLIC | pages | BY_TOKEN.get(service, set())
+    others = BY_TOKEN.get(service, set()) | MOUNTED.get(service, set())
+    assert operations(app) == set(TABLE[service]) | PUBLIC | pages | others
 
 
 @pytest.mark.long

@@ -122,7 +122,7 @@ async def test_refusals_are_problems(tmp_path):
 
 async def test_a_take_keeps_the_trace_in_which_it_was_saved(tmp_path, monkeypatch):
     streams = [s for s in pattern.pattern_streams() if s.descriptor.name == "head"]
-    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+    monkeypatch.setattr(pattern, "pattern_streams", lambda **_: streams)
     async with station(tmp_path) as client:
         await client.post("/v1/recorder/arm", json=PROMPT)
         recording_id = (await client.post("/v1/recorder/record")).json()["recording_id"]

@@ -61,7 +61,7 @@ def store_process(folder, port=0):
 def station(tmp_path, monkeypatch):
     """Serve the enrolled station with one mock tracker."""
     streams = [s for s in pattern.pattern_streams() if s.descriptor.name == "head"]
-    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+    monkeypatch.setattr(pattern, "pattern_streams", lambda **_: streams)
 
     def start():
         settings = AcquisitionSettings(

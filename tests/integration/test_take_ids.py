@@ -151,7 +151,7 @@ async def until(ask):
 
 async def test_a_take_that_is_refused_for_good_is_set_aside(tmp_path, monkeypatch):
     streams = [s for s in pattern.pattern_streams() if s.descriptor.name == "head"]
-    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+    monkeypatch.setattr(pattern, "pattern_streams", lambda **_: streams)
     spool = record(tmp_path, "desk_1")
     refusing = RefusingStore()
     uploader = Uploader(spool, refusing, period_s=0.001)

@@ -21,16 +21,14 @@ from services.alignment.calibration.hand_eye import (
 )
 from services.alignment.calibration.motion import (
     MIN_VIEWS,
+    WANTED_ROTATION_RAD,
+    WANTED_TRANSLATION_M,
     DegenerateMotionError,
     Series,
     view_pairs,
 )
 from services.alignment.calibration.places import place_labels
 
-# One sigma of a good mount: at 0.5 m from the camera both move a point by 0.8 mm at most, a quarter
-# of a taxel. A tracker with noise of 0.05 degrees and 0.5 mm gets there in about 30 places.
-WANTED_ROTATION_RAD: Final = float(np.deg2rad(0.06))
-WANTED_TRANSLATION_M: Final = 8e-4
 # A slip is recognised with three places on either side of it; the rest is chosen.
 WANTED_PLACES: Final = 12
 # Turns spread uniformly over 20 degrees to either side give 16; the solver refuses less than 10.

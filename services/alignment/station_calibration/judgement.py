@@ -9,7 +9,7 @@ import numpy as np
 
 from dextouch.episodes.spool import read_attributes
 from dextouch.schemas import Matrix
-from services.alignment.calibration.mount_guide import WANTED_ROTATION_RAD, WANTED_TRANSLATION_M
+from services.alignment.calibration.motion import WANTED_ROTATION_RAD, WANTED_TRANSLATION_M
 from services.alignment.station_calibration.record import read_matrices
 
 # Learners need these, and alignment those of the recorded gloves.

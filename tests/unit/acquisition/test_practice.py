@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dextouch.serving.keys import ApiKey
 from services.acquisition import app as station_app
 from services.acquisition.mocks import pattern
 from services.acquisition.retention import spooled_takes
 from services.acquisition.settings import AcquisitionSettings
 
 HEADS = {"head"}
+KEY = "5f1c93b07ad24e68"
 
 
 @pytest.fixture
@@ -60,6 +62,25 @@ async def test_practice_devices_are_there_while_they_are_on(settings, tmp_path):
         assert spooled_takes(spool) == []
         assert (await client.post("/v1/practice/stop")).json() == {"state": "off"}
         assert (await client.get("/practice/v1/health")).status_code == 404
+
+
+async def test_practice_devices_need_the_keys_of_their_station(settings):
+    key = ApiKey(name="bench", key=KEY, scopes=("station",))
+    app = station_app.create_app(settings.model_copy(update={"api_keys": (key,)}))
+    transport = httpx.ASGITransport(app=app)
+    known = {"authorization": f"Bearer {KEY}"}
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://localhost") as client,
+    ):
+        assert (await client.post("/v1/practice/start")).status_code == 401
+        assert (await client.post("/v1/practice/start", headers=known)).json() == {"state": "on"}
+        for given, status in (({}, 401), ({"authorization": "Bearer wrong"}, 401), (known, 200)):
+            for path in ("/practice/v1/health", "/practice/v1/recorder"):
+                assert (await client.get(path, headers=given)).status_code == status
+            armed = {"task": "calibrate", "instruction": "rest"}
+            reply = await client.post("/practice/v1/recorder/arm", json=armed, headers=given)
+            assert reply.status_code == status
 
 
 async def test_a_station_of_real_devices_has_none(tmp_path):
