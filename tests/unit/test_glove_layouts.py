@@ -300,3 +300,13 @@ def test_health_finds_a_dead_cell_by_its_neighbours_on_the_pad():
         values = layout.expand(taxels, side="left").astype(np.float32)
         found = judged(check, block(t_s, values), (second + 1) * SECOND_NS)
     assert found.taxels == {"dead": (dead,)}
+
+
+def test_a_changed_copy_is_another_layout():
+    layout = small_layout()
+    assert layout == small_layout()
+    renamed = layout.model_copy(update={"name": "other"})
+    assert (renamed.name, renamed == layout) == ("other", False)
+    assert renamed.fingerprint != layout.fingerprint
+    with pytest.raises(ValidationError, match="num_raw_cells"):
+        layout.model_copy(update={"num_raw_cells": 1})

@@ -8,8 +8,9 @@ import hashlib
 import itertools
 import json
 from collections import Counter
+from collections.abc import Mapping
 from functools import cached_property
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, model_validator
 from pydantic_core import from_json
@@ -31,6 +32,7 @@ MAX_PITCH_M: Final = 0.1
 # Of a layout as one JSON text: of 4096 taxels it takes some 43 kB, most of it the cells.
 MAX_LAYOUT_TEXT: Final = 64 * 2**10
 
+DescriptionT = TypeVar("DescriptionT", bound="LayoutDescription")
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Cell = Annotated[int, Field(ge=0, lt=MAX_CELLS)]
 Cells = Annotated[tuple[Cell, ...], Field(min_length=1, max_length=MAX_CELLS)]
@@ -190,6 +192,13 @@ class LayoutDescription(FrozenModel):
         for pad in self.pads[:-1]:
             starts.append(starts[-1] + pad.num_taxels)
         return tuple(starts)
+
+    def model_copy(
+        self: DescriptionT, *, update: Mapping[str, Any] | None = None, deep: bool = False
+    ) -> DescriptionT:
+        """A copy with other fields, validated; what is cached is computed anew."""
+        del deep
+        return type(self).model_validate(self.model_dump() | dict(update or {}))
 
     # Not field by field as pydantic does, whose comparison includes what is cached: arrays.
     def __eq__(self, other: object) -> bool:
