@@ -1,6 +1,7 @@
 """Application of the episode store, with its threads in the background."""
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Final
@@ -38,7 +39,7 @@ RETRY_PERIOD_S: Final = 30.0
 WATCH_PERIOD_S: Final = 1.0
 
 
-class PeriodicThread:
+class PeriodicThread(ABC):
     """Calls `work` again and again, between `start` and `stop`.
 
     A failure, such as a bucket that cannot be reached or a read-only folder, is logged as `event`
@@ -50,9 +51,9 @@ class PeriodicThread:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=event, daemon=True)
 
+    @abstractmethod
     def work(self) -> None:
         """What is done once a period."""
-        raise NotImplementedError
 
     def start(self) -> None:
         """Begin in the background."""

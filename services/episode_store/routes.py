@@ -64,6 +64,17 @@ Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
 MAX_ATTRIBUTES_BYTES = 256 * KIB
 
 
+async def _check_unless(
+    is_stored: Callable[[], bool], check: Callable[[], None], *, limiter: anyio.CapacityLimiter
+) -> None:
+    """As `_unless`; whether a batch is stored is looked up on the disk, in a thread."""
+    try:
+        check()
+    except StorageFullError:
+        if not await anyio.to_thread.run_sync(is_stored, limiter=limiter):
+            raise
+
+
 def uploads_router(
     ingest: Ingest, limits: StorageLimits, admission: Admission, metrics: UploadMetrics
 ) -> APIRouter:
@@ -107,14 +118,9 @@ def uploads_router(
             # A refused body is not read.
             with metrics.counting_refusals():
                 admitted.enter_context(admission.admitted(num_bytes))
-                try:
-                    limits.check_batch(recording_id, num_bytes)
-                except StorageFullError:
-                    # As `_unless`; whether it is stored is looked up on the disk.
-                    if not await anyio.to_thread.run_sync(
-                        ingest.is_stored, recording_id, stream, number, limiter=admission.threads
-                    ):
-                        raise
+                is_stored = partial(ingest.is_stored, recording_id, stream, number)
+                check = partial(limits.check_batch, recording_id, num_bytes)
+                await _check_unless(is_stored, check, limiter=admission.threads)
             started = time.perf_counter()
             data = await request.body()
             receipt = await anyio.to_thread.run_sync(

@@ -104,6 +104,30 @@ def _add_source(commands: "argparse._SubParsersAction[CommandParser]", source: s
         epilog=f"examples:\n{examples}\n\nin the station's settings:\n  {_SETTINGS[source]}\n\n"
         "frames, units and clocks: docs/sdk_bridges.md",
     )
+    _add_choices(parser, source)
+    address = parser.add_mutually_exclusive_group()
+    address.add_argument(
+        "--port",
+        type=port_number,
+        default=PORTS[source],
+        metavar="PORT",
+        help=f"where stations connect; 0: any free one (default: {PORTS[source]})",
+    )
+    address.add_argument(
+        "--path", type=Path, metavar="PATH", help="of a local socket, instead of a port"
+    )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="of this computer on which to listen; anyone who reaches it gets the samples "
+        "(default: 127.0.0.1)",
+    )
+    add_json(parser)
+
+
+def _add_choices(parser: argparse.ArgumentParser, source: str) -> None:
+    """Options of one source: what it serves, and where its library is."""
     if source in {"openvr", "libsurvive"}:
         parser.add_argument(
             "--device",
@@ -153,22 +177,3 @@ def _add_source(commands: "argparse._SubParsersAction[CommandParser]", source: s
         )
     if source in {"openvr", "libsurvive", "lsl"}:
         parser.add_argument("--list", action="store_true", help="print what is there, and end")
-    address = parser.add_mutually_exclusive_group()
-    address.add_argument(
-        "--port",
-        type=port_number,
-        default=PORTS[source],
-        metavar="PORT",
-        help=f"where stations connect; 0: any free one (default: {PORTS[source]})",
-    )
-    address.add_argument(
-        "--path", type=Path, metavar="PATH", help="of a local socket, instead of a port"
-    )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="of this computer on which to listen; anyone who reaches it gets the samples "
-        "(default: 127.0.0.1)",
-    )
-    add_json(parser)

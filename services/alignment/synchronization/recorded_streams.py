@@ -21,7 +21,8 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
 from dextouch.streams import ENCODED_UNITS, H264_UNIT, HEAD_CAMERA, StreamDescriptor, encoded_values
-from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration, unusable_taxels
+from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration
+from services.alignment.calibration.taxel_faults import unusable_taxels
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,

@@ -16,8 +16,8 @@ from services.alignment.calibration.tactile_tare import (
     REASONS,
     STUCK,
     TactileCalibration,
-    unusable_taxels,
 )
+from services.alignment.calibration.taxel_faults import unusable_taxels
 from services.alignment.command_line import report_line
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions

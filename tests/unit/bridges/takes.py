@@ -74,17 +74,14 @@ def write_episode(
         described = descriptor(name, kind, shape, dtype, unit, rate_hz, frame)
         streams[name] = (described, grid_ns(rate_hz, len(values)), values)
 
+    def touch(n):
+        return rng.gamma(2.0, 3.0, (n, 320)).astype("f4")
+
     def poses(n):
         return pose_from_transform(trajectory_of(rng, n).Ts_world_wrist_left)
 
     for side in ("left", "right"):
-        add(
-            f"tactile_{side}",
-            "tactile",
-            lambda n: rng.gamma(2.0, 3.0, (n, 320)).astype("f4"),
-            60,
-            "kPa",
-        )
+        add(f"tactile_{side}", "tactile", touch, 60, "kPa")
         add(
             f"keypoints_{side}",
             "keypoints",
