@@ -148,7 +148,12 @@ class StateTrainSettings(DataSettings):
         "success, for new tasks from few takes; or that estimate alone",
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
+    num_members: int = Field(
+        default=3,
+        ge=1,
+        le=16,
+        description="members of the ensemble; with --init, by default as many as that has",
+    )
     heldout_share: float = Field(
         default=0.08, gt=0, lt=1, description="share of held-out scenes, if no --heldout is given"
     )

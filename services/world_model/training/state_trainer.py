@@ -260,6 +260,14 @@ def _with_base(
             f"of --init, {', '.join(about.dynamics.tasks)}; --learn readers trains start readers "
             "for other tasks"
         )
+    is_chosen = "num_members" in settings.model_fields_set
+    if settings.learn == "all" and is_chosen:
+        return settings.model_copy(update={"renderer": about.renderer})
+    if is_chosen and settings.num_members != about.num_members:
+        raise InvalidInputError(
+            f"--num-members: got {settings.num_members}, expected {about.num_members}, as in "
+            f"--init, since --learn {settings.learn} keeps its members; or leave the flag out"
+        )
     shape = {"num_members": about.num_members, "renderer": about.renderer}
     if settings.learn == "all":
         return settings.model_copy(update=shape)

@@ -64,12 +64,16 @@ class Base:
         counts = set(zip(own.tasks, own.num_objects, strict=True))
         return counts >= set(zip(config.tasks, config.num_objects, strict=True))
 
+    def _own(self, member: int) -> int:
+        """Member of the base that a member starts from: more members share those of the base."""
+        return member % self.checkpoint.metadata.num_members
+
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
         """A member's reader; weights of tasks that the base does not know are fresh."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             reader = StartReader(config)
-        known = self.checkpoint.dynamics.readers()[member].state_dict()
+        known = self.checkpoint.dynamics.readers()[self._own(member)].state_dict()
         kept = {name: value for name, value in known.items() if name not in _OF_TASKS}
         reader.load_state_dict(kept, strict=False)
         self._copy_tasks(config, reader.state_dict(), known)
@@ -97,9 +101,9 @@ class Base:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             core = RecurrentCore(config)
-        known = self.checkpoint.dynamics.core
+        known, own = self.checkpoint.dynamics.core, self._own(member)
         kept = {
-            name: value[member : member + 1]
+            name: value[own : own + 1]
             for name, value in known.named_parameters()
             if learns_all or not name.startswith(_SUCCESS)
         }

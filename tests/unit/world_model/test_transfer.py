@@ -27,7 +27,7 @@ from services.world_model.training.state_trainer import (
     _Work,
     train_state,
 )
-from services.world_model.training.transfer import Base
+from services.world_model.training.transfer import _OF_TASKS, Base
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.test_state_training import PX, episode
 
@@ -182,3 +182,27 @@ def test_the_estimate_alone_is_trained_from_what_a_reader_reads(base, table):
         assert is_read is starts_read
         assert torch.allclose(start.sd_m, given.sd_m) is starts_read
         assert torch.allclose(start.size, given.size) is starts_read
+
+
+def test_more_members_than_the_base_share_its_members(base, config):
+    reader = base.checkpoint.dynamics.readers()[1].state_dict()
+    taken = base.reader(config, 3, seed=0).state_dict()
+    kept = [name for name in reader if name not in _OF_TASKS]
+    assert kept
+    assert all(torch.equal(taken[name], reader[name]) for name in kept)
+    own = base.checkpoint.metadata.dynamics
+    core, row = base.checkpoint.dynamics.core, base.core(own, 3, seed=0, learns_all=True)
+    name = next(name for name, _ in row.named_parameters())
+    assert torch.equal(row.get_parameter(name), core.get_parameter(name)[1:2])
+
+
+@pytest.mark.parametrize(("flags", "expected"), [({}, 2), ({"num_members": 5}, 5)])
+def test_the_number_of_members_is_the_bases_unless_it_is_chosen(base, config, flags, expected):
+    settings = StateTrainSettings(episodes=("takes",), init=base._path, **flags)
+    assert _with_base(base, config, settings).num_members == expected
+
+
+def test_a_kept_ensemble_has_the_members_of_the_base(base, config):
+    given = StateTrainSettings(episodes=("a",), init=base._path, learn="readers", num_members=3)
+    with pytest.raises(InvalidInputError, match="--num-members: got 3, expected 2"):
+        _with_base(base, config, given)
