@@ -51,6 +51,7 @@ from .episodes import EpisodeSummary as EpisodeSummary
 from .episodes import ExpireUploads as ExpireUploads
 from .episodes import FinishRecording as FinishRecording
 from .episodes import HoursRow as HoursRow
+from .episodes import ImportedFile as ImportedFile
 from .episodes import LedgerEntry as LedgerEntry
 from .episodes import LineageEntry as LineageEntry
 from .episodes import NewRecording as NewRecording
