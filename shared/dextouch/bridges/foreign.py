@@ -81,7 +81,8 @@ class ImportedStream:
 class ImportReport:
     """Result of an import: nothing of the file is missing from all three lists.
 
-    `kept_as_numbers` are streams that are also among `imported`, with the reason.
+    `kept_as_numbers` are streams that are also among `imported`, with the reason. `contradictions`
+    are those between what the file says of itself and what it holds.
     """
 
     recording_id: str
@@ -89,6 +90,7 @@ class ImportReport:
     imported: list[ImportedStream] = field(default_factory=list)
     kept_as_numbers: dict[str, str] = field(default_factory=dict)
     refused: list[Refused] = field(default_factory=list)
+    contradictions: list[str] = field(default_factory=list)
 
     def as_json(self) -> dict[str, object]:
         """Plain JSON values."""
@@ -112,6 +114,7 @@ class ImportReport:
         for no in self.refused:
             about = f" ({no.schema})" if no.schema else ""
             yield f"  refused {no.source}{about}, {no.num_samples} samples: {no.reason}"
+        yield from (f"  contradiction: {one}" for one in self.contradictions)
 
 
 @dataclass(frozen=True)
