@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
@@ -14,6 +15,9 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_r
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
+
+if TYPE_CHECKING:
+    from dextouch.bridges.foreign import ImportReport
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]
@@ -176,23 +180,50 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    if options.format == "mcap":
-        from dextouch.bridges.mcap import import_mcap
+    from dextouch.bridges.foreign import find_format
 
-        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        files = [file for file in found if file == path or not is_system_file(file.name)]
-        if not files:
-            raise NotFoundError(f"{path}: holds no .mcap file")
-        names = progress(files, "import mcap", len(files))
-        ids = [import_mcap(file, store) for file in names]
-    else:
+    form = options.format or find_format(path)
+    about = {"format": form, "store": options.store}
+    if form == "lerobot":
         from dextouch.bridges.lerobot import ImportOptions, import_lerobot
 
         chosen = ImportOptions(id_prefix=options.id_prefix, images=options.images)
         ids = import_lerobot(path, store, options=chosen)
-    for item_id in ids:
-        print(item_id)
-    return {"format": options.format, "store": options.store, "ids": ids}
+        for item_id in ids:
+            print(item_id)
+        return about | {"ids": ids}
+    found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
+    files = [file for file in found if file == path or not is_system_file(file.name)]
+    if not files:
+        raise NotFoundError(f"{path}: holds no .{form} file")
+    reports = [_import_file(f, store, form, options) for f in progress(files, form, len(files))]
+    for report in reports:
+        lines = report.lines() if report.imported else [report.recording_id]
+        print(*lines, sep="\n")
+    ids = [report.recording_id for report in reports]
+    return about | {"ids": ids, "reports": [report.as_json() for report in reports]}
+
+
+def _import_file(
+    path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
+) -> "ImportReport":
+    from dextouch.bridges.foreign import ImportAttributes
+
+    about = ImportAttributes(
+        mapping=options.map,
+        id_prefix=options.id_prefix,
+        task=options.task,
+        instruction=options.instruction,
+        domain=options.domain,
+        images=options.images,
+    )
+    if form == "rrd":
+        from dextouch.bridges.foreign_rerun import import_rrd
+
+        return import_rrd(path, store, about, timeline=options.timeline)
+    from dextouch.bridges.foreign_mcap import import_any_mcap
+
+    return import_any_mcap(path, store, about)
 
 
 def export_main(argv: Sequence[str]) -> int:

@@ -126,10 +126,14 @@ examples:
 """
 _IMPORT_HELP = """\
 examples:
-  dextouch import --format mcap take.mcap
+  dextouch import take.mcap --map camera_head=/camera/color/image_raw/compressed \\
+      --map wrist_left=/tf:left_hand --map tactile_left=/glove/left
   dextouch import --format mcap takes/
+  dextouch import run.rrd --timeline frame_time
   dextouch import --format lerobot data/lerobot --id-prefix theirs-
 
+Files that DexTouch exported come back as they were. Every other mcap or rrd file becomes a
+recording of the streams that it has, and a report says what was not imported, and why.
 What each format keeps and loses: docs/bridges.md
 """
 TASKS = ("stand_bottle", "stack_bowls")
@@ -403,15 +407,42 @@ def export_parser() -> argparse.ArgumentParser:
     return parser
 
 
+class _Mapping(argparse.Action):
+    """Collects NAME=SOURCE; a name that comes twice is refused."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        name, found, source = str(values).partition("=")
+        known = getattr(namespace, self.dest)
+        if not (name and found and source) or name in known:
+            parser.error(f"{option_string}: got {values!r}, expected STREAM=SOURCE, each once")
+        setattr(namespace, self.dest, known | {name: source})
+
+
 def import_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch import`."""
     parser = _bridge_parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
-    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
-    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
-    images = "lerobot: unit of stored images (%(default)s)"
+    forms = ("lerobot", "mcap", "rrd")
+    add("--format", choices=forms, help="input format (default: that of the content)")
+    prefix = "prefix of every id, but not of our own mcap exports"
+    add("--id-prefix", default="", metavar="TEXT", help=prefix)
+    images = "unit of video that must be decoded (%(default)s)"
     add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
+    mapped = "mcap, rrd: name the stream of a topic or entity; repeat it for more"
+    add("--map", action=_Mapping, default={}, metavar="STREAM=SOURCE", help=mapped)
+    timeline = "rrd: timeline of the samples (default: the only one with times)"
+    add("--timeline", metavar="NAME", help=timeline)
+    add("--task", default="imported", metavar="TASK", help="mcap, rrd: task (%(default)s)")
+    add("--instruction", default="", metavar="TEXT", help="mcap, rrd: the task's sentence")
+    domain = "mcap, rrd: who acts (%(default)s)"
+    add("--domain", choices=("human", "robot"), default="human", help=domain)
     return parser
 
 
