@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from dextouch.bridges.foreign_images import (
+    check_codec,
     compressed_form,
     decode_png,
     decode_raw,
@@ -255,6 +256,7 @@ def _raw_image(message: Plain) -> list[Item]:
 
 def _video(message: Plain) -> list[Item]:
     data, codec = _bytes(message["data"]), _text(message.get("format"))
+    check_codec(codec)
     form = Form("image", VIDEO_UNIT + codec, "uint8", (), _frame(message))
     return [_item(message, form, lambda: data)]
 

@@ -14,6 +14,7 @@ from rerun.chunk import Chunk, RrdReader
 from dextouch.bridges.foreign import ImportAttributes, ImportReport
 from dextouch.bridges.foreign_images import (
     RAW,
+    check_codec,
     check_pixels,
     compressed_form,
     decode_png,
@@ -288,7 +289,8 @@ def _video(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
     value, codec = row.get("VideoStream:sample"), _part(known, "VideoStream:codec", 1)
     if value is None or not value.is_valid or not len(value):
         return
-    name = "unknown" if codec is None else _VIDEO_CODECS.get(int(codec[0]), "unknown")
+    name = "unknown" if codec is None else _VIDEO_CODECS.get(int(codec[0]), str(int(codec[0])))
+    check_codec(name)
     data = _flat(value).tobytes()
     yield _item(Form("image", VIDEO_UNIT + name, "uint8", (), frame), lambda: data)
 

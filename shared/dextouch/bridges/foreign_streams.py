@@ -314,6 +314,7 @@ class _Part:
                     value = self._convert(self._source_form.fit(value, item.form))
                 self._add(stamps, value)
         except DexTouchError as error:
+            self._stamps.pop(self._num_packets - 1, None)
             self.lose(error)
         if self.is_ordered and (
             self._pending_bytes >= MAX_PENDING_BYTES or len(self._rows) >= MAX_PENDING
