@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import ValidationError
@@ -26,6 +26,8 @@ MAX_NAME: Final = 64
 MAX_ID: Final = 128
 # Suffixes of the arrays beside a stream's values, which no other stream may be called.
 _STAMP_SUFFIXES: Final = ("_t_host_ns", "_t_device_ns", "_sequence")
+# First bytes of the formats of single files.
+MAGIC: Final = {"mcap": b"\x89MCAP0\r\n", "rrd": b"RRF"}
 _NS_PER_S: Final = 1_000_000_000
 # Host times before are those of a clock that counts from its start, not from 1970.
 _EARLIEST_NS: Final = int(datetime(2000, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
@@ -121,7 +123,8 @@ class ImportReport:
 class ImportAttributes:
     """What a file of another tool does not say about the take.
 
-    `mapping` has sources by stream name and overrides the rule of `stream_names`.
+    `mapping` has sources by stream name and overrides the rule of `stream_names`; `images` is the
+    unit of video that must be decoded.
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
@@ -130,6 +133,31 @@ class ImportAttributes:
     instruction: str = ""
     domain: str = "human"
     station: str = "imported"
+    images: Literal["h264", "jpeg", "rgb8"] = "h264"
+
+
+def find_format(path: Path) -> str:
+    """Format of a file or folder by its content: `mcap`, `rrd` or `lerobot`.
+
+    Raises InvalidInputError if it is none of these.
+    """
+    if path.is_dir():
+        if (path / "meta" / "info.json").is_file():
+            return "lerobot"
+        for form in MAGIC:
+            if any(path.glob(f"*.{form}")):
+                return form
+        found = "a folder without meta/info.json, .mcap or .rrd files"
+    else:
+        with disk_errors(f"read {path}"), path.open("rb") as file:
+            start = file.read(8)
+        for form, magic in MAGIC.items():
+            if start.startswith(magic):
+                return form
+        found = f"a file that begins with {start.hex(' ') or 'nothing'}"
+    raise InvalidInputError(
+        f"{path}: got {found}, expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
+    )
 
 
 def stream_names(sources: Sequence[str], mapping: Mapping[str, str]) -> dict[str, str]:
@@ -247,7 +275,8 @@ def write_recording(
     """Write the streams of a foreign file as one recording, whole or not at all.
 
     `blocks` are those of all streams with the stream's name, for files in which streams are
-    interleaved; without it each stream's own are taken in turn. Samples out of order within a block
+    interleaved; without it each stream's own are taken in turn. `refused` is read at the end, when
+    the blocks are taken. Samples out of order within a block
     are sorted, and both these and repeated stamps are counted in the report.
 
     Raises:
@@ -260,12 +289,11 @@ def write_recording(
         )
     source = attributes.imported_from
     report = ImportReport(attributes.recording_id, "" if source is None else source.name)
-    report.refused += refused
     if not streams:
         raise InvalidInputError(
             f"{report.file}: has no stream to import"
-            + "".join(f"; {one.source}: {one.reason}" for one in report.refused[:20]),
-            refused=[asdict(one) for one in report.refused],
+            + "".join(f"; {one.source}: {one.reason}" for one in refused[:20]),
+            refused=[asdict(one) for one in refused],
         )
     descriptors = tuple(stream.descriptor for stream in streams)
     attributes = attributes.model_copy(update={"streams": descriptors})
@@ -275,6 +303,7 @@ def write_recording(
             blocks = ((one.descriptor.name, block) for one in streams for block in one.blocks)
         for name, block in blocks:
             counters[name].append(block)
+    report.refused += refused
     report.imported += [counter.result() for counter in counters.values()]
     report.kept_as_numbers |= {s.descriptor.name: s.as_numbers for s in streams if s.as_numbers}
     return report

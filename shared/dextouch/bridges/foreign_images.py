@@ -149,14 +149,18 @@ def decode_raw(
     return np.ascontiguousarray(pixels.reshape(height_px, width_px, channels)[..., colours])
 
 
+def check_codec(codec: str) -> None:
+    """Raise InvalidInputError for a video format that this reader does not decode."""
+    if codec not in VIDEO_CODECS:
+        raise InvalidInputError(
+            f"video format {codec!r}; expected one of {', '.join(VIDEO_CODECS)}"
+        )
+
+
 class VideoDecoder:
     """Decoder of one camera's video, packet by packet; a packet is one image, without B-frames."""
 
     def __init__(self, codec: str) -> None:
-        if codec not in VIDEO_CODECS:
-            raise InvalidInputError(
-                f"video format {codec!r}; expected one of {', '.join(VIDEO_CODECS)}"
-            )
         self._context: Any = av.CodecContext.create(VIDEO_CODECS[codec], "r")
         self._context.thread_count = 1
         self._context.options = {"max_pixels": str(MAX_PIXELS), "flags": "+low_delay"}

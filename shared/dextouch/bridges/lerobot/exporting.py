@@ -151,7 +151,9 @@ def _existing(folder: Path, options: ExportOptions) -> ExistingDataset | None:
             f"{folder}: exists already; choose another folder, or add --append or --force"
         )
     if not (folder / layout.INFO_FILE).is_file():
-        raise ConflictError(f"{folder}: is not a LeRobot dataset, so it is not {options.existing}d")
+        raise ConflictError(
+            f"{folder}: is not a LeRobot data set, so --force and --append leave it as it is"
+        )
     return ExistingDataset.read(folder) if options.existing == "append" else None
 
 

@@ -1,8 +1,8 @@
 """Import of LeRobot datasets: those with our actions as episodes, all others as recordings."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ from dextouch.episodes import EpisodeStore, Kind
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import (
+    MAX_INSTRUCTION,
     EpisodeAttributes,
     LineageEntry,
     StoredAnchor,
@@ -69,9 +70,9 @@ DEFAULTS = ImportOptions()
 class DatasetImport:
     """Result of an import: what was written under which ids, and what was not.
 
-    `reports` are those of recordings, one each; of episodes, `kept` are the streams by feature and
-    `refused` what no stream could be made of. `contradictions` are those between the dataset's
-    description and its files.
+    `reports` are those of recordings, one each; of episodes of other origin, `kept` are the streams
+    of images and of features without a role, and `refused` what no stream could be made of.
+    `contradictions` are those between the dataset's description and its files.
     """
 
     kind: Kind
@@ -81,6 +82,27 @@ class DatasetImport:
     refused: list[Refused] = field(default_factory=list)
     contradictions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def as_json(self) -> dict[str, object]:
+        """Plain JSON values."""
+        return asdict(self)
+
+    def lines(self) -> Iterator[str]:
+        """The result for a terminal: all of the first recording, of others what is new."""
+        yield from self.notes
+        told: set[str] = set()
+        for report in self.reports:
+            head, *rest = report.lines()
+            yield head
+            about = ("  refused", "  contradiction")
+            fresh = [one for one in rest if not told or one.startswith(about)]
+            yield from (one for one in fresh if one not in told)
+            told.update(rest)
+        if not self.reports:
+            yield from self.ids
+            yield from (f"  {name}  <- {key}" for key, name in self.kept.items())
+            yield from (f"  refused {one.source}: {one.reason}" for one in self.refused)
+            yield from (f"  contradiction: {one}" for one in self.contradictions)
 
 
 def import_lerobot(
@@ -124,7 +146,6 @@ def import_dataset(
         if is_taken and name not in {*_ROLES, *features}:
             raise UnknownNameError(f"name of feature {key!r} (--map)", name, [*_ROLES, "camera_…"])
     result = DatasetImport("episode")
-    result.kept = {key: name for name, key in features.items() if name not in _ROLES}
     result.contradictions = dataset_contradictions(source)
     for entry in source.episodes:
         _import_episode(source, store, entry, features, options, result)
@@ -410,7 +431,7 @@ def _foreign_attributes(
     return {
         "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
         "task": (options.task or entry.task or "unknown")[:128],
-        "instruction": entry.task[:2000],
+        "instruction": (options.instruction or entry.task)[:MAX_INSTRUCTION],
         "domain": options.domain,
         "origin": "recorded",
         "model_rate_hz": float(source.info.fps),

@@ -30,7 +30,7 @@ from dextouch.bridges.lerobot.feature_streams import (
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, InvalidInputError
-from dextouch.schemas import Domain, LineageEntry, Matrix, RecordingAttributes
+from dextouch.schemas import MAX_INSTRUCTION, Domain, LineageEntry, Matrix, RecordingAttributes
 from dextouch.streams import HEAD_CAMERA
 
 # Of the frames' times from their nominal ones, as a share of a frame: chosen, a tenth shows a rate
@@ -47,8 +47,8 @@ class ImportOptions:
     `tactile` and cameras (`camera_head`, `camera_wrist_left`, …); of recordings the name of any
     stream. `id_prefix`: put before every id (needed when ids exist already); `images`: the unit
     that images are stored in, None for the one nearest to what they are. Only for datasets of other
-    origin: `K_head` in pixels, `domain` and `task` (without it the dataset's own text), and `fps`,
-    the rate instead of that and the timestamps of the dataset.
+    origin: `K_head` in pixels, `domain`, `task` and `instruction` (without them the dataset's own
+    text), and `fps`, the rate instead of that and the timestamps of the dataset.
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
@@ -57,6 +57,7 @@ class ImportOptions:
     K_head: Matrix | None = None
     domain: Domain = "robot"
     task: str | None = None
+    instruction: str = ""
     fps: float | None = None
 
 
@@ -244,7 +245,7 @@ def _attributes(
     about = ImportAttributes(
         id_prefix=options.id_prefix,
         task=task[:128],
-        instruction=" / ".join(entry.tasks)[:2000],
+        instruction=(options.instruction or " / ".join(entry.tasks))[:MAX_INSTRUCTION],
         domain=options.domain,
         station=source.info.robot_type or "lerobot",
     )
