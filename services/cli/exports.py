@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
@@ -20,6 +20,8 @@ Reader = EpisodeReader | RecordingReader
 Report = dict[str, Any]
 # By id and camera.
 DamagedImages = dict[str, dict[str, list[int]]]
+# Exit status if some of several files were refused, as of a command that is.
+_SOME_FAILED = 3
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -201,12 +203,21 @@ def _import(options: argparse.Namespace) -> Report:
     files = [file for file in found if file == path or not is_system_file(file.name)]
     if not files:
         raise NotFoundError(f"{path}: holds no .{form} file")
-    reports = [_import_file(f, store, form, options) for f in progress(files, form, len(files))]
-    for report in reports:
-        lines = report.lines() if report.imported else [report.recording_id]
-        print(*lines, sep="\n")
+    reports, failed = [], {}
+    for file in progress(files, f"import {form}", len(files)):
+        try:
+            report = _import_file(file, store, form, options)
+        except DexTouchError as error:
+            if len(files) == 1:
+                raise
+            failed[str(file)] = error.message
+            print(f"{file}: not imported: {error.message}", file=sys.stderr)
+            continue
+        reports.append(report)
+        print(*(report.lines() if report.imported else [report.recording_id]), sep="\n")
     ids = [report.recording_id for report in reports]
-    return about | {"ids": ids, "reports": [report.as_json() for report in reports]}
+    files_of = [report.as_json() for report in reports]
+    return about | {"ids": ids, "reports": files_of, "failed": failed}
 
 
 def _import_file(
@@ -241,5 +252,6 @@ def export_main(argv: Sequence[str]) -> int:
 def import_main(argv: Sequence[str]) -> int:
     """Run `dextouch import`."""
     options = import_parser().parse_args(list(argv))
-    write_result(options.json, _import(options))
-    return 0
+    report = _import(options)
+    write_result(options.json, report)
+    return _SOME_FAILED if report.get("failed") else 0

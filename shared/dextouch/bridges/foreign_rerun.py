@@ -1,5 +1,6 @@
 """Import of Rerun `.rrd` files, read by rerun-sdk: what one timeline holds becomes a recording."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -86,9 +87,16 @@ def import_rrd(
 
 def _chunks(path: Path) -> Iterator[Chunk]:
     try:
-        yield from RrdReader(path).stream()
+        yield from _opened(path)[0].stream()
     except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
         raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
+
+
+def _opened(path: Path) -> tuple[RrdReader, list[str]]:
+    """The reader of a file, and its warnings: of a file without a footer, which may be cut."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        return RrdReader(path), [str(one.message) for one in said]
 
 
 def _timeline(path: Path, name: str | None) -> str:
@@ -122,6 +130,9 @@ class _Rows:
 
     def run(self) -> Iterator[Reading]:
         """Iterate over the rows, static ones first."""
+        if self._survey is not None:
+            for reason in _opened(self._path)[1]:
+                self._survey.refuse(self._path.name, "file", reason)
         for chunk in _chunks(self._path):
             if chunk.is_static:
                 self._remember(chunk)
