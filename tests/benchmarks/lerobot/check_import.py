@@ -42,6 +42,12 @@ def main() -> int:
                 failed += 1
                 found = f"FAIL {error}"
             sys.stdout.write(f"written by lerobot with {codec}: {found}\n")
+        try:
+            found = check_conversion(Path(folder) / "arm")
+        except MismatchError as error:
+            failed += 1
+            found = f"FAIL {error}"
+        sys.stdout.write(f"v2.1, and converted to v3.0 by lerobot: {found}\n")
     return 1 if failed else 0
 
 
@@ -131,6 +137,40 @@ def check(codec: str, folder: Path) -> str:
         f"{sum(LENGTHS)} frames of {len(LENGTHS)} episodes, numbers and PNG images equal, "
         f"videos at least {lowest_db:.1f} dB (bound {LEAST_PSNR_DB:g})"
     )
+
+
+def check_conversion(folder: Path) -> str:
+    """Import a v2.1 dataset before and after lerobot's own conversion to v3.0, and compare.
+
+    Raises:
+        MismatchError: where the two imports differ.
+    """
+    from foreign_lerobot import arm
+    from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
+
+    from dextouch.bridges.lerobot import ImportOptions, import_dataset
+    from dextouch.episodes import EpisodeStore
+
+    store = EpisodeStore(folder.with_name("arm-store"))
+    arm().write_v21(folder)
+    before = import_dataset(folder, store)
+    convert_dataset(REPO, root=folder, push_to_hub=False)
+    after = import_dataset(folder, store, options=ImportOptions(id_prefix="v3-"))
+    num_compared = 0
+    for one, other in zip(before.ids, after.ids, strict=True):
+        old, new = store.recording(one), store.recording(other)
+        require("streams", set(new.streams), set(old.streams))
+        require("task", new.attributes.task, old.attributes.task)
+        for name, stream in old.streams.items():
+            require(f"{name}: times", new.stamps_ns(name).tolist(), old.stamps_ns(name).tolist())
+            is_image = stream.kind == "image"
+            got, expected = (
+                r.images(name) if is_image else r.values(name, 0, r.num_samples(name))
+                for r in (new, old)
+            )
+            require(f"{name}: values", np.array_equal(got, expected), expected=True)
+            num_compared += 1
+    return f"{num_compared} streams of {len(before.ids)} episodes equal"
 
 
 def check_numbers(recording, written) -> None:

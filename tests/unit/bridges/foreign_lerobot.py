@@ -183,11 +183,25 @@ class Foreign:
         meta = folder / "meta"
         meta.mkdir(exist_ok=True)
         tasks = [{"task_index": k, "task": text} for k, text in enumerate(TASKS)]
-        for name, rows in (("episodes", lines), ("tasks", tasks)):
+        stats = [self._statistics(episode) for episode in range(len(self.lengths))]
+        for name, rows in (("episodes", lines), ("tasks", tasks), ("episodes_stats", stats)):
             text = "".join(json.dumps(row) + "\n" for row in rows)
             (meta / f"{name}.jsonl").write_text(text)
         (meta / "info.json").write_text(json.dumps(info))
         return folder
+
+    def _statistics(self, episode):
+        found = {}
+        for key, feature in self.features.items():
+            if feature["dtype"] != "string":
+                rows = np.array(self.values[key][episode], dtype=float).reshape(
+                    self.lengths[episode], -1, feature["shape"][-1]
+                )
+                found[key] = {
+                    kind: getattr(rows, kind)(axis=(0, 1)).tolist()
+                    for kind in ("min", "max", "mean", "std")
+                } | {"count": [self.lengths[episode]]}
+        return {"episode_index": episode, "stats": found}
 
     def _videos(self):
         return [key for key, (dtype, *_) in self.cameras.items() if dtype == "video"]

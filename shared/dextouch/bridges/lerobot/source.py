@@ -139,7 +139,7 @@ class LeRobotFolder:
         self.info = _read_info(folder)
         self.tasks = _read_tasks(folder, self.info)
         self.episodes = _read_episodes(folder, self.info, self.tasks)
-        self._table: tuple[Path, pa.Table] | None = None
+        self._table: tuple[Path, pa.Table, dict[int, tuple[int, int]]] | None = None
 
     def columns(self, entry: EpisodeEntry, names: list[str]) -> dict[str, np.ndarray]:
         """Columns [n, *shape] of one episode by feature.
@@ -282,13 +282,21 @@ class LeRobotFolder:
         # Consecutive episodes usually share a file, so the last table is cached.
         if self._table is None or self._table[0] != path:
             images = {name for name, feature in self.info.features.items() if feature.is_camera()}
-            self._table = path, _read_table(path, leave_out=images)
-        table = self._table[1]
-        owners = _column_values(table, "episode_index", [1], str(path))
-        rows = np.flatnonzero(owners == entry.index)
-        if len(rows) and int(rows[-1]) - int(rows[0]) + 1 != len(rows):
-            raise CorruptDataError(f"{path}: frames of episode {entry.index} are not contiguous")
-        return table, int(rows[0]) if len(rows) else 0, len(rows)
+            table = _read_table(path, leave_out=images)
+            owners = _column_values(table, "episode_index", [1], str(path))
+            starts = np.flatnonzero(np.diff(owners, prepend=owners[:1] - 1))
+            runs = zip(owners[starts].tolist(), starts.tolist(), strict=True)
+            ends = [*starts[1:].tolist(), len(owners)]
+            places: dict[int, tuple[int, int]] = {}
+            for (episode, start), end in zip(runs, ends, strict=True):
+                if episode in places:
+                    raise CorruptDataError(
+                        f"{path}: frames of episode {episode} are not contiguous"
+                    )
+                places[episode] = (start, end - start)
+            self._table = path, table, places
+        _, table, places = self._table
+        return table, *places.get(entry.index, (0, 0))
 
 
 def _image_values(path: Path, name: str, start: int, count: int) -> Iterator[object]:
