@@ -144,6 +144,10 @@ def _export(options: argparse.Namespace) -> Report:
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
+    if options.append and form != "lerobot":
+        raise InvalidInputError(
+            f"--append: a file of {form!r} cannot grow; only lerobot data sets can"
+        )
     ids = _ids(store, options)
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))

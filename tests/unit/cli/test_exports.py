@@ -177,6 +177,10 @@ def test_lerobot_data_sets_grow_and_get_a_card(store, dextouch, tmp_path):
     assert json.loads(report.read_text())["present"] == ["one"]
     assert "license: cc-by-4.0" in (folder / "README.md").read_text()
     assert dextouch("import", folder, store="other")[1] == "one\ntwo\n"
+    words = ("export", "--format", "umi", "--append", "--to", tmp_path / "all.zip")
+    status, _, err = dextouch(*words)
+    assert status == main.EXIT_REFUSED
+    assert "only lerobot" in err
 
 
 def test_a_lerobot_data_set_of_another_robot_becomes_recordings(store, dextouch, tmp_path):
