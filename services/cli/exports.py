@@ -219,6 +219,7 @@ def _import_file(
     path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
 ) -> "ImportReport":
     from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.tactile.layout import read_layout
 
     about = ImportAttributes(
         mapping=options.map,
@@ -227,6 +228,7 @@ def _import_file(
         instruction=options.instruction,
         domain=options.domain,
         images=options.images,
+        layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
         from dextouch.bridges.foreign_rerun import import_rrd

@@ -437,6 +437,8 @@ def import_parser() -> argparse.ArgumentParser:
     add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
     mapped = "mcap, rrd: name the stream of a topic or entity; repeat it for more"
     add("--map", action=_Mapping, default={}, metavar="STREAM=SOURCE", help=mapped)
+    layout = "mcap, rrd: layout of mapped tactile streams (default: that of our own glove)"
+    add("--layout", type=Path, metavar="FILE", help=layout)
     timeline = "rrd: timeline of the samples (default: the only one with times)"
     add("--timeline", metavar="NAME", help=timeline)
     add("--task", default="imported", metavar="TASK", help="mcap, rrd: task (%(default)s)")

@@ -21,6 +21,7 @@ from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import ImportedFile, RecordingAttributes, first_problems
 from dextouch.streams import NO_DEVICE_TIME, StreamDescriptor
+from dextouch.tactile.layout import TactileLayout
 
 MAX_NAME: Final = 64
 MAX_ID: Final = 128
@@ -121,7 +122,8 @@ class ImportAttributes:
     """What a file of another tool does not say about the take.
 
     `mapping` has sources by stream name and overrides the rule of `stream_names`; `images` is the
-    unit of video that must be decoded.
+    unit of video that must be decoded; `layout` that of the taxels of mapped tactile streams,
+    None of `dextouch_v1`.
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
@@ -131,6 +133,7 @@ class ImportAttributes:
     domain: str = "human"
     station: str = "imported"
     images: Literal["h264", "jpeg", "rgb8"] = "h264"
+    layout: TactileLayout | None = None
 
 
 def find_format(path: Path) -> str:

@@ -46,6 +46,7 @@ from dextouch.streams import (
     StreamDescriptor,
     encoded_values,
 )
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 
 MAX_SOURCES: Final = 1000
 MAX_SAMPLES: Final = 20_000_000
@@ -79,10 +80,13 @@ class Reading:
 Convert = Callable[[np.ndarray], np.ndarray]
 
 
-def mapped_form(name: str, form: Form) -> tuple[Form, Convert, str | None]:
+def mapped_form(
+    name: str, form: Form, layout: TactileLayout = DEXTOUCH_V1
+) -> tuple[Form, Convert, str | None]:
     """Form, conversion and side of a source that is mapped to one of our own streams.
 
-    Streams of other names stay as they are. Floats as touch are taken for kPa, integers for counts.
+    Streams of other names stay as they are. Floats as touch are the taxels of a layout in kPa,
+    integers the counts of its raw cells.
 
     Raises InvalidInputError for a source that cannot be that stream.
     """
@@ -90,8 +94,13 @@ def mapped_form(name: str, form: Form) -> tuple[Form, Convert, str | None]:
     numbers = form.kind != "image"
     size = math.prod(form.shape)
     if name.startswith("tactile_") and side:
-        wanted, fits = "numbers", numbers
         is_float = form.dtype.startswith("float")
+        count = layout.num_taxels if is_float else layout.num_raw_cells
+        what = "taxels in kPa" if is_float else "raw cells"
+        wanted, fits = (
+            f"the {count} {what} of {layout.name!r} (--layout)",
+            numbers and size == count,
+        )
         made = replace(
             form,
             kind="tactile",
@@ -219,7 +228,7 @@ class _Part:
 
     # Between the passes.
 
-    def plan(self, name: str, images: str) -> StreamDescriptor:
+    def plan(self, name: str, about: ImportAttributes) -> StreamDescriptor:
         """The stream; raises InvalidInputError or LimitExceededError if it cannot be one."""
         form = max(self.forms, key=lambda one: one[1])[0]
         self._source_form = form
@@ -229,8 +238,9 @@ class _Part:
                 "time first"
             )
         if self.video is not None:
-            form = self._video_form(form, images)
-        form, self._convert, side = mapped_form(name, form)
+            form = self._video_form(form, about.images)
+        layout = about.layout or DEXTOUCH_V1
+        form, self._convert, side = mapped_form(name, form, layout)
         self.form, self.name = form, name
         shown = form.names if form.shape[-1:] == (len(form.names),) else ()
         try:
@@ -245,6 +255,7 @@ class _Part:
                     "frame": form.frame,
                     "side": side,
                     "names": shown,
+                    "layout": about.layout if form.kind == "tactile" else None,
                     "capabilities": self._capabilities(),
                 }
             )
@@ -450,7 +461,7 @@ def _planned(
             refused.append(Refused(label, reason, part.schema, len(part.times)))
             continue
         try:
-            descriptor = part.plan(names[label], about.images)
+            descriptor = part.plan(names[label], about)
         except (InvalidInputError, LimitExceededError) as error:
             if names[label] in about.mapping:
                 raise InvalidInputError(f"--map {names[label]}={label}: {error.message}") from error

@@ -242,8 +242,6 @@ def test_ros_2_messages_that_rosbags_wrote(store):
         "camera_head": "/cam/image_raw/compressed",
         "wrist_left": "/tf:wrist_left",
         "keypoints_left": "/poses",
-        "tactile_left": "/f32",
-        "tactile_right": "/u8",
     }
     report = import_any_mcap(GOLDEN, store, ImportAttributes(mapping=mapping))
     recording = store.recording("ros2_rosbags")
@@ -269,15 +267,12 @@ def test_ros_2_messages_that_rosbags_wrote(store):
     expected = np.ndarray((3, 4), "<f4", raw.tobytes())[:, :3]
     np.testing.assert_array_equal(first("points")[:, :3], expected)
     assert first("points")[:, 3].tolist() == [12 + 13 * 256, 28 + 29 * 256, 44 + 45 * 256]
-    assert recording.values("tactile_left", 0, 2).tolist() == [
-        [0, 1, 2, 3, 4, 5],
-        [1, 2, 3, 4, 5, 6],
+    # Two by three by its layout's dimensions.
+    assert recording.values("f32", 0, 2).tolist() == [
+        [[0, 1, 2], [3, 4, 5]],
+        [[1, 2, 3], [4, 5, 6]],
     ]
-    touch = {name: recording.streams[name] for name in ("tactile_left", "tactile_right")}
-    assert [(one.unit, one.dtype) for one in touch.values()] == [
-        ("kPa", "float32"),
-        ("counts", "uint8"),
-    ]
+    assert [recording.streams[name].dtype for name in ("f32", "u8")] == ["float32", "uint8"]
     assert first("i32").tolist() == [-2, -1, 0, 1]
     assert recording.streams["i32"].dtype == "int64"
     glove = recording.streams["glove"]
@@ -373,6 +368,7 @@ def test_limits_and_mistakes_are_errors(store, tmp_path, monkeypatch):
         ({"wrist_left": "/cam/jpeg"}, "expected poses of one body"),
         ({"camera_head": "/pose"}, "expected images"),
         ({"keypoints_left": "/log"}, "expected points"),
+        ({"tactile_left": "/joints"}, "expected the 320 taxels in kPa of 'dextouch_v1'"),
     ):
         with pytest.raises(InvalidInputError, match=part):
             import_any_mcap(path, store, ImportAttributes(mapping=mapping))
