@@ -1,4 +1,4 @@
-"""Recordings from files of other tools: their streams in, a recording and a report out.
+"""Recordings made of the streams of other tools' files, with their provenance and a report.
 
 Readers of a format yield streams in blocks; what they cannot read they refuse by name. The names of
 streams follow one rule for all formats (`stream_names`).

@@ -25,9 +25,9 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import VideoDecoder, check_pixels, video_size
+from dextouch.bridges.foreign_images import VideoDecoder, check_order, check_pixels, video_size
 from dextouch.bridges.foreign_messages import VIDEO_UNIT, CameraModel, Form, Item
-from dextouch.episodes import GOP_IMAGES, EpisodeStore, check_group, is_keyframe
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, is_keyframe
 from dextouch.errors import (
     CorruptDataError,
     DexTouchError,
@@ -149,7 +149,7 @@ class _Video:
     num_packets: int = 0
     num_before: int = 0
     in_groups: bool = True
-    first_group: list[bytes] = field(default_factory=list)
+    first_packets: list[bytes] = field(default_factory=list)
 
     def add(self, data: bytes) -> None:
         if self.size_px is None and self.num_before < MAX_TRIED:
@@ -159,17 +159,17 @@ class _Video:
             return
         begins = self.num_packets % GOP_IMAGES == 0
         self.in_groups = self.in_groups and self.codec == "h264" and is_keyframe(data) == begins
-        if self.num_packets < GOP_IMAGES:
-            self.first_group.append(data)
+        if self.num_packets < 4 * GOP_IMAGES:
+            self.first_packets.append(data)
         self.num_packets += 1
 
     def is_kept(self) -> bool:
-        """Whether its packets are the store's already: closed groups of 8 images in 4:2:0."""
-        if not self.in_groups or self.size_px is None or self.num_before:
-            return False
-        try:
-            check_group(self.first_group, self.size_px)
-        except DexTouchError:
+        """Whether its packets are the store's already: closed groups of 8 images in 4:2:0.
+
+        Raises InvalidInputError for B-frames.
+        """
+        is_plain = check_order(self.codec, self.first_packets)
+        if not (is_plain and self.in_groups) or self.size_px is None or self.num_before:
             return False
         return self.size_px[0] % 2 == 0 == self.size_px[1] % 2
 
@@ -423,7 +423,7 @@ class Survey:
     def refuse(self, source: str, schema: str, reason: str) -> None:
         """Count a record without samples; past a number of reasons those of a source are one."""
         key = (source, schema, reason)
-        if key not in self.problems:
+        if key not in self.problems and len(self.problems) >= _MAX_REASONS:
             reasons = sum(one[0] == source for one in self.problems)
             if reasons >= _MAX_REASONS or len(self.problems) >= 2 * MAX_SOURCES:
                 key = (source, schema, "other reasons")
