@@ -228,6 +228,7 @@ def _import_file(
     path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
 ) -> "ImportReport":
     from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.tactile.layout import read_layout
 
     about = ImportAttributes(
         mapping=options.map,
@@ -236,6 +237,7 @@ def _import_file(
         instruction=options.instruction,
         domain=options.domain or "human",
         images=options.images or "h264",
+        layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
         from dextouch.bridges.foreign_rerun import import_rrd

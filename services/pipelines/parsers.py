@@ -447,6 +447,8 @@ def import_parser() -> argparse.ArgumentParser:
     add("--images", choices=("h264", "jpeg", "rgb8"), help=images)
     mapped = "name the stream of a topic, entity or feature; repeat it for more"
     add("--map", action=_Mapping, default={}, metavar="STREAM=SOURCE", help=mapped)
+    layout = "mcap, rrd: layout of mapped tactile streams (default: that of our own glove)"
+    add("--layout", type=Path, metavar="FILE", help=layout)
     timeline = "rrd: timeline of the samples (default: the only one with times)"
     add("--timeline", metavar="NAME", help=timeline)
     task = "task (default: the data set's, or imported)"

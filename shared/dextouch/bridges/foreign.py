@@ -1,4 +1,4 @@
-"""Recordings from files of other tools: their streams in, a recording and a report out.
+"""Recordings made of the streams of other tools' files, with their provenance and a report.
 
 Readers of a format yield streams in blocks; what they cannot read they refuse by name. The names of
 streams follow one rule for all formats (`stream_names`).
@@ -21,6 +21,7 @@ from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import ImportedFile, RecordingAttributes, first_problems
 from dextouch.streams import NO_DEVICE_TIME, StreamDescriptor
+from dextouch.tactile.layout import TactileLayout
 
 MAX_NAME: Final = 64
 MAX_ID: Final = 128
@@ -124,7 +125,8 @@ class ImportAttributes:
     """What a file of another tool does not say about the take.
 
     `mapping` has sources by stream name and overrides the rule of `stream_names`; `images` is the
-    unit of video that must be decoded.
+    unit of video that must be decoded; `layout` that of the taxels of mapped tactile streams,
+    None of `dextouch_v1`.
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
@@ -134,6 +136,7 @@ class ImportAttributes:
     domain: str = "human"
     station: str = "imported"
     images: Literal["h264", "jpeg", "rgb8"] = "h264"
+    layout: TactileLayout | None = None
 
 
 def find_format(path: Path) -> str:

@@ -4,7 +4,7 @@ Sizes are read from headers and checked before anything is decoded.
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import av
@@ -163,7 +163,8 @@ class VideoDecoder:
     def __init__(self, codec: str) -> None:
         self._context: Any = av.CodecContext.create(VIDEO_CODECS[codec], "r")
         self._context.thread_count = 1
-        self._context.options = {"max_pixels": str(MAX_PIXELS), "flags": "+low_delay"}
+        # Without low_delay: images come in the order in which they are shown.
+        self._context.options = {"max_pixels": str(MAX_PIXELS)}
         self._reformatter = VideoReformatter()
         self._sent = 0
 
@@ -184,6 +185,10 @@ class VideoDecoder:
         except (av.FFmpegError, ValueError) as error:
             raise CorruptDataError(f"video packet cannot be decoded ({error})") from error
 
+    def is_delayed(self) -> bool:
+        """Whether images wait for later packets, as B-frames need it."""
+        return bool(self._context.has_b_frames)
+
     def to_rgb(self, frame: VideoFrame) -> np.ndarray:
         """Pixels of a decoded image, uint8 [h, w, 3]."""
         frame = self._reformatter.reformat(frame, format="rgb24", interpolation="BICUBIC")
@@ -191,6 +196,27 @@ class VideoDecoder:
         rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
         pixels = rows[: frame.height, : 3 * frame.width]
         return np.ascontiguousarray(pixels).reshape(frame.height, frame.width, 3)
+
+
+def check_order(codec: str, packets: Sequence[bytes]) -> bool:
+    """Whether the first packets of a video are 4:2:0 and need no later ones.
+
+    Raises InvalidInputError for images that are shown in another order than they are sent.
+    """
+    decoder, numbers, is_plain = VideoDecoder(codec), [-1], True
+    try:
+        for data in (*packets, None):
+            for number, frame in decoder.decode(data):
+                numbers.append(number)
+                is_plain = is_plain and frame.format.name in {"yuv420p", "yuvj420p"}
+    except CorruptDataError:
+        is_plain = False
+    if numbers != sorted(numbers):
+        raise InvalidInputError(
+            "video with B-frames, whose images are shown in another order than they are sent; "
+            "encode it without them"
+        )
+    return is_plain and not decoder.is_delayed()
 
 
 def video_size(codec: str, packet: bytes) -> tuple[int, int] | None:

@@ -10,7 +10,7 @@ import binascii
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -421,40 +421,57 @@ def _array(message: Plain, values: np.ndarray, shape: tuple[int, ...], dtype: st
 
 def _flat(message: Plain) -> Item:
     """All numbers of a message, in its order, with their paths as names."""
-    names: list[str] = []
-    numbers: list[float] = []
+    paths: list[tuple[str, int]] = []
+    numbers: list[np.ndarray] = []
     skipped: list[str] = []
+    size = 0
     for path, value in _leaves(message, ""):
-        if path.startswith(("header.", "timestamp.")) or path in {"header", "timestamp"}:
-            continue
-        if isinstance(value, bool | int | float | np.number):
-            names.append(path[-128:])
-            numbers.append(float(value))
+        if isinstance(value, np.ndarray):
+            paths.append((path, value.size if value.ndim else -1))
+            numbers.append(value.ravel().astype(np.float64))
+            size += value.size
         elif value not in {None, ""} and path != "frame_id":
             skipped.append(path)
-        if len(names) > MAX_NUMBERS or len(skipped) > MAX_NUMBERS:
+        if size > MAX_NUMBERS or len(skipped) > MAX_NUMBERS:
             raise LimitExceededError(f"message of more than {MAX_NUMBERS} values")
-    if not numbers:
+    if not size:
         raise InvalidInputError("message without a number")
     form = Form(
         "scalar",
         NUMBERS_UNIT,
         "float64",
-        (len(numbers),),
+        (size,),
         _frame(message),
-        tuple(names),
+        _names(tuple(paths)),
         as_numbers="no schema that this release knows",
         notes=(f"left out, not numbers: {', '.join(skipped[:8])}",) if skipped else (),
     )
-    return _array_item(message, form, np.array(numbers))
+    return _array_item(message, form, np.concatenate(numbers))
+
+
+@lru_cache(maxsize=64)
+def _names(paths: tuple[tuple[str, int], ...]) -> tuple[str, ...]:
+    """Names of numbers (count −1) and of the elements of lists."""
+    return tuple(
+        name[-128:]
+        for path, count in paths
+        for name in ([path] if count < 0 else [f"{path}[{index}]" for index in range(count)])
+    )
 
 
 def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:
-    """Path and value of everything that is not a message or a list."""
+    """Path and value of all in a message but its own time; numbers and lists of them as arrays."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _leaves(inner, f"{path}.{name}" if path else str(name))
-    elif isinstance(value, list | tuple | np.ndarray):
+            if path or name not in {"header", "timestamp"}:
+                yield from _leaves(inner, f"{path}.{name}" if path else str(name))
+    elif isinstance(value, bool | int | float | np.ndarray):
+        array = np.asarray(value)
+        yield path, array if array.dtype.kind in "biuf" and array.ndim < 2 else "array"
+    elif isinstance(value, list | tuple):
+        if value and all(isinstance(one, bool | int | float) for one in value):
+            yield path, np.array(value, dtype=np.float64)
+            return
         for index, inner in enumerate(value[: MAX_NUMBERS + 1]):
             yield from _leaves(inner, f"{path}[{index}]")
     else:

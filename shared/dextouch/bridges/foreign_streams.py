@@ -25,9 +25,9 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import VideoDecoder, check_pixels, video_size
+from dextouch.bridges.foreign_images import VideoDecoder, check_order, check_pixels, video_size
 from dextouch.bridges.foreign_messages import VIDEO_UNIT, CameraModel, Form, Item
-from dextouch.episodes import GOP_IMAGES, EpisodeStore, check_group, is_keyframe
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, is_keyframe
 from dextouch.errors import (
     CorruptDataError,
     DexTouchError,
@@ -46,6 +46,7 @@ from dextouch.streams import (
     StreamDescriptor,
     encoded_values,
 )
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 
 MAX_SOURCES: Final = 1000
 MAX_SAMPLES: Final = 20_000_000
@@ -79,10 +80,13 @@ class Reading:
 Convert = Callable[[np.ndarray], np.ndarray]
 
 
-def mapped_form(name: str, form: Form) -> tuple[Form, Convert, str | None]:
+def mapped_form(
+    name: str, form: Form, layout: TactileLayout = DEXTOUCH_V1
+) -> tuple[Form, Convert, str | None]:
     """Form, conversion and side of a source that is mapped to one of our own streams.
 
-    Streams of other names stay as they are. Floats as touch are taken for kPa, integers for counts.
+    Streams of other names stay as they are. Floats as touch are the taxels of a layout in kPa,
+    integers the counts of its raw cells.
 
     Raises InvalidInputError for a source that cannot be that stream.
     """
@@ -90,8 +94,13 @@ def mapped_form(name: str, form: Form) -> tuple[Form, Convert, str | None]:
     numbers = form.kind != "image"
     size = math.prod(form.shape)
     if name.startswith("tactile_") and side:
-        wanted, fits = "numbers", numbers
         is_float = form.dtype.startswith("float")
+        count = layout.num_taxels if is_float else layout.num_raw_cells
+        what = "taxels in kPa" if is_float else "raw cells"
+        wanted, fits = (
+            f"the {count} {what} of {layout.name!r} (--layout)",
+            numbers and size == count,
+        )
         made = replace(
             form,
             kind="tactile",
@@ -140,7 +149,7 @@ class _Video:
     num_packets: int = 0
     num_before: int = 0
     in_groups: bool = True
-    first_group: list[bytes] = field(default_factory=list)
+    first_packets: list[bytes] = field(default_factory=list)
 
     def add(self, data: bytes) -> None:
         if self.size_px is None and self.num_before < MAX_TRIED:
@@ -150,17 +159,17 @@ class _Video:
             return
         begins = self.num_packets % GOP_IMAGES == 0
         self.in_groups = self.in_groups and self.codec == "h264" and is_keyframe(data) == begins
-        if self.num_packets < GOP_IMAGES:
-            self.first_group.append(data)
+        if self.num_packets < 4 * GOP_IMAGES:
+            self.first_packets.append(data)
         self.num_packets += 1
 
     def is_kept(self) -> bool:
-        """Whether its packets are the store's already: closed groups of 8 images in 4:2:0."""
-        if not self.in_groups or self.size_px is None or self.num_before:
-            return False
-        try:
-            check_group(self.first_group, self.size_px)
-        except DexTouchError:
+        """Whether its packets are the store's already: closed groups of 8 images in 4:2:0.
+
+        Raises InvalidInputError for B-frames.
+        """
+        is_plain = check_order(self.codec, self.first_packets)
+        if not (is_plain and self.in_groups) or self.size_px is None or self.num_before:
             return False
         return self.size_px[0] % 2 == 0 == self.size_px[1] % 2
 
@@ -219,7 +228,7 @@ class _Part:
 
     # Between the passes.
 
-    def plan(self, name: str, images: str) -> StreamDescriptor:
+    def plan(self, name: str, about: ImportAttributes) -> StreamDescriptor:
         """The stream; raises InvalidInputError or LimitExceededError if it cannot be one."""
         form = max(self.forms, key=lambda one: one[1])[0]
         self._source_form = form
@@ -229,8 +238,9 @@ class _Part:
                 "time first"
             )
         if self.video is not None:
-            form = self._video_form(form, images)
-        form, self._convert, side = mapped_form(name, form)
+            form = self._video_form(form, about.images)
+        layout = about.layout or DEXTOUCH_V1
+        form, self._convert, side = mapped_form(name, form, layout)
         self.form, self.name = form, name
         shown = form.names if form.shape[-1:] == (len(form.names),) else ()
         try:
@@ -245,6 +255,7 @@ class _Part:
                     "frame": form.frame,
                     "side": side,
                     "names": shown,
+                    "layout": about.layout if form.kind == "tactile" else None,
                     "capabilities": self._capabilities(),
                 }
             )
@@ -412,7 +423,7 @@ class Survey:
     def refuse(self, source: str, schema: str, reason: str) -> None:
         """Count a record without samples; past a number of reasons those of a source are one."""
         key = (source, schema, reason)
-        if key not in self.problems:
+        if key not in self.problems and len(self.problems) >= _MAX_REASONS:
             reasons = sum(one[0] == source for one in self.problems)
             if reasons >= _MAX_REASONS or len(self.problems) >= 2 * MAX_SOURCES:
                 key = (source, schema, "other reasons")
@@ -450,7 +461,7 @@ def _planned(
             refused.append(Refused(label, reason, part.schema, len(part.times)))
             continue
         try:
-            descriptor = part.plan(names[label], about.images)
+            descriptor = part.plan(names[label], about)
         except (InvalidInputError, LimitExceededError) as error:
             if names[label] in about.mapping:
                 raise InvalidInputError(f"--map {names[label]}={label}: {error.message}") from error

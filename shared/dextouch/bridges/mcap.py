@@ -259,8 +259,8 @@ def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
             text = record.data
     if text is None or kind not in {"episode", "recording"}:
         raise InvalidInputError(
-            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
-            "`dextouch export --format mcap` wrote can be imported"
+            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; expected a file that "
+            "`dextouch export --format mcap` wrote (`dextouch import` takes others, too)"
         )
     if len(text) > MAX_ATTRIBUTES_BYTES:
         raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")

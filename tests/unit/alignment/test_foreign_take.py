@@ -5,9 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from dextouch.bridges.foreign import ImportAttributes
+from dextouch.bridges.foreign_mcap import import_any_mcap
 from dextouch.episodes import EpisodeStore, needs
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import poses_from_actions
+from dextouch.images import decode_jpeg
 from dextouch.streams import unpack
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
@@ -20,6 +23,7 @@ from services.episode_store.reading import (
     reduce_signals,
 )
 from tests.unit.bridges.test_foreign_mcap import PIXELS, T0, Recorder, encoded
+from tests.unit.world_model.test_other_gloves import LAYOUT
 
 SECONDS = 4.0
 MAPS = {
@@ -108,6 +112,20 @@ def test_it_becomes_an_episode_for_learners(imported):
     )
 
 
+def test_touch_of_another_glove_has_its_layout(tmp_path):
+    recorder = Recorder(tmp_path / "glove.mcap")
+    recorder.channel("/glove", "Glove", "jsonschema", b'{"type": "object"}')
+    recorder.raw("/glove", {"kpa": [2.5] * LAYOUT.num_taxels}, T0)
+    recorder.done()
+    (tmp_path / "layout.json").write_text(LAYOUT.model_dump_json())
+    words = ["import", str(tmp_path / "glove.mcap"), "--map", "tactile_left=/glove"]
+    words += ["--store", str(tmp_path / "store")]
+    assert main(words) == 3
+    assert main([*words, "--layout", str(tmp_path / "layout.json")]) == 0
+    stream = EpisodeStore(tmp_path / "store").recording("glove").streams["tactile_left"]
+    assert (stream.layout, stream.unit, stream.side) == (LAYOUT, "kPa", "left")
+
+
 def test_the_player_shows_the_recording(imported):
     reader = imported.recording("take")
     about = playback_of(reader)
@@ -121,3 +139,18 @@ def test_the_player_shows_the_recording(imported):
     _, curves = unpack(reduce_signals(reader, SignalsQuery(names=names, **span)), max_bytes=1 << 20)
     np.testing.assert_allclose(curves["wrist_left.0/low"], [0, 0.1, 0.2, 0.3], atol=2e-3)
     np.testing.assert_allclose(curves["tactile_left.max/high"], 1.5)
+
+
+def test_the_player_shows_gray_images(tmp_path):
+    recorder = Recorder(tmp_path / "depth.mcap")
+    deep = (PIXELS[0, ..., 0].astype("<u2") * 4).tobytes()
+    size = {"width": 64, "height": 48, "step": 128}
+    recorder.add("/depth", "RawImage", T0, data=deep, encoding="16UC1", **size)
+    store = EpisodeStore(tmp_path / "store")
+    import_any_mcap(recorder.done(), store, ImportAttributes())
+    for half_size in (False, True):
+        query = ImagesQuery(half_size=half_size)
+        answer = _images(store.recording("depth"), "depth", query, 1 << 24)
+        shown = decode_jpeg(unpack(answer, max_bytes=1 << 24)[1]["data"].tobytes())
+        expected = PIXELS[0, ..., :1].astype(float) * 255 / PIXELS[0, ..., 0].max()
+        assert np.abs(shown.astype(float) - expected).mean() < 6

@@ -19,6 +19,7 @@ from PIL import Image
 from dextouch.bridges import foreign_streams
 from dextouch.bridges.foreign import ImportAttributes
 from dextouch.bridges.foreign_mcap import import_any_mcap
+from dextouch.bridges.foreign_messages import items_of
 from dextouch.bridges.mcap import export_mcap
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
@@ -98,7 +99,7 @@ def encoded(pixels, form):
     return file.getvalue()
 
 
-def video(num_images, *, keyint, codec="libx264", bframes=0):
+def video(num_images, *, keyint, codec="libx264", bframes=0, tune="zerolatency"):
     """Access units of an encoder that is not the store's; image k has level 20 (k mod 10)."""
     av = pytest.importorskip("av")
     encoder = av.CodecContext.create(codec, "w")
@@ -106,7 +107,7 @@ def video(num_images, *, keyint, codec="libx264", bframes=0):
     encoder.time_base = Fraction(1, 30)
     option = {"libx264": "x264-params", "libx265": "x265-params"}[codec]
     encoder.options = {
-        "tune": "zerolatency",
+        "tune": tune,
         option: f"keyint={keyint}:min-keyint={keyint}:scenecut=0:bframes={bframes}:log-level=none",
     }
     units = []
@@ -242,8 +243,6 @@ def test_ros_2_messages_that_rosbags_wrote(store):
         "camera_head": "/cam/image_raw/compressed",
         "wrist_left": "/tf:wrist_left",
         "keypoints_left": "/poses",
-        "tactile_left": "/f32",
-        "tactile_right": "/u8",
     }
     report = import_any_mcap(GOLDEN, store, ImportAttributes(mapping=mapping))
     recording = store.recording("ros2_rosbags")
@@ -269,15 +268,12 @@ def test_ros_2_messages_that_rosbags_wrote(store):
     expected = np.ndarray((3, 4), "<f4", raw.tobytes())[:, :3]
     np.testing.assert_array_equal(first("points")[:, :3], expected)
     assert first("points")[:, 3].tolist() == [12 + 13 * 256, 28 + 29 * 256, 44 + 45 * 256]
-    assert recording.values("tactile_left", 0, 2).tolist() == [
-        [0, 1, 2, 3, 4, 5],
-        [1, 2, 3, 4, 5, 6],
+    # Two by three by its layout's dimensions.
+    assert recording.values("f32", 0, 2).tolist() == [
+        [[0, 1, 2], [3, 4, 5]],
+        [[1, 2, 3], [4, 5, 6]],
     ]
-    touch = {name: recording.streams[name] for name in ("tactile_left", "tactile_right")}
-    assert [(one.unit, one.dtype) for one in touch.values()] == [
-        ("kPa", "float32"),
-        ("counts", "uint8"),
-    ]
+    assert [recording.streams[name].dtype for name in ("f32", "u8")] == ["float32", "uint8"]
     assert first("i32").tolist() == [-2, -1, 0, 1]
     assert recording.streams["i32"].dtype == "int64"
     glove = recording.streams["glove"]
@@ -298,9 +294,40 @@ def test_ros_2_messages_that_rosbags_wrote(store):
 
 
 @pytest.mark.parametrize(
+    ("schema", "size", "kind", "names"),
+    [
+        # foxglove.PackedElementField and sensor_msgs/PointField number their types otherwise.
+        ("foxglove.PointCloud", "point_stride", "type", "uint8 int8 uint16 int16 uint32 int32"),
+        (
+            "sensor_msgs/PointCloud2",
+            "point_step",
+            "datatype",
+            "int8 uint8 int16 uint16 int32 uint32",
+        ),
+    ],
+)
+def test_points_have_fields_of_all_types(schema, size, kind, names):
+    numbers = [*names.split(), "float32", "float64"]
+    values = [-2 if one[0] != "u" else 200 for one in numbers]
+    parts = [np.array(v, dtype=t).tobytes() for v, t in zip(values, numbers, strict=True)]
+    offsets = np.cumsum([0, *map(len, parts)]).tolist()
+    fields = [
+        {"name": name, "offset": offset, kind: index + 1, "count": 1}
+        for index, (name, offset) in enumerate(zip(numbers, offsets[:-1], strict=True))
+    ]
+    stride = offsets[-1]
+    cloud = {"fields": fields, "data": b"".join(parts) * 2, size: stride}
+    rows = {"width": 2, "height": 1, "row_step": 2 * stride} if size == "point_step" else {}
+    (item,) = items_of(schema, cloud | rows)
+    assert item.decode().tolist() == [values] * 2
+    assert item.form.names == tuple(numbers)
+
+
+@pytest.mark.parametrize(
     ("codec", "keyint", "note"),
     [
         ("libx264", 8, "video kept"),
+        ("libx264", 16, "h264 decoded, encoded as h264"),
         ("libx264", 30, "h264 decoded, encoded as h264"),
         ("libx265", 30, "h265 decoded, encoded as h264"),
     ],
@@ -309,7 +336,7 @@ def test_video_is_kept_or_decoded(codec, keyint, note, store, tmp_path):
     units = video(20, keyint=keyint, codec=codec)
     recorder = Recorder(tmp_path / "video.mcap")
     # It begins in the middle: images before the first key frame cannot be decoded.
-    first = 0 if keyint == 8 else -3
+    first = -3 if keyint == 30 else 0
     units = [units[1]] * -first + units
     form = {"libx264": "h264", "libx265": "h265"}[codec]
     for k, data in enumerate(units):
@@ -325,6 +352,17 @@ def test_video_is_kept_or_decoded(codec, keyint, note, store, tmp_path):
     np.testing.assert_allclose(level, [20 * (k % 10) for k in range(20)], atol=6)
     assert recording.stamps("video").t_device_ns[0] == T0 - first * STEP
     assert sum(one.num_samples for one in report.refused) == -first
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_video_with_b_frames_is_refused(codec, store, tmp_path):
+    recorder = Recorder(tmp_path / "video.mcap")
+    units = video(24, keyint=8, codec=codec, bframes=2, tune="animation")
+    form = {"libx264": "h264", "libx265": "h265"}[codec]
+    for k, data in enumerate(units):
+        recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format=form)
+    with pytest.raises(InvalidInputError, match="B-frames"):
+        import_any_mcap(recorder.done(), store, ImportAttributes())
 
 
 def test_what_cannot_be_read_is_named(store, tmp_path):
@@ -373,6 +411,7 @@ def test_limits_and_mistakes_are_errors(store, tmp_path, monkeypatch):
         ({"wrist_left": "/cam/jpeg"}, "expected poses of one body"),
         ({"camera_head": "/pose"}, "expected images"),
         ({"keypoints_left": "/log"}, "expected points"),
+        ({"tactile_left": "/joints"}, "expected the 320 taxels in kPa of 'dextouch_v1'"),
     ):
         with pytest.raises(InvalidInputError, match=part):
             import_any_mcap(path, store, ImportAttributes(mapping=mapping))
