@@ -209,7 +209,8 @@ class Foreign:
 
 def _write(path, table):
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path)
+    # Row groups that end within episodes.
+    pq.write_table(table, path, row_group_size=5)
 
 
 def _arrow(feature):

@@ -214,6 +214,17 @@ def test_a_killed_process_leaves_a_whole_dataset(store, folder, tmp_path, where)
     assert len(rows(folder, "meta/episodes")) == 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="renameat2 is a system call of Linux")
+def test_two_folders_are_exchanged_in_one_step(tmp_path):
+    for name in ("new", "old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}.txt").touch()
+    assert files._exchange(tmp_path / "new", tmp_path / "old")
+    assert [p.name for p in (tmp_path / "old").iterdir()] == ["new.txt"]
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["old.txt"]
+    assert not files._exchange(tmp_path / "new", tmp_path / "none")
+
+
 def test_disks_that_cannot_exchange_or_link_do_as_well(store, folder, monkeypatch):
     export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
     monkeypatch.setattr(files, "_exchange", lambda *_: False)
