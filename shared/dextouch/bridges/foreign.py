@@ -100,7 +100,11 @@ class ImportReport:
         return asdict(self)
 
     def lines(self) -> Iterator[str]:
-        """The report for a terminal, one line each."""
+        """The report for a terminal, one line each; names in files may hold control characters."""
+        for line in self._lines():
+            yield "".join(one if one.isprintable() else "\ufffd" for one in line)
+
+    def _lines(self) -> Iterator[str]:
         yield f"{self.recording_id}  {self.file}"
         for one in self.imported:
             said = [f"{one.num_samples} samples", f"{one.rate_hz:.4g} Hz", *one.notes]

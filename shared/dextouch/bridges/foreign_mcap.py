@@ -3,6 +3,8 @@
 Files are untrusted: they are read record by record, with bounded allocations.
 """
 
+import contextlib
+import io
 import json
 import struct
 from collections.abc import Callable, Iterator
@@ -245,7 +247,9 @@ def _ros_decoder(schema: Schema) -> Decoder:
     from mcap_ros2.decoder import DecoderFactory
 
     try:
-        read = DecoderFactory().decoder_for("cdr", schema)
+        # Its parser prints what it refuses.
+        with contextlib.redirect_stderr(io.StringIO()):
+            read = DecoderFactory().decoder_for("cdr", schema)
     except (
         InvalidSpecification,
         InvalidValue,

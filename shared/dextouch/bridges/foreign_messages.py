@@ -164,7 +164,12 @@ def camera_model(message: Plain) -> CameraModel:
 
 
 def _text(value: object) -> str:
-    return value[:128] if isinstance(value, str) else ""
+    return _encodable(value[:128]) if isinstance(value, str) else ""
+
+
+def _encodable(text: str) -> str:
+    """Text without the halves of surrogate pairs that JSON allows and UTF-8 does not."""
+    return text.encode(errors="replace").decode()
 
 
 def _bytes(value: object) -> bytes:
@@ -453,7 +458,7 @@ def _flat(message: Plain) -> Item:
 def _names(paths: tuple[tuple[str, int], ...]) -> tuple[str, ...]:
     """Names of numbers (count −1) and of the elements of lists."""
     return tuple(
-        name[-128:]
+        _encodable(name[-128:])
         for path, count in paths
         for name in ([path] if count < 0 else [f"{path}[{index}]" for index in range(count)])
     )

@@ -210,6 +210,7 @@ def test_json_by_the_documented_schemas_and_of_anyone(store, tmp_path):
     recorder.channel("/image", "foxglove.CompressedImage", "jsonschema", b'{"type": "object"}')
     recorder.channel("/glove", "MyGlove", "jsonschema", b'{"type": "object"}')
     recorder.channel("/bare", "", "")
+    recorder.channel("/\x1b[31mred", "", "")
     for k in range(6):
         t = T0 + k * 10**7
         stamp = {"sec": t // 10**9, "nsec": t % 10**9}
@@ -220,6 +221,7 @@ def test_json_by_the_documented_schemas_and_of_anyone(store, tmp_path):
         # One comes late, so that two have one time.
         recorder.raw("/glove", cells, t - (k == 4) * 10**7)
         recorder.raw("/bare", [1, k] if k else b"{broken", t)
+        recorder.raw("/\x1b[31mred", b'{"frame_id": "\\ud800", "\\ud800": 1, "big": 1e999}', t)
     recorder.raw("/glove", {"taxels": [1]}, t)
     report = import_any_mcap(recorder.done(), store, ImportAttributes())
     recording = store.recording("json")
@@ -228,6 +230,9 @@ def test_json_by_the_documented_schemas_and_of_anyone(store, tmp_path):
     names = ("state.battery", "state.ok", "taxels[0]", "taxels[1]", "taxels[2]")
     assert recording.streams["glove"].names == names
     assert recording.values("glove", 0, 1).tolist() == [[0.5, 1, 0, 1.5, 2]]
+    # Half a surrogate pair cannot be stored, and control characters are not shown.
+    assert recording.streams["s_31mred"].names == ("?", "big")
+    assert "\x1b" not in "\n".join(report.lines())
     assert recording.values("bare", 0, 1).tolist() == [[1, 1]]
     (glove,) = (one for one in report.imported if one.stream == "glove")
     assert glove.num_repeated_stamps == 1
