@@ -289,6 +289,24 @@ def test_what_no_stream_can_hold_is_refused_with_the_reason(store, tmp_path):
     assert json.dumps(report.as_json())
 
 
+def test_texts_that_are_no_unicode_are_replaced_or_refused(store, tmp_path):
+    _, folder = written(tmp_path, "v2.1")
+    half = "\\ud800"
+    edit_json(folder, INFO, lambda i: i["features"]["action"].update(names=["j\ud800"] * 7))
+    path = folder / "meta/episodes.jsonl"
+    path.write_text(path.read_text().replace(TASKS[0], f"pick {half}"))
+    about = store.recording(import_dataset(folder, store).ids[0])
+    assert about.attributes.task == "pick ?"
+    assert about.streams["action"].names == ("j?",) * 7
+    _, folder = arm(), arm().write_v3(tmp_path / "latin")
+    table = pq.read_table(folder / DATA)
+    place = table.column_names.index("subtask")
+    latin = pa.array([b"gr\xfc\xdfe"] * table.num_rows, pa.binary()).view(pa.string())
+    pq.write_table(table.set_column(place, "subtask", latin), folder / DATA)
+    with pytest.raises(CorruptDataError, match="subtask"):
+        import_dataset(folder, store)
+
+
 def test_image_files_stay_in_the_folder_and_are_bounded(store, tmp_path, monkeypatch):
     made, folder = written(tmp_path, cameras={WRIST: ("image", ".png")})
     outside = tmp_path / "secret.png"

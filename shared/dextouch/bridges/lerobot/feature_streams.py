@@ -14,7 +14,12 @@ from pydantic import ValidationError
 from dextouch.bridges.exporting import BLOCK_IMAGES, Block
 from dextouch.bridges.foreign import ForeignStream, Refused
 from dextouch.bridges.foreign_images import compressed_form, decode_png
-from dextouch.bridges.lerobot.source import EpisodeEntry, FeatureInfo, LeRobotFolder
+from dextouch.bridges.lerobot.source import (
+    EpisodeEntry,
+    FeatureInfo,
+    LeRobotFolder,
+    whole_text,
+)
 from dextouch.bridges.lerobot.video import read_images, read_units
 from dextouch.episodes import GOP_IMAGES, is_keyframe
 from dextouch.errors import CorruptDataError
@@ -88,7 +93,7 @@ def _stream(frames: Frames, key: str, name: str, unit: ImageUnit | None) -> Fore
         if feature.is_camera():
             return camera_stream(frames, key, name, frames.t_ns, unit)
         if feature.dtype in TEXT_TYPES:
-            return _text_stream(frames, key, name)
+            return text_stream(frames, key, name, frames.source.texts(frames.entry, key))
         return _number_stream(frames, key, name)
     except ValidationError as error:
         return first_problems(error)
@@ -135,23 +140,13 @@ def _number_stream(frames: Frames, key: str, name: str) -> ForeignStream | str:
     return ForeignStream(descriptor, key, _blocks(frames.t_ns, values), notes=notes)
 
 
-def _text_stream(frames: Frames, key: str, name: str) -> ForeignStream | str:
-    rows = frames.source.rows(frames.entry)
-    if key not in rows.column_names:
-        raise CorruptDataError(
-            f"{frames.source.data_file(frames.entry)}: has no column {key!r}, which info.json "
-            "declares"
-        )
-    return text_stream(frames, key, name, rows.column(key).to_pylist())
-
-
 def text_stream(
     frames: Frames, key: str, name: str, values: Iterable[object]
 ) -> ForeignStream | str:
     """A stream of text, one for each frame, as UTF-8 padded with zeros; lists become JSON."""
     plain = ("" if one is None else one for one in values)
     texts = [
-        (one if isinstance(one, str) else json.dumps(one, default=str, ensure_ascii=False)).encode()
+        whole_text(one if isinstance(one, str) else json.dumps(one, default=str)).encode()
         for one in plain
     ]
     width = max(1, *map(len, texts)) if texts else 1

@@ -89,6 +89,10 @@ class DatasetImport:
 
     def lines(self) -> Iterator[str]:
         """The result for a terminal: all of the first recording, of others what is new."""
+        for line in self._lines():
+            yield "".join(one if one.isprintable() else "\ufffd" for one in line)
+
+    def _lines(self) -> Iterator[str]:
         yield from self.notes
         told: set[str] = set()
         for report in self.reports:

@@ -27,7 +27,7 @@ from dextouch.bridges.lerobot.feature_streams import (
     feature_streams,
     text_stream,
 )
-from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
+from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder, whole_text
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.schemas import MAX_INSTRUCTION, Domain, LineageEntry, Matrix, RecordingAttributes
@@ -247,14 +247,14 @@ def _attributes(
         task=task[:128],
         instruction=(options.instruction or " / ".join(entry.tasks))[:MAX_INSTRUCTION],
         domain=options.domain,
-        station=source.info.robot_type or "lerobot",
+        station=whole_text(source.info.robot_type or "lerobot")[:128],
     )
     attributes = new_attributes(
         root,
         about,
         form=f"lerobot {source.info.codebase_version}",
         calibration={} if options.K_head is None else {"K_head": np.array(options.K_head)},
-        sha256=hashlib.sha256(text.encode()).hexdigest(),
+        sha256=hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest(),
     )
     number, plain = f"-{entry.index:06d}", root.name.replace(".", "-")
     return attributes.model_copy(
@@ -262,7 +262,9 @@ def _attributes(
             "recording_id": recording_id_of(Path(plain), options.id_prefix)[: 128 - len(number)]
             + number,
             "lineage": tuple(
-                LineageEntry(kind="recording", id=f"lerobot:{root.name}/{name}", sha256=digest)
+                LineageEntry(
+                    kind="recording", id=whole_text(f"lerobot:{root.name}/{name}"), sha256=digest
+                )
                 for name, digest in lines
             ),
         }

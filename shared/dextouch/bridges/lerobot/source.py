@@ -38,6 +38,11 @@ _IMAGE_PATHS = (
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff")
 
 
+def whole_text(value: object) -> str:
+    """Text of a value without half surrogates, which JSON can hold and UTF-8 cannot."""
+    return str(value).encode(errors="replace").decode()
+
+
 class FeatureInfo(BaseModel):
     """One feature of `info.json`."""
 
@@ -81,7 +86,7 @@ class FeatureInfo(BaseModel):
             names = names[0]
         if len(self.shape) != 1 or not isinstance(names, list) or len(names) != self.shape[0]:
             return ()
-        return tuple(str(name)[:128] for name in names)
+        return tuple(whole_text(name)[:128] for name in names)
 
     def has_colours(self) -> bool:
         """Whether it is a camera with colours."""
@@ -178,6 +183,16 @@ class LeRobotFolder:
         if not np.array_equal(order, np.arange(entry.length)):
             raise CorruptDataError(f"{where}: frame_index does not count its frames from 0")
         return part
+
+    def texts(self, entry: EpisodeEntry, name: str) -> list[object]:
+        """One feature's values of an episode as Python objects; raises as `columns`."""
+        rows, path = self.rows(entry), self.data_file(entry)
+        if name not in rows.column_names:
+            raise CorruptDataError(f"{path}: has no column {name!r}, which info.json declares")
+        try:
+            return rows.column(name).to_pylist()
+        except (pa.ArrowException, ValueError) as error:
+            raise CorruptDataError(f"{path}: column {name!r} is damaged ({error})") from error
 
     def images(self, entry: EpisodeEntry, name: str) -> Iterator[bytes]:
         """Encoded images of an episode, one for each frame: from the data file or files of images.
@@ -319,7 +334,7 @@ def _image_values(path: Path, name: str, start: int, count: int) -> Iterator[obj
                             f"{path}: images of {name!r} are larger than {MAX_IMAGE_BYTES} bytes"
                         )
                     yield from part.to_pylist()
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise CorruptDataError(f"{path}: column {name!r} is damaged ({error})") from error
 
 
@@ -392,7 +407,7 @@ def _read_tasks(folder: Path, info: DatasetInfo) -> dict[int, str]:
         number, said = row.get("task_index"), row.get(text or "")
         if not isinstance(number, int) or said is None or number in tasks:
             raise CorruptDataError(f"{path}: got {row}, expected a task_index of its own and task")
-        tasks[number] = str(said)
+        tasks[number] = whole_text(said)
     return tasks
 
 
@@ -428,7 +443,7 @@ def _read_episodes(
                 f"{len(entries)} of 1 … {MAX_EPISODE_FRAMES} frames"
             )
         said = row.get("tasks") or list(tasks.values())[:1] or [""]
-        texts = tuple(map(str, said)) if isinstance(said, list) else (str(said),)
+        texts = tuple(map(whole_text, said if isinstance(said, list) else [said]))
         entries.append(EpisodeEntry(index, length, texts, row))
     if len(entries) != info.total_episodes:
         raise CorruptDataError(
