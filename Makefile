@@ -129,8 +129,9 @@ $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $
 bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: compare our store with LeRobotDataset v3; ARGS="--rounds 5"
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py --out runs/bench_lerobot $(ARGS)
 
-check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: check that lerobot itself opens our exports
+check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: check that lerobot itself opens our exports, and we what it writes
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
+	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_import.py
 
 $(OPENPI_VENV)/.complete:
 	$(PYTHON) -m venv $(OPENPI_VENV)

@@ -32,6 +32,7 @@ _DISTRIBUTIONS = {
     "cv2": "opencv-contrib-python-headless",
     "mujoco": "mujoco-core",
     "rerun": "rerun-sdk",
+    "mcap_ros2": "mcap-ros2-support",
 }
 _PURPOSES = {
     "zstandard": "episodes",
@@ -52,6 +53,7 @@ _OPTIONAL = {
     "rerun": "shows the .rrd files of the player's command: rerun FILE.rrd",
     "pyarrow": "LeRobot datasets",
     "mcap": "MCAP files",
+    "mcap_ros2": "MCAP files of ROS 2",
     "obstore": "stores in a bucket, s3://…",
     "diffusers": "the full-size world model",
 }

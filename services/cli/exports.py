@@ -1,24 +1,27 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
-import shutil
 import sys
-import uuid
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
+if TYPE_CHECKING:
+    from dextouch.bridges.foreign import ImportReport
+
 Reader = EpisodeReader | RecordingReader
-Report = dict[str, object]
+Report = dict[str, Any]
 # By id and camera.
 DamagedImages = dict[str, dict[str, list[int]]]
+# Exit status if some of several files were refused, as of a command that is.
+_SOME_FAILED = 3
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -33,35 +36,34 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
 
 
-def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
+    """Write all episodes together; the report's part about them."""
     if options.format == "umi":
         from dextouch.bridges.umi import export_umi
 
-        return export_umi(readers, options.to, overwrite=options.force)
-    from dextouch.bridges.lerobot import ExportOptions, export_lerobot
+        return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+    from dextouch.bridges.lerobot import ExportOptions, export_dataset
 
-    with _replaced(options.to, force=options.force):
-        chosen = ExportOptions(fps=options.fps)
-        return export_lerobot(readers, options.to, repo_id=options.repo_id, options=chosen)
-
-
-@contextmanager
-def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
-    """Replace an existing data set, restoring it if the new one fails."""
-    if not folder.exists():
-        yield
-        return
-    if not force:
-        raise ConflictError(f"{folder}: exists already; choose another folder or add --force")
-    if not (folder / "meta" / "info.json").is_file():
-        raise ConflictError(f"{folder}: is not a LeRobot data set, so --force does not remove it")
-    aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
-    folder.rename(aside)
-    with ExitStack() as undo:
-        undo.callback(aside.rename, folder)
-        yield
-        undo.pop_all()
-    shutil.rmtree(aside)
+    chosen = ExportOptions(
+        fps=options.fps,
+        touch_samples=options.touch_samples,
+        license_name=options.license,
+        existing="append" if options.append else "replace" if options.force else "refuse",
+    )
+    done = export_dataset(readers, options.to, repo_id=options.repo_id, options=chosen)
+    if done.present:
+        print(f"{len(done.present)} episodes were in the data set already", file=sys.stderr)
+    if done.num_touch_left_out:
+        print(
+            f"{done.num_touch_left_out} touch samples are left out: more of them lie between two "
+            "frames than the data set has room for",
+            file=sys.stderr,
+        )
+    return {
+        "num_steps": done.num_frames,
+        "present": list(done.present),
+        "num_touch_left_out": done.num_touch_left_out,
+    }
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
@@ -142,6 +144,10 @@ def _export(options: argparse.Namespace) -> Report:
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
+    if options.append and form != "lerobot":
+        raise InvalidInputError(
+            f"--append: a file of {form!r} cannot grow; only lerobot data sets can"
+        )
     ids = _ids(store, options)
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))
@@ -149,9 +155,10 @@ def _export(options: argparse.Namespace) -> Report:
     report["damaged_images"] = damaged
     if form in JOINT_FORMATS:
         left_out: list[str] = []
-        num_steps = _export_all(_episodes(store, shown, damaged, left_out), options)
-        print(f"{to}  {len(ids) - len(left_out)} episodes  {num_steps} steps")
-        return report | {"path": str(to), "num_steps": num_steps, "left_out": left_out}
+        done = _export_all(_episodes(store, shown, damaged, left_out), options)
+        num_new = len(ids) - len(left_out) - len(done.get("present", []))
+        print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
+        return report | done | {"path": str(to), "left_out": left_out}
     # One file for one id, a folder of files otherwise.
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":
@@ -176,23 +183,69 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    if options.format == "mcap":
-        from dextouch.bridges.mcap import import_mcap
+    from dextouch.bridges.foreign import find_format
 
-        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        files = [file for file in found if file == path or not is_system_file(file.name)]
-        if not files:
-            raise NotFoundError(f"{path}: holds no .mcap file")
-        names = progress(files, "import mcap", len(files))
-        ids = [import_mcap(file, store) for file in names]
-    else:
-        from dextouch.bridges.lerobot import ImportOptions, import_lerobot
+    form = options.format or find_format(path)
+    about = {"format": form, "store": options.store}
+    if form == "lerobot":
+        from dextouch.bridges.lerobot import ImportOptions, import_dataset
 
-        chosen = ImportOptions(id_prefix=options.id_prefix, images=options.images)
-        ids = import_lerobot(path, store, options=chosen)
-    for item_id in ids:
-        print(item_id)
-    return {"format": options.format, "store": options.store, "ids": ids}
+        chosen = ImportOptions(
+            mapping=options.map,
+            id_prefix=options.id_prefix,
+            images=options.images,
+            K_head=options.k_head,
+            domain=options.domain or "robot",
+            task=options.task,
+            instruction=options.instruction,
+            fps=options.fps,
+        )
+        result = import_dataset(path, store, options=chosen)
+        print(*result.lines(), sep="\n")
+        return about | result.as_json()
+    found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
+    files = [file for file in found if file == path or not is_system_file(file.name)]
+    if not files:
+        raise NotFoundError(f"{path}: holds no .{form} file")
+    reports, failed = [], {}
+    for file in progress(files, f"import {form}", len(files)):
+        try:
+            report = _import_file(file, store, form, options)
+        except DexTouchError as error:
+            if len(files) == 1:
+                raise
+            failed[str(file)] = error.message
+            print(f"{file}: not imported: {error.message}", file=sys.stderr)
+            continue
+        reports.append(report)
+        print(*(report.lines() if report.imported else [report.recording_id]), sep="\n")
+    ids = [report.recording_id for report in reports]
+    files_of = [report.as_json() for report in reports]
+    return about | {"ids": ids, "reports": files_of, "failed": failed}
+
+
+def _import_file(
+    path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
+) -> "ImportReport":
+    from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.tactile.layout import read_layout
+
+    about = ImportAttributes(
+        mapping=options.map,
+        id_prefix=options.id_prefix,
+        task=options.task or "imported",
+        instruction=options.instruction,
+        domain=options.domain or "human",
+        images=options.images or "h264",
+        layout=None if options.layout is None else read_layout(options.layout),
+    )
+    if form == "rrd":
+        from dextouch.bridges.foreign_rerun import import_rrd
+
+        return import_rrd(path, store, about, timeline=options.timeline)
+    from dextouch.bridges.foreign_mcap import import_any_mcap
+
+    return import_any_mcap(path, store, about)
 
 
 def export_main(argv: Sequence[str]) -> int:
@@ -205,5 +258,6 @@ def export_main(argv: Sequence[str]) -> int:
 def import_main(argv: Sequence[str]) -> int:
     """Run `dextouch import`."""
     options = import_parser().parse_args(list(argv))
-    write_result(options.json, _import(options))
-    return 0
+    report = _import(options)
+    write_result(options.json, report)
+    return _SOME_FAILED if report.get("failed") else 0

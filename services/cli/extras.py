@@ -13,7 +13,7 @@ _PACKAGES = {
     "full": "diffusers transformers",
     "twin": "mujoco",
     "gym": "gymnasium",
-    "export": "pyarrow mcap foxglove_schemas_protobuf",
+    "export": "pyarrow mcap mcap_ros2 foxglove_schemas_protobuf",
     "rerun": "rerun",
     "s3": "obstore",
     "scale": "ray",

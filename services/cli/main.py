@@ -78,7 +78,7 @@ COMMANDS = {
         "pipelines.parsers:export_parser",
     ),
     "import": Command(
-        "read LeRobot or MCAP files into a store",
+        "read LeRobot, MCAP or Rerun files into a store",
         "cli.exports:import_main",
         "pipelines.parsers:import_parser",
     ),

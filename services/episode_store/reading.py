@@ -401,7 +401,8 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
     descriptor = reader.streams[camera]
     if descriptor.kind != "image":
         raise InvalidInputError(f"images: {camera!r} is a stream of kind {descriptor.kind!r}")
-    form = ImageForm(half_size=query.half_size)
+    is_colour = len(descriptor.shape) == 3
+    form = ImageForm(half_size=query.half_size and is_colour)
     image_bytes = int(np.prod(form.shape(descriptor.shape)))
     allowed = max(1, min(MAX_IMAGES, max_bytes // image_bytes))
     text = f"the span holds {count} images, expected at most {allowed}; ask for a shorter time"
@@ -416,7 +417,7 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
         encoded = [images[index - first] for index in indices.tolist()]
     else:
         pictures = reader.images_at(camera, indices, form=form)
-        encoded = [encode_jpeg(picture, quality=QUALITY) for picture in pictures]
+        encoded = [encode_jpeg(_in_colour(picture), quality=QUALITY) for picture in pictures]
     return pack(
         {"camera": camera},
         {
@@ -425,6 +426,16 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
             "data": np.frombuffer(b"".join(encoded), dtype=np.uint8),
         },
     )
+
+
+def _in_colour(picture: np.ndarray) -> np.ndarray:
+    """An image with three channels; one of 16 bits relative to its largest value."""
+    if picture.ndim == 3:
+        return picture
+    if picture.dtype != np.uint8:
+        largest = max(1, int(picture.max()))
+        picture = (picture.astype(np.uint64) * 255 // largest).astype(np.uint8)
+    return np.repeat(picture[..., None], 3, axis=-1)
 
 
 def reduce_signals(reader: Reader, query: SignalsQuery) -> bytes:

@@ -111,7 +111,7 @@ All keys of a study file: docs/studies.md
 """
 _EXPORT_HELP = """\
 formats:
-  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
+  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet, card
   umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
            (cannot be imported)
   mcap     one file per episode or recording, every sample; opens in Foxglove
@@ -121,15 +121,22 @@ examples:
   dextouch export --format mcap stand-bottle-0003 --to take.mcap
   dextouch export --format mcap --kind recording --operator p17 --to takes/
   dextouch export --format lerobot --task stand_bottle --to data/lerobot
+  dextouch export --format lerobot --to data/lerobot --append --license cc-by-4.0
   dextouch export --format umi --domain robot --to robot.zarr.zip
   dextouch export --format rrd stand-bottle-0003 --to take.rrd
 """
 _IMPORT_HELP = """\
 examples:
-  dextouch import --format mcap take.mcap
+  dextouch import take.mcap --map camera_head=/camera/color/image_raw/compressed \\
+      --map wrist_left=/tf:left_hand --map tactile_left=/glove/left
   dextouch import --format mcap takes/
-  dextouch import --format lerobot data/lerobot --id-prefix theirs-
+  dextouch import run.rrd --timeline frame_time
+  dextouch import data/lerobot --id-prefix theirs-
+  dextouch import aloha --map camera_head=observation.images.top --k-head 600,600,320,240
 
+Files that DexTouch exported come back as they were. Every other mcap or rrd file becomes a
+recording of the streams that it has, and a report says what was not imported, and why. So does
+every episode of a LeRobot data set (v2 or v3), unless it has our actions and a head camera.
 What each format keeps and loses: docs/bridges.md
 """
 TASKS = ("stand_bottle", "stack_bowls")
@@ -393,14 +400,38 @@ def export_parser() -> argparse.ArgumentParser:
     add("--operator", metavar="P", help="only items of this operator")
     rejected = "also items that were rejected in review; ids that are given always are"
     add("--with-rejected", action="store_true", help=rejected)
-    add("--force", action="store_true", help="replace existing files")
+    old = parser.add_mutually_exclusive_group()
+    old.add_argument("--force", action="store_true", help="replace existing files")
+    grow = "lerobot: add the episodes that an existing data set lacks"
+    old.add_argument("--append", action="store_true", help=grow)
     quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
     add("--jpeg-quality", type=int, metavar="1…100", help=quality)
     rate = "lerobot: frames per second (default: model rate)"
     add("--fps", type=_whole_fps, metavar="N", help=rate)
     name = "lerobot: name of the data set (%(default)s)"
     add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
+    licence = "lerobot: licence on the data set's card, such as cc-by-4.0"
+    add("--license", metavar="ID", help=licence)
+    touch = "lerobot: also every touch sample between two frames"
+    add("--touch-samples", action="store_true", help=touch)
     return parser
+
+
+class _Mapping(argparse.Action):
+    """Collects NAME=SOURCE; a name that comes twice is refused."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        name, found, source = str(values).partition("=")
+        known = getattr(namespace, self.dest)
+        if not (name and found and source) or name in known:
+            parser.error(f"{option_string}: got {values!r}, expected STREAM=SOURCE, each once")
+        setattr(namespace, self.dest, known | {name: source})
 
 
 def import_parser() -> argparse.ArgumentParser:
@@ -408,11 +439,41 @@ def import_parser() -> argparse.ArgumentParser:
     parser = _bridge_parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
-    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
-    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
-    images = "lerobot: unit of stored images (%(default)s)"
-    add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
+    forms = ("lerobot", "mcap", "rrd")
+    add("--format", choices=forms, help="input format (default: that of the content)")
+    prefix = "prefix of every id, but not of our own mcap exports"
+    add("--id-prefix", default="", metavar="TEXT", help=prefix)
+    images = "unit of images (default: as they are, and h264 for video that must be decoded)"
+    add("--images", choices=("h264", "jpeg", "rgb8"), help=images)
+    mapped = "name the stream of a topic, entity or feature; repeat it for more"
+    add("--map", action=_Mapping, default={}, metavar="STREAM=SOURCE", help=mapped)
+    layout = "mcap, rrd: layout of mapped tactile streams (default: that of our own glove)"
+    add("--layout", type=Path, metavar="FILE", help=layout)
+    timeline = "rrd: timeline of the samples (default: the only one with times)"
+    add("--timeline", metavar="NAME", help=timeline)
+    task = "task (default: the data set's, or imported)"
+    add("--task", metavar="TASK", help=task)
+    add("--instruction", default="", metavar="TEXT", help="the task's sentence")
+    domain = "who acts (default: lerobot robot, others human)"
+    add("--domain", choices=("human", "robot"), help=domain)
+    matrix = "lerobot: camera matrix of camera_head, in pixels"
+    add("--k-head", type=_camera_matrix, metavar="FX,FY,CX,CY", help=matrix)
+    rate = "lerobot: frames per second instead of the data set's times"
+    add("--fps", type=float, metavar="HZ", help=rate)
     return parser
+
+
+def _camera_matrix(text: str) -> tuple[tuple[float, float, float], ...]:
+    """Parse FX,FY,CX,CY, for argparse."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        fx = fy = cx = cy = math.nan
+    if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected FX,FY,CX,CY such as 600,600,320,240"
+        )
+    return ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)

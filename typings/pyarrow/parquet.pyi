@@ -1,11 +1,18 @@
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from pyarrow import Schema, Table
+from pyarrow import RecordBatch, Schema, Table
+
+class ColumnChunkMetaData:
+    path_in_schema: str
+    total_uncompressed_size: int
 
 class RowGroupMetaData:
     total_byte_size: int
     num_rows: int
+    num_columns: int
+    def column(self, i: int) -> ColumnChunkMetaData: ...
 
 class FileMetaData:
     num_rows: int
@@ -14,9 +21,17 @@ class FileMetaData:
 
 class ParquetFile:
     metadata: FileMetaData
+    num_row_groups: int
     schema_arrow: Schema
     def __init__(self, source: Path, *, memory_map: bool = ...) -> None: ...
     def read(self, columns: list[str] | None = ..., use_threads: bool = ...) -> Table: ...
+    def iter_batches(
+        self,
+        batch_size: int = ...,
+        row_groups: list[int] | None = ...,
+        columns: list[str] | None = ...,
+        use_threads: bool = ...,
+    ) -> Iterator[RecordBatch]: ...
     def close(self) -> None: ...
     def __enter__(self) -> ParquetFile: ...
     def __exit__(
@@ -32,3 +47,4 @@ class ParquetWriter:
     def close(self) -> None: ...
 
 def write_table(table: Table, where: Path) -> None: ...
+def read_schema(where: Path) -> Schema: ...

@@ -1,6 +1,8 @@
-"""What exporters share: samples in bounded memory, and a file that appears whole."""
+"""What exporters share: samples in bounded memory, and a file or folder that appears whole."""
 
+import ctypes
 import os
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +20,8 @@ from dextouch.streams import ENCODED_UNITS, H264_UNIT, NO_DEVICE_TIME, NO_SEQUEN
 BLOCK_IMAGES: Final = 32
 Reader = EpisodeReader | RecordingReader
 BLOCK_SECONDS: Final = 1.0
+# Of the system call renameat2 (Linux): paths from the working folder; exchange both.
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 @dataclass(frozen=True)
@@ -92,3 +96,48 @@ def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
+
+
+def replace_folder(new: Path, old: Path) -> None:
+    """Put a complete folder in the place of another one, which is removed.
+
+    On Linux the two are exchanged in one step, so that a crash leaves one of them in the place;
+    where the disk cannot do that, the old one is renamed first.
+
+    Raises StorageError if neither is possible; then the old one is in its place.
+    """
+    with disk_errors(f"replace {old}"):
+        for path in new.rglob("*"):
+            # Files that are shared with the old folder are on the disk already.
+            if path.is_dir() or path.stat().st_nlink == 1:
+                _sync(path)
+        _sync(new)
+        if not _exchange(new, old):
+            aside = old.with_name(f".{old.name}.{uuid.uuid4().hex}.old")
+            old.rename(aside)
+            try:
+                new.rename(old)
+            except OSError:
+                aside.rename(old)
+                raise
+            aside.rename(new)
+        _sync(old.parent)
+        shutil.rmtree(new)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchange two paths in one step; False where the system or the disk cannot."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError):
+        return False
+    paths = (os.fsencode(first), os.fsencode(second))
+    return bool(rename(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], _RENAME_EXCHANGE) == 0)

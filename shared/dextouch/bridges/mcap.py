@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Final
 
+import lz4.frame
 import numpy as np
 import zstandard
 from mcap.exceptions import McapError
@@ -258,8 +259,8 @@ def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
             text = record.data
     if text is None or kind not in {"episode", "recording"}:
         raise InvalidInputError(
-            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
-            "`dextouch export --format mcap` wrote can be imported"
+            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; expected a file that "
+            "`dextouch export --format mcap` wrote (`dextouch import` takes others, too)"
         )
     if len(text) > MAX_ATTRIBUTES_BYTES:
         raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
@@ -342,7 +343,8 @@ class _Bounded:
     def read(self, size: int = -1) -> bytes:
         wanted = self._left if size < 0 else size
         if wanted > self._left:
-            raise EOFError(f"{wanted} bytes requested, {self._left} are left")
+            at = self._file.tell()
+            raise EOFError(f"at byte {at}: {wanted} bytes requested, {self._left} are left")
         self._left -= wanted
         return self._file.read(wanted)
 
@@ -364,8 +366,9 @@ def records(path: Path) -> Iterator[McapRecord]:
             raise CorruptDataError(f"{path}: is truncated ({error}); copy it again") from error
         except (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError) as error:
             raise CorruptDataError(
-                f"{path}: is damaged or truncated ({type(error).__name__}: {error}); copy it "
-                "again, or see what `mcap recover` saves"
+                f"{path}: is damaged or truncated before byte {file.tell()} "
+                f"({type(error).__name__}: {error}); copy it again, or see what `mcap recover` "
+                "saves"
             ) from error
 
 
@@ -399,9 +402,17 @@ def _opened(chunk: Chunk, path: Path) -> Chunk:
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
             # At most one byte more than declared, never an unbounded output.
             data = stream.read(chunk.uncompressed_size + 1)
+    elif chunk.compression == "lz4":
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(
+                chunk.data, max_length=chunk.uncompressed_size + 1
+            )
+        except RuntimeError as error:
+            raise CorruptDataError(f"{path}: a chunk cannot be decompressed ({error})") from error
     else:
         raise InvalidInputError(
-            f"{path}: got chunks compressed as {chunk.compression!r}, expected 'zstd' or none; "
+            f"{path}: got chunks compressed as {chunk.compression!r}, expected 'zstd', 'lz4' or "
+            "none; "
             "convert it with `mcap compress --compression zstd`"
         )
     if len(data) != chunk.uncompressed_size:

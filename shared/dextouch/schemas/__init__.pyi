@@ -24,6 +24,7 @@ from .catalog import TrashedItem as TrashedItem
 from .catalog import Verdict as Verdict
 from .common import CLASS_OF_STATUS as CLASS_OF_STATUS
 from .common import ID_PATTERN as ID_PATTERN
+from .common import MAX_INSTRUCTION as MAX_INSTRUCTION
 from .common import MAX_NAMED as MAX_NAMED
 from .common import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
 from .common import ClockMethod as ClockMethod
@@ -51,6 +52,7 @@ from .episodes import EpisodeSummary as EpisodeSummary
 from .episodes import ExpireUploads as ExpireUploads
 from .episodes import FinishRecording as FinishRecording
 from .episodes import HoursRow as HoursRow
+from .episodes import ImportedFile as ImportedFile
 from .episodes import LedgerEntry as LedgerEntry
 from .episodes import LineageEntry as LineageEntry
 from .episodes import NewRecording as NewRecording

@@ -257,6 +257,17 @@ class LedgerEntry(FrozenModel):
     first_t_host_ns: int | None = None
 
 
+class ImportedFile(FrozenModel):
+    """The file of another tool that a recording was made of, and what read it.
+
+    `name` is the file's own, without folders; `importer` names format and release.
+    """
+
+    name: str = Field(min_length=1, max_length=255)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    importer: str = Field(min_length=1, max_length=128)
+
+
 class RecordingAttributes(FrozenModel):
     """Metadata of a raw take.
 
@@ -266,7 +277,8 @@ class RecordingAttributes(FrozenModel):
     `complete` is False of a take that was saved although its check found it incomplete, for the
     reason `incomplete_cause`; both are only written then.
     `trace_id` is that of the request that saved the take, or else began its upload; `num_batches`
-    the batches of each stream in the upload, which the store notes. Neither is written if empty.
+    the batches of each stream in the upload, which the store notes; `imported_from` the file of
+    another tool that the recording was made of. None of these is written if empty.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -289,6 +301,7 @@ class RecordingAttributes(FrozenModel):
     quality: dict[str, FiniteFloat] = Field(default={})
     trace_id: TraceId | None = Field(default=None, exclude_if=not_)
     num_batches: dict[str, int] = Field(default={}, exclude_if=not_)
+    imported_from: ImportedFile | None = Field(default=None, exclude_if=not_)
     streams: Annotated[tuple[StreamDescriptor, ...], Field(fail_fast=True)] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":

@@ -133,7 +133,8 @@ DAMAGE = {
     "info is no JSON": (_write(INFO, b"{"), CorruptDataError, "info.json"),
     "info is a list": (_write(INFO, b"[1]"), CorruptDataError, "info.json"),
     "info nests deeply": (_write(INFO, b"[" * 200_000), CorruptDataError, "info.json"),
-    "older format": (_info(codebase_version="v2.1"), InvalidInputError, "v2.1"),
+    "older format": (_info(codebase_version="v1.6"), InvalidInputError, "v1.6"),
+    "format of other files": (_info(codebase_version="v2.1"), NotFoundError, "tasks.jsonl"),
     "no fps": (_info(fps=0), CorruptDataError, "fps"),
     "data path leads out": (
         _info(data_path="../{chunk_index}/{file_index}.parquet"),

@@ -13,8 +13,11 @@ from dextouch.images import encode_jpeg
 from dextouch.schemas import Review
 from dextouch.streams import encoded_values
 from services.cli import main
+from tests.unit.bridges.foreign_lerobot import arm
 from tests.unit.bridges.lerobot_episodes import make_episode, pictures
 from tests.unit.bridges.takes import differing_streams, write_episode, write_recording
+
+TOP = "observation.images.top"
 
 
 @pytest.fixture
@@ -157,6 +160,46 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     status, _, err = dextouch(*words, "--force")
     assert status == main.EXIT_REFUSED
     assert "not a LeRobot data set" in err
+
+
+def test_lerobot_data_sets_grow_and_get_a_card(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=5)
+    folder, report = tmp_path / "data", tmp_path / "report.json"
+    words = ("export", "--format", "lerobot", "--to", folder, "--json", report)
+    assert dextouch(*words, "--license", "cc-by-4.0", "--touch-samples")[0] == 0
+    write_episode(store, "two", num_steps=4)
+    status, _, err = dextouch(*words, "--append")
+    assert status == main.EXIT_REFUSED
+    assert "with --touch-samples" in err
+    status, out, err = dextouch(*words, "--append", "--touch-samples")
+    assert (status, "1 episodes  4 steps" in out) == (0, True)
+    assert "1 episodes were in the data set already" in err
+    assert json.loads(report.read_text())["present"] == ["one"]
+    assert "license: cc-by-4.0" in (folder / "README.md").read_text()
+    assert dextouch("import", folder, store="other")[1] == "one\ntwo\n"
+    words = ("export", "--format", "umi", "--append", "--to", tmp_path / "all.zip")
+    status, _, err = dextouch(*words)
+    assert status == main.EXIT_REFUSED
+    assert "only lerobot" in err
+
+
+def test_a_lerobot_data_set_of_another_robot_becomes_recordings(store, dextouch, tmp_path):
+    folder, report = arm().write_v21(tmp_path / "arm"), tmp_path / "report.json"
+    words = ("import", folder, "--json", report, "--map", f"camera_head={TOP}")
+    status, out, _ = dextouch(*words, "--k-head", "60,60,32,24", "--fps", "5", "--task", "cubes")
+    assert status == 0
+    assert out.startswith("imported as recordings: 'action': 'action' is float32 [7], expected")
+    assert f"  camera_head  <- {TOP}  h264 [48, 64, 3]  12 samples, 5 Hz" in out
+    assert "kept as numbers: text as UTF-8" in out
+    told = json.loads(report.read_text())
+    assert told["ids"] == ["arm-000000", "arm-000001"] == store.list(kind="recording")
+    assert {one["stream"] for one in told["reports"][0]["imported"]} >= {"action", "subtask"}
+    about = store.recording("arm-000000").attributes
+    assert about.calibration["K_head"] == ((60, 0, 32), (0, 60, 24), (0, 0, 1))
+    assert (about.task, about.domain) == ("cubes", "robot")
+    with pytest.raises(SystemExit) as usage:
+        dextouch(*words, "--k-head", "60,60,32")
+    assert usage.value.code == main.EXIT_USAGE
 
 
 @pytest.mark.long

@@ -1,0 +1,127 @@
+"""Rerun files that rerun-sdk wrote become recordings with the same numbers."""
+
+import contextlib
+import io
+import random
+
+import numpy as np
+import pytest
+from PIL import Image
+
+rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
+
+from dextouch.bridges.foreign import ImportAttributes  # noqa: E402
+from dextouch.bridges.foreign_rerun import import_rrd  # noqa: E402
+from dextouch.bridges.rerun import export_rrd  # noqa: E402
+from dextouch.episodes import EpisodeStore  # noqa: E402
+from dextouch.errors import DexTouchError, InvalidInputError  # noqa: E402
+from tests.unit.bridges.takes import write_recording  # noqa: E402
+
+T0 = 1_700_000_000_000_000_000
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "store")
+
+
+def png(pixels):
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    return file.getvalue()
+
+
+def rrd(path, timelines=("camera",)):
+    stream = rr.RecordingStream("lab")
+    stream.save(path)
+    K = np.array([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]])
+    stream.log("world/cam", rr.Pinhole(image_from_camera=K, width=6, height=4), static=True)
+    for k in range(6):
+        stream.set_time("frame", sequence=k)
+        for name in timelines:
+            stream.set_time(name, timestamp=np.datetime64(T0 + k * 10**8, "ns"))
+        turned = rr.Quaternion(xyzw=[0, 0, 0.6, 0.8])
+        stream.log("world/hand", rr.Transform3D(translation=[k, 2, 3], quaternion=turned))
+        stream.log("world/turn", rr.Transform3D(translation=[k, 2, 3], mat3x3=TURN))
+        stream.log("world/points", rr.Points3D(np.full((2 + k % 2, 3), k)))
+        stream.log("plots/force", rr.Scalars([k, 2.5]))
+        stream.log("plots/cells", rr.AnyValues(kpa=np.arange(4.0) + k))
+        stream.log("world/cam/image", rr.Image(np.full((4, 6, 3), k, np.uint8)))
+        stream.log("bgr", rr.Image(np.full((4, 6, 3), (1, 2, k), np.uint8), color_model="BGR"))
+        stream.log("depth", rr.DepthImage(np.full((4, 6), 1000 + k, np.uint16)))
+        blob = png(np.full((4, 6, 3), 9 * k, np.uint8))
+        stream.log("png", rr.EncodedImage(contents=blob, media_type="image/png"))
+        stream.log("text", rr.TextLog("hello"))
+    stream.flush()
+    stream.disconnect()
+    return path
+
+
+def test_what_rerun_wrote_arrives(store, tmp_path):
+    path = rrd(tmp_path / "a.rrd")
+    about = ImportAttributes(
+        mapping={"camera_head": "/world/cam/image", "wrist_left": "/world/hand"}
+    )
+    report = import_rrd(path, store, about)
+    recording = store.recording("a")
+    for name in recording.streams:
+        t_ns = recording.stamps(name).t_host_ns
+        assert t_ns.tolist() == [T0 + k * 10**8 for k in range(6)]
+    k = np.arange(6)
+    # Rerun has xyzw, the store w first.
+    hand = recording.values("wrist_left", 0, 6)
+    np.testing.assert_allclose(hand[4], [4, 2, 3, 0.8, 0, 0, 0.6], atol=1e-7)
+    turn = recording.values("world_turn", 0, 1)[0]
+    np.testing.assert_allclose(turn, [0, 2, 3, 0.5**0.5, 0, 0, 0.5**0.5], atol=1e-7)
+    points = recording.values("world_points", 0, 2)
+    assert np.isnan(points[0, 2]).all()
+    assert points[1].tolist() == [[1, 1, 1]] * 3
+    np.testing.assert_array_equal(recording.values("plots_force", 0, 6)[:, 0], k)
+    assert recording.values("plots_cells", 5, 6)[0].tolist() == [5, 6, 7, 8]
+    np.testing.assert_array_equal(recording.values("camera_head", 0, 6)[:, 1, 2, 0], k)
+    assert recording.values("bgr", 3, 4)[0, 0, 0].tolist() == [3, 2, 1]
+    np.testing.assert_array_equal(recording.values("depth", 0, 6)[:, 0, 0], 1000 + k)
+    np.testing.assert_array_equal(recording.values("png", 0, 6)[:, 0, 0, 2], 9 * k)
+    # Rerun's pinhole counts pixels from the corner, as the store.
+    K = recording.attributes.calibration["K_head"]
+    assert K == ((5, 0, 3), (0, 5, 2), (0, 0, 1))
+    assert recording.streams["wrist_left"].frame == "world"
+    assert [one.source for one in report.refused] == ["/text"]
+    assert report.kept_as_numbers.keys() == {"world_points", "plots_cells"}
+
+
+def test_the_timeline_is_chosen(store, tmp_path):
+    path = rrd(tmp_path / "two.rrd", ("camera", "robot"))
+    for name in (None, "frame", "nothing"):
+        with pytest.raises(InvalidInputError, match=r"\['camera', 'log_time', 'robot'\] are times"):
+            import_rrd(path, store, ImportAttributes(), timeline=name)
+    assert import_rrd(path, store, ImportAttributes(), timeline="robot").imported
+    path = rrd(tmp_path / "none.rrd", ())
+    report = import_rrd(path, store, ImportAttributes())
+    assert abs(report.imported[0].duration_s) < 60
+
+
+def test_an_export_of_ours_comes_back_as_numbers(store, tmp_path):
+    reader = write_recording(store, "take")
+    export_rrd(reader, tmp_path / "take.rrd")
+    report = import_rrd(tmp_path / "take.rrd", store, ImportAttributes(id_prefix="again-"))
+    again = store.recording("again-take")
+    (wrist,) = (one.stream for one in report.imported if one.source == "/world/wrist_left")
+    count = again.num_samples(wrist)
+    np.testing.assert_array_equal(
+        again.stamps(wrist).t_host_ns, reader.stamps("wrist_left").t_host_ns
+    )
+    ours = reader.values("wrist_left", 0, count)
+    np.testing.assert_allclose(again.values(wrist, 0, count)[:, :3], ours[:, :3], rtol=1e-6)
+
+
+def test_damaged_files_give_our_errors(store, tmp_path):
+    chance, source = random.Random(3), rrd(tmp_path / "a.rrd").read_bytes()
+    for number in range(40):
+        data = bytearray(source)
+        data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path = tmp_path / "flipped.rrd"
+        path.write_bytes(data if number else data[: len(data) // 2])
+        with contextlib.suppress(DexTouchError):
+            import_rrd(path, store, ImportAttributes(id_prefix=f"{number}-"))
