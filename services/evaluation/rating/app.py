@@ -12,7 +12,7 @@ from pydantic import Field
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
 from dextouch.free_text import FreeLines
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.rating.marks import (
     Judgement,
@@ -66,6 +66,8 @@ class RolloutView(FrozenModel):
 
 class SubmittedMark(Judgement):
     """Body of a mark."""
+
+    model_config = example(rollout="0123456789abcdef0123", rater="p07", holds={"touched": True})
 
     rollout: str = Field(pattern=r"^[0-9a-f]{20}$")
     comment: FreeLines = Field(default="", max_length=2000)
@@ -141,7 +143,7 @@ def rating_router(
     @router.get(
         "/next", response_model=None, responses={200: {"model": RolloutView}, 204: {}, 409: {}}
     )
-    def next_rollout(
+    def get_next_rollout(
         request: Request, rater: RaterName, key: Annotated[str, Depends(needs_rater)]
     ) -> RolloutView | Response:
         """The rollout that a rater should rate next; 204 when nothing is left."""
@@ -170,13 +172,13 @@ def rating_router(
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    def picture(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
+    def get_step_image(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
         """Head image and taxel maps of one step."""
         jpeg = pictures.step(queue.rollout(token).episode_id, step)
         return Response(jpeg, media_type="image/jpeg", headers={"cache-control": "no-store"})
 
     @router.post("/marks", status_code=201)
-    def give(
+    def submit_mark(
         request: Request, given: SubmittedMark, key: Annotated[str, Depends(needs_rater)]
     ) -> SubmittedMarkNumber:
         """Add a mark; a second one for the same presentation corrects the first."""

@@ -69,6 +69,7 @@ from .episodes import matrix_rows as matrix_rows
 from .observations import EVERYTHING as EVERYTHING
 from .observations import IMAGE_PREFIX as IMAGE_PREFIX
 from .observations import OBSERVED_ARRAYS as OBSERVED_ARRAYS
+from .observations import JsonAnswer as JsonAnswer
 from .observations import Observation as Observation
 from .observations import ReturnSelector as ReturnSelector
 from .observations import RolloutAnswer as RolloutAnswer

@@ -56,9 +56,12 @@ CHANNELS: Final = 3
 class ReturnSelector(FrozenModel):
     """Requested part of an observation.
 
-    `cameras` None means all cameras of the world, an empty list none; in a query, where an empty
-    list cannot be written, none is `cameras=`. `images` is how they are sent: JPEG takes a tenth of
-    the bytes, but is not exact.
+    Attributes:
+        cameras: names of cameras; all of the world if omitted, an empty list means none. In a
+            query, where an empty list cannot be written, none is `cameras=`.
+        steps: all steps of the chunk, or only its last one.
+        tactile: whether touch is sent.
+        images: how images are sent; JPEG takes a tenth of the bytes, but is not exact.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -236,6 +239,34 @@ class AnswerFields(FrozenModel):
     rollout: RolloutInfo
     observation: ObservationFields
     info: dict[str, float] = Field(default={})
+
+
+class JsonArray(FrozenModel):
+    """An array within JSON.
+
+    Attributes:
+        dtype: of numpy, such as `uint8` or `float32`.
+        shape: the number of entries along each axis.
+        data: its bytes in C order, little endian, as base64.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    data: str
+
+
+class JsonAnswer(FrozenModel):
+    """A response with an observation as JSON; MessagePack holds the same without base64.
+
+    Attributes:
+        arrays: of n steps, by name: `image/CAMERA` uint8 [n, h, w, 3], or `jpeg/CAMERA` with
+            `jpeg_bytes/CAMERA`; `tactile_kpa` float32 [n, 2, taxels], left hand first;
+            `action_reached` float64 [n, 67]; with the first observation `K_head` [3, 3] and the
+            poses `T_world_wrist_left`, `T_world_wrist_right`, `T_world_camera_head` [4, 4].
+    """
+
+    fields: AnswerFields
+    arrays: dict[str, JsonArray]
 
 
 class StartFields(FrozenModel):
