@@ -85,6 +85,7 @@ from .observations import encode_observation as encode_observation
 from .observations import encode_start as encode_start
 from .observations import rollout_uncertainty as rollout_uncertainty
 from .observations import start_from as start_from
+from .observations import start_of_parts as start_of_parts
 from .observations import validate_fields as validate_fields
 from .rollouts import CHUNK_STEPS as CHUNK_STEPS
 from .rollouts import MAX_SEED as MAX_SEED

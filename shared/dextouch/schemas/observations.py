@@ -361,7 +361,13 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
     """Decode a start request of an untrusted source; raises InvalidInputError if it is invalid."""
-    raw, arrays = unpack(data, max_bytes=max_bytes)
+    return start_of_parts(*unpack(data, max_bytes=max_bytes))
+
+
+def start_of_parts(
+    raw: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> tuple[StartRequest, RolloutStart]:
+    """A start request of fields and arrays of an untrusted source; raises as `decode_start`."""
     fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
         return fields.start, start_from(fields.start)
