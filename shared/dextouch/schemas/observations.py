@@ -205,7 +205,7 @@ def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
 def _check_array(
     name: str, array: np.ndarray, expected: tuple[str, tuple[int, ...]], where: str
 ) -> None:
-    if (_name_of(array.dtype), array.shape) != expected:
+    if array.shape != expected[1] or _name_of(array.dtype) != expected[0]:
         raise ShapeError(
             f"{where}: {name} got {array.dtype.name} {list(array.shape)}, "
             f"expected {expected[0]} {list(expected[1])}"

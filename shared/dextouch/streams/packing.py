@@ -128,12 +128,13 @@ def array_of(
     Raises InvalidInputError for a shape that is none, too many elements, or another number of
     bytes; `what` names the array.
     """
-    if (
-        not isinstance(shape, list)
-        or len(shape) > MAX_DIMENSIONS
-        or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
-        or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
-    ):
+    num_numbers = MAX_NUMBERS + 1
+    if isinstance(shape, list) and len(shape) <= MAX_DIMENSIONS:
+        num_numbers = 1
+        for n in shape:
+            # Exactly int, since a bool is none.
+            num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
+    if num_numbers > MAX_NUMBERS:
         raise InvalidInputError(
             f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "
             f"at most {MAX_NUMBERS}"
