@@ -128,22 +128,23 @@ def array_of(
     Raises InvalidInputError for a shape that is none, too many elements, or another number of
     bytes; `what` names the array.
     """
-    num_numbers = MAX_NUMBERS + 1
+    counts: list[Any] | None = None
     if isinstance(shape, list) and len(shape) <= MAX_DIMENSIONS:
-        num_numbers = 1
-        for n in shape:
-            # Exactly int, since a bool is none.
-            num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
-    if num_numbers > MAX_NUMBERS:
+        counts = shape
+    num_numbers = 1
+    for n in counts or ():
+        # Exactly int, since a bool is none.
+        num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
+    if counts is None or num_numbers > MAX_NUMBERS:
         raise InvalidInputError(
             f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "
             f"at most {MAX_NUMBERS}"
         )
-    expected = math.prod(shape) * dtype.itemsize
+    expected = math.prod(counts) * dtype.itemsize
     if not isinstance(data, bytes) or len(data) != expected:
         got = len(data) if isinstance(data, bytes) else type(data).__name__
-        raise InvalidInputError(f"{what}: got {got} bytes, expected {expected} for {shape}")
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+        raise InvalidInputError(f"{what}: got {got} bytes, expected {expected} for {counts}")
+    return np.frombuffer(data, dtype=dtype).reshape(counts)
 
 
 def pack_openpi(message: Mapping[str, Any]) -> bytes:
