@@ -5,7 +5,6 @@ from pathlib import Path as FilePath
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Request, Response
-from fastapi.responses import FileResponse
 from prometheus_client import Counter, Gauge
 from pydantic import Field
 
@@ -13,7 +12,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
 from dextouch.free_text import FreeLines
 from dextouch.frozen_model import FrozenModel, example
-from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
+from dextouch.serving import RequireScope, ServedFolder, create_service_app, file_router, serve
 from services.evaluation.rating.marks import (
     Judgement,
     Mark,
@@ -103,7 +102,8 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     text = "Marks given since the start, with corrections."
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
-    routers = [page_router(), rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
+    page = file_router(STATIC, FILES, PAGE_HEADERS)
+    routers = [page, rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),
         ServedFolder(settings.marks.parent, "folder of marks"),
@@ -114,18 +114,6 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     to_rate = Gauge("dextouch_rating_rollouts", text, registry=app.state.registry)
     to_rate.set(len(rollouts))
     return app
-
-
-def page_router() -> APIRouter:
-    """Router of the page and its files."""
-    router = APIRouter(include_in_schema=False)
-    for address, name in FILES.items():
-
-        async def file(name: str = name) -> FileResponse:
-            return FileResponse(STATIC / name, headers=PAGE_HEADERS)
-
-        router.add_api_route(address, file)
-    return router
 
 
 def rating_router(

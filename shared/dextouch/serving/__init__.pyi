@@ -1,3 +1,4 @@
+from .api_page import file_router as file_router
 from .app import create_service_app as create_service_app
 from .child_process import Answer as Answer
 from .child_process import ChildProcess as ChildProcess

@@ -1,5 +1,6 @@
 """Page of a service's OpenAPI document at /docs, which needs no other host: Swagger UI."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -27,11 +28,16 @@ HEADERS: Final = {
 
 def api_page_router() -> APIRouter:
     """Router of the page and its files, which need no key, as the document itself."""
+    return file_router(FOLDER, FILES, HEADERS)
+
+
+def file_router(folder: Path, files: Mapping[str, str], headers: Mapping[str, str]) -> APIRouter:
+    """Router of a page's files, by address, which need no key."""
     router = APIRouter(include_in_schema=False)
-    for address, name in FILES.items():
+    for address, name in files.items():
 
         async def file(name: str = name) -> FileResponse:
-            return FileResponse(FOLDER / name, headers=HEADERS)
+            return FileResponse(folder / name, headers=headers)
 
         router.add_api_route(address, file)
     return router
