@@ -6,6 +6,7 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 OPENPI_VENV ?= .venv-openpi
 LEROBOT_POLICY_VENV ?= .venv-lerobot-policy
+API_CLIENT_VENV ?= .venv-api-client
 RAY_VENV ?= .venv-ray
 STAGE ?= store loader acquisition clocks calibration retargeting teleoperation alignment closure twin world-model starts objects evaluator agreement rollouts
 MADE := runs/reproduce
@@ -14,7 +15,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -120,8 +121,9 @@ fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, commits, tags and builds the wheel in dist
 	$(BIN)/python deploy/release.py $(VERSION)
 
-vendor:                  ## fetch the vendored files of the dashboard again (needs npm); git diff shows whether they changed
+vendor:                  ## fetch the vendored files of the pages again (needs npm); git diff shows whether they changed
 	$(PYTHON) deploy/fetch_vendored.py services/dashboard/static/vendor
+	$(PYTHON) deploy/fetch_vendored.py shared/dextouch/serving/static/vendor
 
 $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $(LEROBOT)/prepare.py
 	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)
@@ -140,6 +142,14 @@ $(OPENPI_VENV)/.complete:
 
 check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: check interoperability with openpi's own client and packing
 	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
+
+$(API_CLIENT_VENV)/.complete:
+	$(PYTHON) -m venv $(API_CLIENT_VENV)
+	$(API_CLIENT_VENV)/bin/pip install --quiet --disable-pip-version-check openapi-python-client==0.29.1
+	touch $@
+
+check-api-client: $(VENV)/.dev $(API_CLIENT_VENV)/.complete   ## opt-in: generate clients of all services by their OpenAPI documents, and run a rollout with one
+	PYTHONPATH=.:shared $(BIN)/python -m tests.system.api_client.check $(abspath $(API_CLIENT_VENV))/bin/python
 
 $(LEROBOT_POLICY_VENV)/.complete:
 	$(PYTHON) -m venv $(LEROBOT_POLICY_VENV)

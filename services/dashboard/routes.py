@@ -22,7 +22,6 @@ from fastapi import (
 from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
-from pydantic_core import to_jsonable_python
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import QueryParams
 from starlette.websockets import WebSocketState
@@ -32,7 +31,14 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.serving import JSON, KIB, OCTETS, takes
 from services.dashboard.audit import ALL_ACTIONS, AuditLog, AuditPage, used_tokens
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
-from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
+from services.dashboard.feeds import (
+    Feeds,
+    HeatmapLayout,
+    OverviewView,
+    Topic,
+    heatmap_layout,
+    skeleton_bones,
+)
 from services.dashboard.fleet import Fleet
 from services.dashboard.pages import COOKIE, SCOPE, Sessions
 from services.dashboard.settings import DashboardSettings
@@ -71,30 +77,37 @@ def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) ->
     Station = Annotated[Feeds, Depends(fleet.of)]
     layout = {**heatmap_layout(), "bones": skeleton_bones()}
 
-    @router.get("/heatmap")
-    async def heatmap() -> JSONResponse:
+    @router.get("/heatmap", responses={200: {"model": HeatmapLayout}})
+    async def get_heatmap_layout() -> JSONResponse:
         """Layout and colours of the taxel maps, and the bones of a hand's keypoints."""
         return JSONResponse(layout)
 
     @router.get("/overview")
-    async def overview(feeds: Station) -> JSONResponse:
+    async def get_overview(feeds: Station) -> OverviewView:
         """Everything that the page shows, as JSON."""
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
         )
-        shown = {"name": settings.station, "station": station, "services": services}
-        shown |= {"takes": takes.takes, "takes_note": takes.note, "refused": takes.refused}
-        return JSONResponse(to_jsonable_python(shown))
+        return OverviewView(
+            name=settings.station,
+            station=station,
+            services=tuple(services),
+            takes=takes.takes,
+            takes_note=takes.note,
+            refused=takes.refused,
+        )
 
     @router.post("/recorder/{action}")
-    async def operate(
-        action: str, body: Annotated[dict[str, Any], Body()], feeds: Station
+    async def operate_recorder(
+        action: str,
+        body: Annotated[dict[str, Any], Body(examples=[{"success": True}])],
+        feeds: Station,
     ) -> RecorderView:
         """Arm, record, stop, save (`success` required) or discard; the recorder's new state."""
         return await feeds.operate(action, body)
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
-    async def retry(recording_id: str, feeds: Station) -> None:
+    async def retry_upload(recording_id: str, feeds: Station) -> None:
         """Upload a refused take again."""
         path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
         await feeds.upstream("acquisition").send("POST", path)
@@ -104,7 +117,7 @@ def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) ->
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    async def camera(name: CameraName, feeds: Station) -> Response:
+    async def get_camera_image(name: CameraName, feeds: Station) -> Response:
         """The newest image of one camera."""
         image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
         media_type = image.headers.get("content-type", "image/jpeg")
@@ -120,12 +133,12 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
 
     @router.post("", status_code=202)
     @takes({JSON: KIB})
-    async def start(body: StartComparison) -> ComparisonView:
+    async def start_comparison(body: StartComparison) -> ComparisonView:
         """Replay an episode in the twin and in the world model; ends the comparison before."""
         return await comparisons.start(body.episode_id)
 
     @router.post("/stop", status_code=204)
-    async def stop() -> None:
+    async def stop_comparison() -> None:
         """End the running comparison and its rollouts."""
         await comparisons.stop()
 
@@ -134,7 +147,7 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
         response_class=Response,
         responses={200: {"content": {OCTETS: {}}}},
     )
-    async def chunk(comparison_id: str, number: int) -> Response:
+    async def get_comparison_chunk(comparison_id: str, number: int) -> Response:
         """Images and touch of both worlds over one chunk."""
         headers = {"cache-control": "no-store"}
         content = comparisons.chunk(comparison_id, number)
@@ -151,12 +164,12 @@ def system_router(
     router = APIRouter(prefix="/v1", dependencies=guards, tags=["system"])
 
     @router.get("/system")
-    async def state() -> SystemView:
+    async def get_system() -> SystemView:
         """Services, disks and queues."""
         return await system.read()
 
     @router.get("/audit")
-    async def audit(
+    async def list_audit_entries(
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
         action: Annotated[str | None, Query(max_length=200)] = None,
         person: Annotated[str | None, Query(max_length=64)] = None,

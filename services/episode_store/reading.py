@@ -99,14 +99,14 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
     max_steps, max_bytes = settings.max_window_steps, settings.max_answer_bytes
 
     @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
-    def attributes(recording_id: str) -> RecordingAttributes:
+    def get_recording_attributes(recording_id: str) -> RecordingAttributes:
         """Attributes of a finished recording."""
         return store.recording(recording_id).attributes
 
     @router.get(
         "/recordings/{recording_id}/streams/{stream}", tags=["recordings"], **_answers(MSGPACK)
     )
-    def recording_samples(
+    def get_recording_samples(
         recording_id: str,
         stream: str,
         span: Annotated[SpanQuery, Query()],
@@ -118,7 +118,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
-    def episode(episode_id: str) -> EpisodeDetail:
+    def get_episode(episode_id: str) -> EpisodeDetail:
         """Attributes of an episode."""
         reader = store.open(episode_id)
         return EpisodeDetail(
@@ -128,7 +128,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         )
 
     @router.get("/episodes/{episode_id}/windows", tags=["episodes"], **_answers(WINDOW_MSGPACK))
-    def window(
+    def get_episode_window(
         episode_id: str, query: Annotated[WindowQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
@@ -139,7 +139,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
 
     @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **_answers(MSGPACK))
-    def episode_samples(
+    def get_episode_samples(
         episode_id: str,
         stream: str,
         span: Annotated[SpanQuery, Query()],
@@ -297,12 +297,12 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         return store.open(item_id) if kind == "episode" else store.recording(item_id)
 
     @router.get("/{kind}/{item_id}")
-    def about(kind: ItemKind, item_id: str) -> Playback:
+    def get_playback(kind: ItemKind, item_id: str) -> Playback:
         """What can be played of an item: its streams with their extents and longest gaps."""
         return playback_of(opened(kind, item_id))
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
-    def images(
+    def get_playback_images(
         kind: ItemKind,
         item_id: str,
         camera: str,
@@ -315,7 +315,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         return response(etag_of(reader, f"jpeg {camera}", query), if_none_match, read, MSGPACK)
 
     @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
-    def signals(
+    def get_playback_signals(
         kind: ItemKind,
         item_id: str,
         query: Annotated[SignalsQuery, Query()],
@@ -327,7 +327,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
 
     @router.get("/episode/{item_id}/robot_hands", **_answers(MSGPACK))
-    def hands(
+    def get_playback_robot_hands(
         item_id: str, query: Annotated[RobotHandsQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Points of both robot hands in the world, from the actions of a span."""

@@ -31,6 +31,8 @@ SCOPES = (
 )
 # Needs no key on any service: probes, and the description of the routes.
 PUBLIC = {"GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json"}
+PUBLIC |= {"GET /docs", "GET /docs/page.js"}
+PUBLIC |= {"GET /docs/swagger-ui.css", "GET /docs/swagger-ui-bundle.js"}
 # Needs a one-time token in place of a key.
 BY_TOKEN = {"episode_store": {"POST /v1/enrolments/exchange"}}
 # An application of its own, with the same keys (tests/unit/acquisition/test_practice.py).

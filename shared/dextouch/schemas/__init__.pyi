@@ -71,6 +71,7 @@ from .episodes import matrix_rows as matrix_rows
 from .observations import EVERYTHING as EVERYTHING
 from .observations import IMAGE_PREFIX as IMAGE_PREFIX
 from .observations import OBSERVED_ARRAYS as OBSERVED_ARRAYS
+from .observations import JsonAnswer as JsonAnswer
 from .observations import Observation as Observation
 from .observations import ReturnSelector as ReturnSelector
 from .observations import RolloutAnswer as RolloutAnswer
@@ -86,6 +87,7 @@ from .observations import encode_observation as encode_observation
 from .observations import encode_start as encode_start
 from .observations import rollout_uncertainty as rollout_uncertainty
 from .observations import start_from as start_from
+from .observations import start_of_parts as start_of_parts
 from .observations import validate_fields as validate_fields
 from .rollouts import CHUNK_STEPS as CHUNK_STEPS
 from .rollouts import MAX_SEED as MAX_SEED

@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import AwareDatetime, Field
 
 from dextouch.free_text import FreeLines, FreeText
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
 from dextouch.tactile import LayoutDescription
@@ -53,6 +53,8 @@ class StoredItem(FrozenModel):
 
 class MoveItems(FrozenModel):
     """Request to move items to the trash, or back."""
+
+    model_config = example(items=[{"kind": "episode", "id": "take-20260301-1"}])
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
 
@@ -102,6 +104,12 @@ class Review(FrozenModel):
 
 class ReviewItems(FrozenModel):
     """Request to review items; a `verdict` of None removes their reviews."""
+
+    model_config = example(
+        items=[{"kind": "episode", "id": "take-20260301-1"}],
+        verdict="rejected",
+        reason="hand occluded",
+    )
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
     verdict: Verdict | None

@@ -9,7 +9,7 @@ from pydantic import AwareDatetime, BaseModel, Field, FiniteFloat, field_validat
 
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import check_texts
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.common import (
@@ -313,6 +313,25 @@ class RecordingAttributes(FrozenModel):
 class NewRecording(RecordingAttributes):
     """Attributes with which an upload begins; texts of earlier recordings are not checked again."""
 
+    model_config = example(
+        recording_id="take-20260301-1",
+        domain="human",
+        station="bench-1",
+        task="stand_bottle",
+        instruction="Stand the bottle upright.",
+        streams=[
+            {
+                "name": "tactile_left",
+                "kind": "tactile",
+                "shape": [320],
+                "dtype": "float32",
+                "unit": "kPa",
+                "nominal_rate_hz": 60.0,
+                "side": "left",
+            }
+        ],
+    )
+
     @model_validator(mode="after")
     def _is_visible(self) -> "NewRecording":
         check_texts(self)
@@ -361,6 +380,8 @@ class FinishRecording(FrozenModel):
 
     Without `content`, as older stations send it, the answer proves nothing about the samples.
     """
+
+    model_config = example(num_batches={"tactile_left": 12}, success=True)
 
     num_batches: dict[str, int]
     content: dict[str, StreamContent] = Field(default={})
@@ -423,5 +444,7 @@ class UploadList(FrozenModel):
 
 class ExpireUploads(FrozenModel):
     """Request to drop every upload that has been idle for at least `idle_s`."""
+
+    model_config = example(idle_s=86400.0)
 
     idle_s: float = Field(ge=MIN_EXPIRE_IDLE_S, allow_inf_nan=False)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import Box, StoreId, first_problems
 
 # Position x y z (m), then the quaternion w x y z.
@@ -251,6 +251,10 @@ class ObjectClick(FrozenModel):
 
 class EpisodeClicks(FrozenModel):
     """Clicks on the objects of one episode, by their names."""
+
+    model_config = example(
+        objects={"bottle": {"point_px": [31.5, 40.0], "heading_px": [36.0, 40.0]}}
+    )
 
     objects: dict[ObjectName, ObjectClick] = Field(max_length=MAX_OBJECTS)
 

@@ -1,3 +1,4 @@
+from .api_page import file_router as file_router
 from .app import create_service_app as create_service_app
 from .child_process import Answer as Answer
 from .child_process import ChildProcess as ChildProcess
@@ -10,6 +11,7 @@ from .configuration_file import file_source as file_source
 from .configuration_file import line_of as line_of
 from .configuration_file import read_configuration as read_configuration
 from .configuration_file import section_of as section_of
+from .connections import accept_messages_of as accept_messages_of
 from .connections import timed as timed
 from .guard import AS_SET as AS_SET
 from .guard import FORM as FORM

@@ -23,6 +23,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -48,6 +49,9 @@ REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 OWN_HEADERS = frozenset({b"x-request-id", b"server-timing"})
 KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+# Of a WebSocket's scope: sets the largest message that its client may send.
+MESSAGE_LIMIT = "dextouch.message_limit"
 
 # Finds the ASGI application that answers a request in place of its route, which takes some 0.4 ms
 # of FastAPI's time; None leaves the request to the route. It checks the scope of the key itself,
@@ -145,6 +149,26 @@ class _Watched(asyncio.Protocol):
 
 class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
     """WebSocket whose client must read; uvicorn's pings find those that are gone."""
+
+    def handle_connect(self, event: Any) -> None:  # noqa: ANN401 - of websockets
+        super().handle_connect(event)
+        # The application begins later; a handshake that was refused has none, and no scope.
+        if not self.handshake_complete:
+            extensions: dict[str, Any] = self.scope.setdefault("extensions", {})
+            extensions[MESSAGE_LIMIT] = self._accept_messages_of
+
+    def _accept_messages_of(self, num_bytes: int) -> None:
+        self.conn.max_message_size = num_bytes
+
+
+def accept_messages_of(socket: WebSocket, num_bytes: int) -> None:
+    """Let the client of a WebSocket send messages of `num_bytes`, once its key is known.
+
+    Others may send 64 KiB (`MAX_WEBSOCKET_BYTES`); another server than ours keeps its own limit.
+    """
+    limit = socket.scope.get("extensions", {}).get(MESSAGE_LIMIT)
+    if limit is not None:
+        limit(num_bytes)
 
 
 class _LimitedHttp(_Watched, HttpToolsProtocol):

@@ -3,14 +3,17 @@
 import threading
 from contextlib import ExitStack
 
+import av
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dextouch.clients import RolloutClient
-from dextouch.clients.gym_env import WorldEnv, WorldVectorEnv
+from dextouch.clients.gym_env import ENV_ID, WorldEnv, WorldVectorEnv
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
@@ -64,6 +67,62 @@ def test_gymnasium_accepts_it(env):
     check_env(env, skip_render_check=True)
 
 
+@pytest.fixture
+def made(url):
+    """The registered environment, found by the name of its module."""
+    opened = []
+
+    def make(**options):
+        given = {"world": "sum", "chunk_steps": 4, "max_chunks": 3} | ASKED | options
+        opened.append(gymnasium.make(f"dextouch.clients.gym_env:{ENV_ID}", url=url, **given))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+
+
+def test_gymnasium_makes_it_by_name_and_accepts_its_images(made):
+    env = made(render_mode="rgb_array")
+    assert isinstance(env.unwrapped, WorldEnv)
+    # Makes it again in each of its render modes.
+    check_env(env.unwrapped)
+    seen, _ = env.reset(seed=3)
+    cameras = env.unwrapped.description.cameras
+    np.testing.assert_array_equal(
+        env.render(), np.concatenate([seen[name] for name in cameras], axis=1)
+    )
+    assert env.metadata["render_fps"] == 15 / 4
+
+
+def test_a_list_has_every_step_of_the_chunk_once(made):
+    env = made(render_mode="rgb_array_list")
+    assert env.metadata["render_fps"] == 15
+    env.reset(seed=3)
+    assert [len(env.render()), len(env.render())] == [1, 0]
+    seen, *_ = env.step(actions(4))
+    images = env.render()
+    assert len(images) == 4
+    np.testing.assert_array_equal(
+        images[-1][:, : seen["camera_head"].shape[1]], seen["camera_head"]
+    )
+
+
+def test_gymnasium_records_videos_of_it(made, tmp_path):
+    pytest.importorskip("moviepy", reason="pip install moviepy")
+    env = RecordVideo(made(render_mode="rgb_array"), str(tmp_path / "videos"))
+    env.reset(seed=3)
+    while not any(env.step(actions(4))[2:4]):
+        pass
+    env.close()
+    (path,) = tmp_path.glob("videos/*.mp4")
+    with av.open(path) as video:
+        (stream,) = video.streams.video
+        # The start, and the end of three chunks.
+        assert len(list(video.decode(stream))) == 4
+        assert float(stream.average_rate) == 15 / 4
+
+
 def test_success_ends_and_length_truncates(env):
     env.reset(seed=0)
     outcomes = [env.step(actions(4))[1:4] for _ in range(3)]
@@ -105,6 +164,8 @@ def test_wrong_use_is_named(client, env):
         WorldEnv(client, world="moon", **ASKED)
     with pytest.raises(InvalidInputError, match="multiple of 4"):
         WorldEnv(client, world="sum", chunk_steps=6, **ASKED)
+    with pytest.raises(UnknownNameError, match="valid: rgb_array, rgb_array_list"):
+        WorldEnv(client, world="sum", render_mode="depth", **ASKED)
     with pytest.raises(InvalidInputError, match="call reset first"):
         env.step(actions(4))
     with pytest.raises(UnknownNameError, match="valid: init"):

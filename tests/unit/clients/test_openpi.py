@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import msgpack
@@ -153,3 +154,84 @@ def test_it_is_a_policy_by_name():
         policy.close()
     with pytest.raises(InvalidInputError, match="expected at least 1"):
         OpenPiPolicy("ws://127.0.0.1:9", chunk_steps=0)
+
+
+def linear(request):
+    """Actions that depend on the whole request, as those of a network do."""
+    state = request["observation/state"].astype(np.float32)
+    touch = request["observation/tactile"].mean()
+    return {"actions": np.tile(state, (8, 1)) + touch + len(request["prompt"])}
+
+
+def acting_together(url, num_policies, num_chunks):
+    """Actions of several policies in threads of their own, by policy and chunk."""
+
+    begin = threading.Barrier(num_policies)
+
+    def act(index):
+        policy = OpenPiPolicy(url)
+        begin.wait(20)
+        policy.reset(PolicyStart("t", "x" * index, 0, fakes.anchor(), np.eye(3)))
+        return [
+            policy.act(fakes.observation(1, seed=100 * index + chunk))
+            for chunk in range(num_chunks)
+        ]
+
+    with ThreadPoolExecutor(num_policies) as threads:
+        return list(threads.map(act, range(num_policies)))
+
+
+def test_requests_of_several_rollouts_go_together_where_the_server_says_so():
+    sizes = []
+
+    def answer(request):
+        requests = request.get("batch", [request])
+        sizes.append(len(requests))
+        # The first one waits for all others.
+        time.sleep(0.3 if len(sizes) == 1 else 0.01)
+        answers = [linear(one) for one in requests]
+        return {"batch": answers} if "batch" in request else answers[0]
+
+    results, counts = {}, {}
+    for max_batch in (1, 4):
+        sizes.clear()
+        with policy_server(answer, max_batch=max_batch) as url:
+            results[max_batch] = acting_together(url, 6, 5)
+        counts[max_batch] = list(sizes)
+    assert set(counts[1]) == {1}
+    assert max(counts[4]) == 4
+    assert sum(counts[4]) == sum(counts[1]) == 30
+    np.testing.assert_allclose(results[4], results[1], rtol=0, atol=1e-6)
+
+
+def test_a_batch_that_fails_fails_for_all_and_the_next_one_works():
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        time.sleep(0.3)
+        if "batch" in request:
+            return {"batch": [linear(request["batch"][0])]}
+        return linear(request)
+
+    with policy_server(answer, max_batch=8) as url, ThreadPoolExecutor(4) as threads:
+        policies = [OpenPiPolicy(url) for _ in range(4)]
+        pending = [threads.submit(one.act, observation()) for one in policies]
+        errors = [future.exception(20) for future in pending]
+        # The first goes alone; the others wait for it, and are answered short.
+        assert sum(error is None for error in errors) == 1
+        told = [str(error) for error in errors if error is not None]
+        assert told == [told[0]] * 3
+        assert "got 1 answers to a batch, expected 3 maps" in told[0]
+        assert policies[0].act(observation()).shape == (8, 67)
+
+
+@pytest.mark.parametrize("metadata", [{"max_batch": 8, "resets": True}, {"max_batch": True}, {}])
+def test_requests_are_not_joined_where_the_server_does_not_say_so(metadata):
+    def answer(request):
+        time.sleep(0.01)
+        assert "batch" not in request
+        return {} if "reset" in request else linear(request)
+
+    with policy_server(answer, **metadata) as url:
+        assert len(acting_together(url, 3, 2)) == 3
