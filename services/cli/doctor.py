@@ -54,6 +54,7 @@ _OPTIONAL = {
     "mcap": "MCAP files",
     "obstore": "stores in a bucket, s3://…",
     "diffusers": "the full-size world model",
+    "uvloop": "a faster event loop of the services",
 }
 DEVICE_KINDS: Final = {
     "serial devices": ("ttyACM*", "ttyUSB*"),
