@@ -16,6 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 SERVICES = {
     *("episode_store", "alignment", "acquisition", "twin", "world_model", "studies", "dashboard")
 }
+MAX_WHEEL_BYTES = 3_000_000
 # Of a machine that is busy with other things; the solver may be compiled first.
 READY_LIMIT_S = 900
 IMPORT_ALL = """
@@ -46,11 +47,20 @@ def files_below(folder, installed_as):
 
 
 def test_the_wheel_holds_every_file_of_both_packages(installed):
-    with zipfile.ZipFile(installed.wheel) as wheel:
-        names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    found = {}
+    for wheel in (installed.wheel, installed.weights):
+        with zipfile.ZipFile(wheel) as opened:
+            found[wheel] = {name for name in opened.namelist() if ".dist-info/" not in name}
+    names = found[installed.wheel]
     share = next(Path(name).parts[0] for name in names if ".data/" in name) / Path("data/share")
+    services = files_below(ROOT / "services", Path("dextouch_services"))
+    weights = {name for name in services if name.endswith(".safetensors")}
+    assert found[installed.weights] == weights
+    assert len(weights) == 5
+    # Clients and stations have no use for weights.
+    assert installed.wheel.stat().st_size < MAX_WHEEL_BYTES
     assert names == (
-        files_below(ROOT / "services", Path("dextouch_services"))
+        (services - weights)
         | files_below(ROOT / "shared/dextouch", Path("dextouch"))
         | files_below(ROOT / "deploy", share / "dextouch/deploy")
         | files_below(ROOT / "docs", share / "dextouch/docs")
