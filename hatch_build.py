@@ -3,7 +3,7 @@
 A top-level package called `services` would collide with those of other distributions
 (docs/decisions/0022-name-of-the-services-in-a-wheel.md). Checkouts and editable installations keep
 the name of the folder. Weights are a wheel of their own, which extras with networks ask for
-(docs/decisions/0023-weights-in-a-wheel-of-their-own.md).
+(docs/decisions/0024-weights-in-a-wheel-of-their-own.md).
 """
 
 import io

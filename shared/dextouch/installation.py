@@ -61,7 +61,7 @@ def _arguments(installed: "Distribution", origin: dict[str, Any] | None, extra: 
         # Other wheels of the release lie beside it.
         beside = ["--find-links", str(wheel.parent)] if wheel else []
         return [*beside, f"{wanted} @ {url}"]
-    return _packages_of(installed, extra)
+    return _packages_of(installed, extra) or [wanted]
 
 
 def _packages_of(installed: "Distribution", extra: str) -> list[str]:
