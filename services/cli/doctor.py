@@ -25,7 +25,7 @@ from dextouch import __version__
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import printable
-from dextouch.installation import install_command
+from dextouch.installation import install_command, pip_install
 from services.cli.extras import install_hint, missing_package
 
 # Distributions that are named otherwise than what they provide.
@@ -308,7 +308,7 @@ def opencv_findings() -> list[Finding]:
         return []
     ours = _DISTRIBUTIONS["cv2"]
     kept = f"{ours}=={installed[ours]}" if ours in installed else f"{ours}>=4.14,<5"
-    do = f"pip install --force-reinstall --no-deps '{kept}'"
+    do = pip_install("--force-reinstall", "--no-deps", kept)
     told = ", ".join(f"{name} {version}" for name, version in installed.items())
     loaded = _loaded_opencv()
     if loaded is None:
@@ -371,7 +371,7 @@ def _outdated() -> list[Finding]:
             continue
         if not requirement.specifier.contains(version, prereleases=True):
             spec = f"{requirement.name}{requirement.specifier}"
-            do = f"pip install '{spec}'"
+            do = pip_install(spec)
             found = f"{version}, expected {requirement.specifier}"
             wrong.append(_advice(requirement.name, found, do))
     return wrong

@@ -35,10 +35,31 @@ def install_command(extra: str) -> str:
     try:
         installed = metadata.distribution(NAME)
     except metadata.PackageNotFoundError:
-        return _command("", ["-e", f"{Path(__file__).parents[2]}[{extra}]"])
+        return pip_install("-e", f"{Path(__file__).parents[2]}[{extra}]")
     record = installed.read_text("direct_url.json")
     origin: dict[str, Any] | None = None if record is None else json.loads(record)
-    return _command(installed.read_text("INSTALLER") or "", _arguments(installed, origin, extra))
+    return pip_install(*_arguments(installed, origin, extra))
+
+
+def pip_install(*arguments: str) -> str:
+    """Shell command that installs into this environment, by pip or uv, whichever installed us.
+
+    It names this Python where another environment is active.
+    """
+    from importlib import metadata
+
+    try:
+        installer = metadata.distribution(NAME).read_text("INSTALLER") or ""
+    except metadata.PackageNotFoundError:
+        installer = ""
+    if installer.strip() == "uv":
+        is_active = os.environ.get("VIRTUAL_ENV", "") == sys.prefix
+        start = ["uv", "pip", "install", *([] if is_active else ["--python", sys.executable])]
+    else:
+        found = shutil.which("pip")
+        is_active = found is not None and Path(found).parent == Path(sys.executable).parent
+        start = ["pip", "install"] if is_active else [sys.executable, "-m", "pip", "install"]
+    return shlex.join([*start, *arguments])
 
 
 def _arguments(installed: "Distribution", origin: dict[str, Any] | None, extra: str) -> list[str]:
@@ -73,16 +94,3 @@ def _packages_of(installed: "Distribution", extra: str) -> list[str]:
 
 def _path_of(url: str) -> Path:
     return Path(unquote(urlsplit(url).path))
-
-
-def _command(installer: str, arguments: list[str]) -> str:
-    """The command of an installer for this Python, even where another environment is active."""
-    environment = Path(sys.prefix)
-    if installer.strip() == "uv":
-        is_active = os.environ.get("VIRTUAL_ENV", "") == str(environment)
-        start = ["uv", "pip", "install", *([] if is_active else ["--python", sys.executable])]
-    else:
-        found = shutil.which("pip")
-        is_active = found is not None and Path(found).parent == Path(sys.executable).parent
-        start = ["pip", "install"] if is_active else [sys.executable, "-m", "pip", "install"]
-    return shlex.join([*start, *arguments])

@@ -36,6 +36,7 @@ CASES = (
     Case("lerobot 3.11", "3.11", NEWEST, beside=(LEROBOT_IN_3_11,), modules=("lerobot", "torch")),
     Case("lerobot 3.12", "3.12", NEWEST, beside=(LEROBOT,), modules=("lerobot", "torch")),
     Case("lerobot 3.13", "3.13", NEWEST, beside=(LEROBOT,), modules=("lerobot", "torch")),
+    Case("all lerobot 3.12", "3.12", NEWEST, "all", (LEROBOT,), "model_check.py", ("lerobot",)),
     Case("model oldest 3.11", "3.11", OLDEST, "model", script="model_check.py"),
     Case("model newest 3.13", "3.13", NEWEST, "model", script="model_check.py"),
 )
@@ -53,7 +54,7 @@ def check(case, folder):
     """Make the environment of a case and run its script there; the last line it prints."""
     python = str(folder / "venv/bin/python")
     uv("venv", "--python", case.python, str(folder / "venv"))
-    weights = [str(ROOT / "weights")] if case.extras == "model" else []
+    weights = [str(ROOT / "weights")] if case.extras in {"model", "all"} else []
     wanted = [f"{ROOT}[{case.extras}]", *weights, *case.beside]
     uv("pip", "install", "--python", python, "--resolution", case.resolution, *wanted)
     uv("pip", "check", "--python", python)

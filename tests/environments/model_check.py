@@ -4,6 +4,9 @@ Run by `make check-environments` with the oldest and the newest torch of the ran
 predicted must be what the torch of constraints.txt predicts, but for rounding.
 """
 
+import importlib
+import sys
+
 import numpy as np
 import PIL
 import torch
@@ -52,6 +55,8 @@ def predicted(world):
 
 
 def main():
+    for name in sys.argv[1:]:
+        importlib.import_module(name)
     torch.set_num_threads(1)
     for path in (default_checkpoint(), paper_form_checkpoint()):
         got = predicted(open_world(path))

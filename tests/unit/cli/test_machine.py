@@ -218,7 +218,7 @@ def test_packages_of_another_version_are_told(monkeypatch):
     monkeypatch.setattr(doctor.importlib.metadata, "version", version)
     (wrong,) = doctor._outdated()
     assert (wrong.what, wrong.found) == ("scipy", "1.17.0, expected <1")
-    assert wrong.do == "pip install 'scipy<1'"
+    assert wrong.do.endswith("pip install 'scipy<1'")
 
 
 CV2 = {
@@ -260,7 +260,7 @@ def test_an_opencv_of_others_over_ours_is_told(opencv):
     (found,) = opencv(BOTH, CV2["lerobot's"])
     assert found.found.startswith("of opencv-python-headless 4.13.0.92; installed: ")
     assert (found.ok, found.required) == (False, False)
-    assert found.do.endswith("'opencv-contrib-python-headless==4.14.0.94'")
+    assert found.do.endswith("--no-deps opencv-contrib-python-headless==4.14.0.94")
 
 
 def test_ours_over_that_of_others_is_in_order(opencv):
@@ -272,7 +272,7 @@ def test_ours_over_that_of_others_is_in_order(opencv):
 def test_files_that_another_build_took_along_are_missed(opencv):
     (found,) = opencv({"opencv-contrib-python-headless": "4.14.0.94"}, None)
     assert found.found.startswith("damaged")
-    assert found.do.startswith("pip install --force-reinstall")
+    assert " pip install --force-reinstall " in found.do
 
 
 def test_without_opencv_nothing_is_said(opencv):
