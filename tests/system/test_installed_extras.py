@@ -3,7 +3,6 @@
 import os
 import subprocess
 import venv
-from pathlib import Path
 
 import pytest
 
@@ -44,6 +43,8 @@ def test_the_command_works(wheel, tmp_path, way):
         "PATH": f"{binaries}:{os.environ['PATH']}",
         "PIP_CONSTRAINT": str(ROOT / "constraints.txt"),
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+        # Builds import hatch_build.py in the checkout.
+        "PYTHONDONTWRITEBYTECODE": "1",
     }
     if way == "index":
         kept["PIP_EXTRA_INDEX_URL"] = index
@@ -72,4 +73,3 @@ def test_the_command_works(wheel, tmp_path, way):
     assert run(python, "-c", USE)[0] == 0
     # Nothing else was changed: it is still installed as it was.
     assert run(python, "-c", TELL)[1] == command
-    assert Path(python).exists()
