@@ -15,7 +15,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -177,6 +177,9 @@ $(DOCS_VENV)/.complete: pyproject.toml constraints.txt
 docs: $(DOCS_VENV)/.complete   ## build the documentation site in build/docs; warnings are errors
 	$(DOCS_VENV)/bin/python -m sphinx --builder html --fresh-env --write-all --fail-on-warning --quiet docs $(SITE)
 	@echo "open $(SITE)/index.html"
+
+check-environments:      ## opt-in: install the package beside LeRobot and with the oldest and newest packages of its ranges, for several Pythons; needs uv (pip install uv); 10 GB; ARGS="store" for some
+	$(PYTHON) tests/environments/check.py $(ARGS)
 
 clean:
 	rm -rf $(SITE) demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,7 +1,7 @@
 """Make a release: `make release VERSION=0.2.0`.
 
-Writes the version into the package and the changelog, commits, tags, and builds the wheel with its
-SHA-256 in `dist`. Nothing is pushed. Run `.ci/run` first.
+Writes the version into the package and the changelog, commits, tags, and builds the wheels of code
+and weights with their SHA-256 in `dist`. Nothing is pushed. Run `.ci/run` first.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from packaging.version import InvalidVersion, Version
 _UNRELEASED = "## Unreleased\n"
 _PLACES = (
     ("pyproject.toml", r'(?m)^version = "(.+)"$'),
+    ("weights/pyproject.toml", r'(?m)^version = "(.+)"$'),
     ("shared/dextouch/__init__.py", r'(?m)^__version__ = "(.+)"$'),
 )
 
@@ -41,8 +42,9 @@ def main() -> int:
     _git(root, "commit", "--quiet", "--message", f"Release {options.version}", *changed)
     tag = f"v{options.version}"
     _git(root, "tag", "--annotate", tag, "--message", f"DexTouch {options.version}")
-    wheel = _build(root)
-    print(f"made {tag} and {wheel}\npush them with: git push origin main {tag}")  # noqa: T201
+    wheels = _build(root, options.version)
+    made = ", ".join(map(str, wheels))
+    print(f"made {tag} and {made}\npush them with: git push origin main {tag}")  # noqa: T201
     return 0
 
 
@@ -81,15 +83,17 @@ def prepare(root: Path, version: str, today: date) -> dict[str, str]:
     return changed
 
 
-def _build(root: Path) -> Path:
-    """Build the wheel, and write its SHA-256 beside it."""
+def _build(root: Path, version: str) -> list[Path]:
+    """Build both wheels, and write the SHA-256 of each beside it."""
     target = root / "dist"
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir"]
-    subprocess.run([*words, str(target), str(root)], check=True)  # noqa: S603 - own words
-    wheel = max(target.glob("*.whl"), key=lambda path: path.stat().st_mtime)
-    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
-    wheel.with_suffix(".whl.sha256").write_text(f"{digest}  {wheel.name}\n", encoding="utf-8")
-    return wheel
+    folders = [str(root), str(root / "weights")]
+    subprocess.run([*words, str(target), *folders], check=True)  # noqa: S603 - own words
+    wheels = sorted(target.glob(f"dextouch_wm*-{version}-*.whl"))
+    for wheel in wheels:
+        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        wheel.with_suffix(".whl.sha256").write_text(f"{digest}  {wheel.name}\n", encoding="utf-8")
+    return wheels
 
 
 def _git(root: Path, *words: str) -> str:

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,14 @@ if TYPE_CHECKING:
 # path, which takes little more than half the time at the same PSNR.
 _TO_YUV = 0x20 | 0x4000
 _TO_RGB = "BICUBIC"
+
+
+@cache
+def _one_thread() -> dict[str, Any]:
+    """Arguments by which PyAV converts images in this thread: from 17 on it starts others."""
+    import av
+
+    return {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
 
 
 class VideoSettings(FrozenModel):
@@ -145,7 +154,9 @@ class GopEncoder:
                 f"H.264: got {image.dtype} {image.shape}, expected uint8 {self._shape}"
             )
         rgb = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(image), format="rgb24")
-        frame = self._reformatter.reformat(rgb, format="yuv420p", interpolation=_TO_YUV, threads=1)
+        frame = self._reformatter.reformat(
+            rgb, format="yuv420p", interpolation=_TO_YUV, **_one_thread()
+        )
         frame.pts = self._index
         packets = self._context.encode(frame)
         if len(packets) != 1:
@@ -263,7 +274,7 @@ class GopDecoder:
             format="gray" if form.gray else "rgb24",
             # Area scaling averages each 2×2 pixels, as the other codecs do.
             interpolation="AREA" if form.half_size else _TO_RGB,
-            threads=1,
+            **_one_thread(),
         )
         plane = converted.planes[0]
         rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)

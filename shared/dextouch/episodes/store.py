@@ -48,6 +48,7 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
+from dextouch.installation import install_command
 from dextouch.schemas import (
     ID_PATTERN,
     EpisodeAttributes,
@@ -244,7 +245,7 @@ def _open_storage(
             if error.name != "obstore":
                 raise
             raise UnavailableError(
-                "episode store: s3://… needs obstore; run `pip install 'dextouch-wm[s3]'`"
+                f"episode store: s3://… needs obstore; run `{install_command('s3')}`"
             ) from error
         return ObjectStorage(url, storage_options)
     if storage_options:

@@ -112,7 +112,7 @@ class _Watched(asyncio.Protocol):
         self._moved_bytes = 0
         self._unsent_bytes = 0
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+    def connection_made(self, transport: Any) -> None:  # noqa: ANN401 - of asyncio or uvloop
         super().connection_made(transport)
         self._check_later()
 
@@ -181,7 +181,7 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._is_refused = False
         self._received_bytes = self._header_bytes = 0
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+    def connection_made(self, transport: Any) -> None:  # noqa: ANN401 - of asyncio or uvloop
         super().connection_made(transport)
         idle, limit = self._limits.idle, self._limits.max_connections
         num_open = len(self.connections)

@@ -131,7 +131,9 @@ def test_a_recording_is_shown_on_its_own_clock(store, tmp_path):
     largest = reader.read("tactile_left").values.max()
     shown = one(moving["tactile/tactile_left"]["Image:buffer"])[3].reshape(28, 26, 3)
     row = reader.read("tactile_left").values[3]
-    np.testing.assert_array_equal(shown, heat_map(row, side="left", full_scale=float(largest)))
+    np.testing.assert_array_equal(
+        shown, heat_map(row, side="left", full_scale=float(largest), is_raw=True)
+    )
 
 
 def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):

@@ -24,6 +24,8 @@ def git(folder, *words):
 @pytest.fixture
 def checkout(tmp_path):
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "0.1.0"\nother = "0.1.0"\n')
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights/pyproject.toml").write_text('[project]\nversion = "0.1.0"\n')
     package = tmp_path / "shared/dextouch"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text('"""Doc."""\n\n__version__ = "0.1.0"\n')
