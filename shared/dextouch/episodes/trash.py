@@ -31,7 +31,8 @@ HOMES: dict[TrashKind, str] = {
 # may change, and they go where the item goes: to the trash, back, and away for good.
 REVIEW_FILE: Final = "review.json"
 CLICKS_FILE: Final = "clicks.json"
-REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
+NOTES_FILE: Final = "notes.json"
+REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE, NOTES_FILE)
 Remark = TypeVar("Remark", bound=BaseModel)
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 

@@ -16,7 +16,14 @@ import numpy as np
 
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
-from dextouch.episodes.files import GroupFiles, LocalGroup, disk_errors, replace_file, try_lock
+from dextouch.episodes.files import (
+    GroupFiles,
+    LocalGroup,
+    disk_errors,
+    replace_file,
+    try_lock,
+    unheld_folders,
+)
 from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
@@ -41,7 +48,7 @@ from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
 from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
-from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage, unheld_folders
+from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
