@@ -166,9 +166,9 @@ def _authors(value: object) -> Iterator[str]:
     """Pseudonyms of those who wrote a remark, or parts of it."""
     if isinstance(value, dict):
         yield from (name for key in _SIGNED if isinstance(name := value.get(key), str))
-    for one in value.values() if isinstance(value, dict) else value:
-        if isinstance(one, dict | list):
-            yield from _authors(one)
+        value = list(value.values())
+    for one in value if isinstance(value, list) else ():
+        yield from _authors(one)
 
 
 def _without_author(value: object, name: str | None) -> object:
@@ -472,7 +472,7 @@ def _remove_all(
         for facts in reviews_by(root, request):
             # The verdict and the notes stay.
             for path in (facts.folder / name for name in SIGNED_FILES):
-                if request.operator in _authors(fields := _dict(path)):
+                if request.operator in set(_authors(fields := _dict(path))):
                     with disk_errors(f"remove the author of {path.name} of {facts.item_id}"):
                         unsigned = _without_author(fields, request.operator)
                         replace_file(path, json.dumps(unsigned).encode())

@@ -4,6 +4,8 @@ import json
 import shlex
 from collections.abc import Mapping
 
+from pydantic import ValidationError
+
 from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome
 from dextouch.episodes.files import GroupFiles
 from dextouch.episodes.format import (
@@ -19,7 +21,14 @@ from dextouch.episodes.format import (
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError
-from dextouch.schemas import EditedItem, EditedOutcome, EpisodeAttributes, json_ready
+from dextouch.free_text import check_line
+from dextouch.schemas import (
+    EditedItem,
+    EditedOutcome,
+    EpisodeAttributes,
+    first_problems,
+    json_ready,
+)
 
 # Attributes that can be changed, beside the outcome.
 LABELS = ("task", "instruction", "operator")
@@ -72,7 +81,14 @@ def relabel_item(
             edit.messages.append(f"events of {about.task!r} are left out")
             fields["event_times_s"] = {}
         fields |= {f"{kind}_id": edit.new_id, "lineage": edit.lineage}
-        attributes = type(about).model_validate(dict(about.model_copy(update=fields)))
+        attributes = about.model_copy(update=fields)
+        try:
+            for value in changed.values():
+                check_line(value)
+            type(about).model_validate(dict(attributes))
+        except ValueError as error:
+            why = first_problems(error) if isinstance(error, ValidationError) else str(error)
+            raise InvalidInputError(f"relabel {kind} {item_id!r}: {why}") from error
         metadata, commit = with_attributes(store.files(item_id, kind=kind), attributes)
 
         def write(writer: EpisodeWriter) -> None:
