@@ -20,6 +20,8 @@ from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError, StorageFullError
 
 _SYNC_THREADS = 16
+# End of the name of a file that is being replaced; one that was interrupted is left.
+PARTIAL = ".partial"
 _COPY_BYTES = 1 << 22
 # EFBIG: the file size limit of the process or file system; handled like a full disk.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -142,7 +144,7 @@ def _sync(path: Path, how: Callable[[int], None]) -> None:
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o644) -> None:
     """Replace the contents of a file atomically; `mode` are its permissions."""
-    unfinished = path.with_name(path.name + ".partial")
+    unfinished = path.with_name(path.name + PARTIAL)
     unfinished.unlink(missing_ok=True)
     write_file(unfinished, data, mode=mode)
     unfinished.replace(path)
@@ -337,7 +339,7 @@ class LocalGroup:
         with disk_errors(f"look through {self.item_id}"):
             found = (path for path in self.folder.rglob("*") if path.is_file())
             names = (path.relative_to(self.folder).as_posix() for path in found)
-            return sorted(name for name in names if not is_system_file(name))
+            return sorted(n for n in names if not (is_system_file(n) or n.endswith(PARTIAL)))
 
     def _path(self, name: str) -> Path:
         path = self.folder

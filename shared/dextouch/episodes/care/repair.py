@@ -17,6 +17,7 @@ import numpy as np
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
 from dextouch.episodes.files import (
+    PARTIAL,
     GroupFiles,
     LocalGroup,
     disk_errors,
@@ -153,7 +154,9 @@ def _stamp_findings(contents: Group) -> list[Finding]:
 
 def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
-    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES}
+    # A killed program may have left a part of a remark, which the next one replaces.
+    partial = (name + PARTIAL for name in REMARK_FILES)
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES, *partial}
     for name, entry in entries.items():
         wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
     folders = {str(parent) for path in wanted for parent in Path(path).parents}
