@@ -4,9 +4,9 @@ from collections.abc import Callable
 from operator import not_
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, AwareDatetime, Field, StringConstraints, model_validator
 
-from dextouch.free_text import FreeLines, FreeText
+from dextouch.free_text import FreeLines, FreeText, check_lines
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
@@ -155,9 +155,11 @@ class NewNote(FrozenModel):
 
     start_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
     stop_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
-    text: Annotated[FreeLines, StringConstraints(strip_whitespace=True)] = Field(
-        min_length=1, max_length=MAX_NOTE
-    )
+    text: Annotated[
+        str,
+        StringConstraints(strip_whitespace=True, min_length=1, max_length=MAX_NOTE),
+        AfterValidator(check_lines),
+    ]
     author: FreeText | None = Field(default=None, max_length=128)
 
 
