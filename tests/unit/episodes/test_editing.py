@@ -162,13 +162,15 @@ def test_damaged_images_beside_the_cut_are_shown_as_before(store):
     made = episode_of(30, camera_unit="jpeg")
     images = [bytes(one) for one in encoded(made.values["camera_head"])]
     # Truncated scan data: libjpeg warns, and the format calls such an image damaged.
-    for bad in (19, 20, 21):
+    damaged = [19, 20, 21, 36, 37, 38, 39]
+    for bad in damaged:
         images[bad] = images[bad][: len(images[bad]) // 2] + b"\xff\xd9"
     made.values["camera_head"] = np.array([*images, None], dtype=object)[:-1]
     source = made.write(store)
-    assert source.damaged_images("camera_head").tolist() == [19, 20, 21]
+    assert source.damaged_images("camera_head").tolist() == damaged
     result = trim_episode(store, source.item_id, (10, 20), outcome="keep", options=KEPT)
-    check_head = store.open(result.id).window(0, 3), source.window(10, 3)
+    # At the first step image 18 is shown for image 20, at the last one 40 for 38.
+    check_head = store.open(result.id).window(0, 10), source.window(10, 10)
     np.testing.assert_array_equal(*(one.images["camera_head"] for one in check_head))
     np.testing.assert_array_equal(*(one.image_dt_ns["camera_head"] for one in check_head))
 
