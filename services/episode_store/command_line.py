@@ -198,7 +198,7 @@ def show(context: Context) -> Outcome:
     say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
     say(_outcome(attributes))
     for source in attributes.lineage:
-        say(f"made from {source.kind} {source.id}")
+        say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
     say(f"content {reader.content_sha256}")

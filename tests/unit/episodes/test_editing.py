@@ -330,6 +330,20 @@ def test_the_source_goes_to_the_trash_and_comes_back_superseded(store):
     assert chosen(store) == [result.id]
 
 
+@pytest.mark.parametrize("options", [KEPT, EditOptions()])
+def test_of_a_chain_of_edits_only_the_last_is_taken(store, options):
+    write_episode(store, "a", num_steps=20)
+    second = trim_episode(store, "a", (1, 20), options=options).id
+    third = relabel_item(store, second, {"instruction": "up"}).id
+    if options != KEPT:
+        store.restore("a")
+    assert set(store.list()) == {"a", third}
+    assert chosen(store) == [third]
+    store.delete(third)
+    store.restore(second)
+    assert chosen(store) == [second]
+
+
 def test_parts_of_one_recording_are_taken_unless_they_share_steps(store):
     write_take(store, "take", num_steps=30, quality={"origin_after_start_ns": 4e8})
     name = "take-aligned"

@@ -161,4 +161,4 @@ def check_bucket(one, bucket, target):
         assert not care.inspect_group(bucket.files(name), "episode").damaged
     merge_stores([bucket], target, options=PLAIN)
     assert target.open(relabelled.id).content_sha256 == relabelled.sha256
-    assert target.review("a").superseded_by == (trimmed.id,)
+    assert target.review("a").superseded_by == (trimmed.id, relabelled.id)

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from dextouch.episodes.format import Attributes, Kind, attributes_id, check_id
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE
+from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE, change_trashed_review
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import (
@@ -113,7 +113,7 @@ class Edit:
         """Write the result with `write`, unless that is done, and put the source away."""
         if not self.options.dry_run:
             if not self.is_done:
-                self._mark_source()
+                self._mark_sources()
                 with self.store.writer(kind=self.kind, attributes=attributes) as writer:
                     write(writer)
                     for name, remark in remarks.items():
@@ -133,21 +133,31 @@ class Edit:
             source_is="in the trash" if self._to_trash else "superseded",
         )
 
-    def _mark_source(self) -> None:
-        review = self.store.review(self.source_id, kind=self.kind)
+    def _mark_sources(self) -> None:
+        """Mark the source, and all that it was edited from, also in the trash, as superseded."""
+        store, kind = self.store, self.kind
+        for entry in self.lineage:
+            if not entry.operation or entry.kind != kind:
+                continue
+            if store.exists(entry.id, kind=kind):
+                review = self._marked(store.review(entry.id, kind=kind))
+                store.set_review(entry.id, review, kind=kind)
+            for folder in store.folders:
+                change_trashed_review(folder, kind, entry.id, self._marked)
+
+    def _marked(self, review: Review | None) -> Review:
         marked: tuple[str, ...] = ()
         earlier = review
         if review is not None and review.superseded_by:
             marked, earlier = review.superseded_by, review.earlier
         superseded_by = tuple(dict.fromkeys([*marked, self.new_id]))[-MAX_MOVED:]
-        mark = Review(
+        return Review(
             verdict="rejected",
             reason=f"superseded by {', '.join(superseded_by)}"[:500],
             reviewed_at=datetime.now(UTC),
             superseded_by=superseded_by,
             earlier=earlier,
         )
-        self.store.set_review(self.source_id, mark, kind=self.kind)
 
     def remarks(
         self,
