@@ -100,6 +100,7 @@ def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttrib
     if isinstance(about, EpisodeAttributes):
         return is_rejected(store, about)
     review = store.review(about.recording_id, kind="recording")
+    review = review and review.standing(lambda name: store.exists(name, kind="recording"))
     return review is not None and review.verdict == "rejected"
 
 

@@ -60,7 +60,7 @@ COMMANDS = {
         "calibrate gloves, cameras and latencies", "pipelines.calibrate:main"
     ),
     "store": Command(
-        "list, show, verify, clicks, repair, delete, deletions, restore, purge, enrol, serve",
+        "list, show, verify, clicks, note, trim, relabel, merge, repair, delete, …",
         "episode_store.command_line:main",
         "episode_store.parser:store_parser",
     ),

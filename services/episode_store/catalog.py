@@ -257,6 +257,10 @@ class Catalog:
             NotFoundError: no such item.
         """
         self._store.set_review(item.id, review, kind=item.kind)
+        self.forget(item)
+
+    def forget(self, item: StoredItem) -> None:
+        """Read an item again, after a change of what is beside its content."""
         (self._episodes if item.kind == "episode" else self._recordings).forget(item.id)
 
     def clickable(self) -> dict[str, Entry[Any]]:

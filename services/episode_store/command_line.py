@@ -1,17 +1,15 @@
 """Command line `dextouch store`: inspect, repair and delete items of a store."""
 
-import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dextouch.command_line import progress, write_result
-from dextouch.data_folder import is_system_file
+from dextouch.command_line import progress, say, write_result
 from dextouch.episodes import (
     KINDS,
     ClickedPoses,
@@ -22,10 +20,8 @@ from dextouch.episodes import (
     Kind,
     LocalGroup,
     TrashKind,
-    check_id,
     clicked_poses,
     has_object_poses,
-    local_folder,
     shard_path,
     stream_arrays,
     touched_objects,
@@ -48,7 +44,6 @@ from dextouch.episodes.care import (
     unfinished_folders,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.free_text import printable
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
@@ -63,7 +58,9 @@ from dextouch.schemas import (
 )
 from dextouch.serving import configure_logging, load_settings
 from services.episode_store.catalog import Catalog
+from services.episode_store.command_context import Context, Outcome
 from services.episode_store.deletions import deletion_statuses
+from services.episode_store.editing_commands import merge, note, relabel, trim
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 from services.episode_store.settings import EpisodeStoreSettings
@@ -71,8 +68,6 @@ from services.episode_store.settings import EpisodeStoreSettings
 EXIT_DAMAGED = 1
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
 _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
-
-Outcome = tuple[dict[str, Any], int]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -88,80 +83,6 @@ def main(argv: Sequence[str]) -> int:
     result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options))
     write_result(options.json, result)
     return status
-
-
-def say(line: str) -> None:
-    """Print a line that may hold text of others."""
-    print(printable(line))
-
-
-@dataclass(frozen=True)
-class Context:
-    """The store, its URL, and parsed arguments."""
-
-    store: EpisodeStore
-    url: str
-    options: argparse.Namespace
-
-    def kind_of(self, item_id: str) -> Kind:
-        """Kind of an id: given by --kind, otherwise the one under which it exists.
-
-        Raises:
-            NotFoundError: no such id.
-            InvalidInputError: both kinds exist.
-        """
-        check_id(item_id)
-        if self.options.kind:
-            return self.options.kind
-        found = [kind for kind in KINDS if self._is_there(kind, item_id)]
-        if not found:
-            raise NotFoundError(
-                f"{item_id!r}: not in the store {self.url}, neither episode nor recording"
-            )
-        if len(found) > 1:
-            raise InvalidInputError(
-                f"{item_id!r} is an episode and a recording; name one with --kind"
-            )
-        return found[0]
-
-    def _is_there(self, kind: Kind, item_id: str) -> bool:
-        if self.store.exists(item_id, kind=kind):
-            return True
-        return self.root is not None and (self.root / f"{kind}s" / item_id).is_dir()
-
-    def items(self) -> list[tuple[Kind, str]]:
-        """Selected items: the given ids, otherwise all of the given kinds.
-
-        A folder counts even without a commit record.
-        """
-        if self.options.ids:
-            return [(self.kind_of(item_id), item_id) for item_id in self.options.ids]
-        found: list[tuple[Kind, str]] = []
-        for kind in KINDS if self.options.kind is None else (self.options.kind,):
-            names = set(self.store.list(kind=kind))
-            folder = None if self.root is None else self.root / f"{kind}s"
-            if folder is not None and folder.is_dir():
-                names |= {p.name for p in folder.iterdir() if not is_system_file(p.name)}
-            found += [(kind, name) for name in sorted(names)]
-        return found
-
-    @property
-    def root(self) -> Path | None:
-        """The store's folder; None for one in a bucket."""
-        return None if self.url.startswith("s3://") else local_folder(self.url)
-
-    def need_local_root(self) -> Path:
-        """The store's folder.
-
-        Raises:
-            InvalidInputError: a store in a bucket.
-        """
-        if self.root is None:
-            raise InvalidInputError(
-                f"{self.options.command}: got the store {self.url}, expected one in a folder; copy "
-                "it to a folder first, or use the versions of the bucket"
-            )
-        return self.root
 
 
 def readable_size(num_bytes: int) -> str:
@@ -277,7 +198,7 @@ def show(context: Context) -> Outcome:
     say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
     say(_outcome(attributes))
     for source in attributes.lineage:
-        say(f"made from {source.kind} {source.id}")
+        say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
     say(f"content {reader.content_sha256}")
@@ -536,8 +457,8 @@ def repair(context: Context) -> Outcome:
         say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
         for name, count in report.lost.items():
             say(f"  {name}: {count} samples lost")
-        for note in report.notes:
-            say(f"  {note}")
+        for text in report.notes:
+            say(f"  {text}")
     left = any(report.action == LEFT for report in reports)
     return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
 
@@ -561,4 +482,8 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "restore": restore,
     "purge": purge,
     "repair": repair,
+    "trim": trim,
+    "relabel": relabel,
+    "merge": merge,
+    "note": note,
 }

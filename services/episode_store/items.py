@@ -151,6 +151,7 @@ def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> 
     sources = [recordings[name].item for name in names]
     torn = next((one for one in (entry.item, *sources) if not one.complete), entry.item)
     review = entry.item.review
+    review = review and review.standing(lambda name: name in episodes)
     if review is None:
         sources += [
             episodes[one.id].item
@@ -158,7 +159,7 @@ def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> 
             if one.kind == "episode" and one.id in episodes
         ]
         reviews = (one.review for one in sources)
-        review = next((one for one in reviews if one and one.verdict == "rejected"), None)
+        review = next((one for one in reviews if one and one.spreads), None)
     consent = all(recordings[name].item.consent for name in names) if names else None
     return _with(
         entry,

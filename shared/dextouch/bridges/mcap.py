@@ -53,6 +53,7 @@ PROFILE: Final = "dextouch"
 BRIDGE_VERSION: Final = "1"
 ABOUT: Final = "dextouch"
 COUNTS: Final = "dextouch.num_samples"
+NOTES: Final = "dextouch.notes"
 ATTRIBUTES_FILE: Final = "attributes.json"
 CALIBRATION_FILE: Final = "calibration.json"
 CHUNK_BYTES: Final = 1 << 20
@@ -147,6 +148,8 @@ class _Export:
         }
         self._writer.add_metadata(ABOUT, about)
         self._writer.add_metadata(COUNTS, {n: str(count) for n, count in self._counts.items()})
+        if notes := reader.notes().notes:
+            self._writer.add_metadata(NOTES, {str(n.number): n.model_dump_json() for n in notes})
         for stream in self._streams:
             message = MessageCodec(stream).message
             metadata = {"stream": stream.name, "unit": stream.unit, "kind": stream.kind}

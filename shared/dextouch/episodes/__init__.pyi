@@ -1,4 +1,5 @@
 from . import care as care
+from . import editing as editing
 from . import needs as needs
 from . import spool as spool
 from .files import GroupFiles as GroupFiles

@@ -31,6 +31,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks, ImageForm, transform_pixels
 from dextouch.episodes.shards import ShardReader, decode_rows
+from dextouch.episodes.trash import NOTES_FILE, read_remark
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -39,7 +40,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.geometry import nearest_index
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
+from dextouch.schemas import EpisodeAttributes, ItemNotes, RecordingAttributes, Verification
 from dextouch.streams import StreamDescriptor
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
@@ -336,6 +337,11 @@ class GroupReader(Generic[A]):
                 return nearest
             usable = np.setdiff1d(usable, damaged)
         raise NotFoundError(f"{self._what}: {name!r} holds no image that can be decoded")
+
+    def notes(self) -> ItemNotes:
+        """Notes of people on time ranges, as they are now; raises CorruptDataError for others."""
+        files = self._contents.files
+        return read_remark(files, NOTES_FILE, ItemNotes, what=self._what) or ItemNotes()
 
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record, up to the first damage.

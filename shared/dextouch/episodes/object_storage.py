@@ -13,13 +13,14 @@ import threading
 import uuid
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import structlog
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.files import disk_errors, write_file
+from dextouch.episodes.files import disk_errors, unheld_folders, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
     KINDS,
@@ -29,7 +30,7 @@ from dextouch.episodes.format import (
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages, unheld_folders
+from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
 from dextouch.errors import (
     ConflictError,
     DexTouchError,
@@ -158,6 +159,12 @@ class ObjectGroup:
         """A file for range reads."""
         return ObjectFile(self._bucket, f"{self._folder}/{name}")
 
+    def names(self) -> list[str]:
+        """Sorted names of all files of the group, with those beside its content."""
+        keys = (facts.key for facts in self._bucket.list(self._folder))
+        names = (key.removeprefix(f"{self._folder}/") for key in keys)
+        return sorted(name for name in names if name != CLAIM_FILE)
+
 
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
@@ -258,6 +265,11 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
+
+    def held(self, kind: Kind, item_id: str, *, waits: bool) -> AbstractContextManager[None]:
+        """Nothing: a bucket has no locks; only that the group exists."""
+        self.group(kind, item_id)
+        return nullcontext()
 
     def complete_uploads(self) -> builtins.list[tuple[Kind, str]]:
         """Upload what waits in the outbox; see `EpisodeStore.complete_uploads`."""

@@ -1,7 +1,10 @@
 """Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
+import fcntl
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -29,6 +32,7 @@ from dextouch.episodes.groups import A, GroupContents, read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.trash import (
     CLICKS_FILE,
+    NOTES_FILE,
     REVIEW_FILE,
     TrashEntry,
     TrashKind,
@@ -53,6 +57,7 @@ from dextouch.schemas import (
     ID_PATTERN,
     EpisodeAttributes,
     EpisodeClicks,
+    ItemNotes,
     Observation,
     RecordingAttributes,
     Review,
@@ -171,8 +176,33 @@ class EpisodeStore:
         """Keep clicks in place of earlier ones; None removes them. Raises as `set_review`."""
         self._set_remark("episode", episode_id, CLICKS_FILE, clicks)
 
+    def notes(self, item_id: str, *, kind: Kind = "episode") -> ItemNotes:
+        """Notes on time ranges of an item. Raises as `review`."""
+        group = self._storage.group(*_check(kind, item_id))
+        what = f"{kind} {item_id!r}"
+        return read_remark(group, NOTES_FILE, ItemNotes, what=what) or ItemNotes()
+
+    def change_notes(
+        self, item_id: str, change: Callable[[ItemNotes], ItemNotes], *, kind: Kind = "episode"
+    ) -> ItemNotes:
+        """Keep what a function makes of the notes of an item, and return it; raises as `review`.
+
+        In a folder no note of another program is lost meanwhile; a bucket keeps the last change.
+        """
+        with self._storage.held(*_check(kind, item_id), waits=True):
+            found = change(self.notes(item_id, kind=kind))
+            self._set_remark(kind, item_id, NOTES_FILE, found if found.notes else None)
+        return found
+
+    def held(self, item_id: str, *, kind: Kind = "episode") -> AbstractContextManager[None]:
+        """Hold an item while it is edited, so that no other program edits it; not in a bucket.
+
+        Raises NotFoundError without the id, UnavailableError while another program holds it.
+        """
+        return self._storage.held(*_check(kind, item_id), waits=False)
+
     def _set_remark(
-        self, kind: Kind, item_id: str, name: str, remark: Review | EpisodeClicks | None
+        self, kind: Kind, item_id: str, name: str, remark: Review | EpisodeClicks | ItemNotes | None
     ) -> None:
         self._storage.group(*_check(kind, item_id))
         content = None if remark is None else remark.model_dump_json().encode()
@@ -345,6 +375,28 @@ class _LocalStorage:
             except FileNotFoundError as error:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
+
+    @contextmanager
+    def held(self, kind: Kind, item_id: str, *, waits: bool) -> Iterator[None]:
+        """Hold the lock of a group's folder, which is that of a deletion, too."""
+        what = f"hold {kind} {item_id}"
+        with disk_errors(what):
+            try:
+                folder = os.open(self.group(kind, item_id).folder, os.O_RDONLY)
+            except FileNotFoundError as error:
+                raise self._missing(kind, item_id) from error
+        try:
+            with disk_errors(what):
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
+                except BlockingIOError as error:
+                    raise UnavailableError(
+                        f"{kind} {item_id!r}: another program is changing it; try again when it is "
+                        "done"
+                    ) from error
+            yield
+        finally:
+            os.close(folder)
 
     def sweep(self) -> int:
         with disk_errors("sweep"):

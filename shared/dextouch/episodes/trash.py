@@ -8,15 +8,24 @@ import contextlib
 import re
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.files import GroupFiles, disk_errors, folder_bytes, sync_folder
+from dextouch.episodes.files import (
+    GroupFiles,
+    LocalGroup,
+    disk_errors,
+    folder_bytes,
+    replace_file,
+    sync_folder,
+)
 from dextouch.episodes.format import COMMIT_FILE, KINDS
 from dextouch.errors import ConflictError, CorruptDataError, NotFoundError, UnknownNameError
+from dextouch.schemas import Review
 
 TRASH = ".trash"
 # Besides groups: unfinished uploads that were damaged.
@@ -31,7 +40,8 @@ HOMES: dict[TrashKind, str] = {
 # may change, and they go where the item goes: to the trash, back, and away for good.
 REVIEW_FILE: Final = "review.json"
 CLICKS_FILE: Final = "clicks.json"
-REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
+NOTES_FILE: Final = "notes.json"
+REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE, NOTES_FILE)
 Remark = TypeVar("Remark", bound=BaseModel)
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 
@@ -153,3 +163,15 @@ def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) 
             f"{what}: {name} is no {name.removesuffix('.json')} ({error.error_count()} fields do "
             "not fit); delete the file, and enter it again"
         ) from error
+
+
+def change_trashed_review(
+    root: Path, kind: TrashKind, item_id: str, change: Callable[[Review | None], Review]
+) -> None:
+    """Change the reviews of an id's groups in the trash, for when they are restored."""
+    for folder in sorted((root / TRASH).glob(f"{kind}.{item_id}.*")):
+        if (folder / COMMIT_FILE).is_file():
+            what = f"{kind} {item_id!r} in the trash"
+            review = read_remark(LocalGroup(folder), REVIEW_FILE, Review, what=what)
+            with disk_errors(f"write {REVIEW_FILE} of {what}"):
+                replace_file(folder / REVIEW_FILE, change(review).model_dump_json().encode())

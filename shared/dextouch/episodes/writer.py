@@ -10,20 +10,21 @@ import os
 import shutil
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
-from dextouch.data_folder import is_system_file
 from dextouch.episodes.files import (
+    GroupFiles,
+    copy_files,
     disk_errors,
-    is_folder_at,
     make_held_folder,
     sync_files,
     sync_folder,
-    try_lock,
+    unheld_folders,
     write_file,
 )
 from dextouch.episodes.format import (
@@ -54,6 +55,7 @@ from dextouch.episodes.image_codecs import (
     pack_chunk,
 )
 from dextouch.episodes.shards import ShardWriter
+from dextouch.episodes.trash import REMARK_FILES
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,
@@ -80,25 +82,6 @@ STAGING = ".staging"
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
     """A unique path for a new stage; the folder is not created."""
     return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
-
-
-def unheld_folders(parent: Path) -> Iterator[Path]:
-    """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
-    for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
-        if is_system_file(folder.name):
-            continue
-        try:
-            lock = try_lock(folder)
-        except FileNotFoundError:
-            continue  # committed since we listed
-        if lock is None:
-            continue
-        try:
-            # Its writer may have committed and unlocked it before we locked it.
-            if is_folder_at(lock, folder):
-                yield folder
-        finally:
-            os.close(lock)
 
 
 def sweep_stages(root: Path) -> int:
@@ -133,9 +116,14 @@ def commit_stage(
         metadata = [stage / name / METADATA_FILE for name in entries]
         sync_files([*shards, *metadata, stage / METADATA_FILE])
         write_file(stage / COMMIT_FILE, encode_commit(record)[0])
+    _publish(stage, target)
+
+
+def _publish(stage: Path, target: Path) -> None:
+    """Rename a complete stage to its target; raises ConflictError if that exists."""
     if target.exists():
         raise _taken(target)
-    with disk_errors(f"commit {record.id}"):
+    with disk_errors(f"commit {target.name}"):
         sync_folder(stage)
         target.parent.mkdir(parents=True, exist_ok=True)
         # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
@@ -167,6 +155,7 @@ class EpisodeWriter:
         self._stage, self._target = stage, target
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
+        self._taken: bytes | None = None
         with disk_errors(f"create {stage}"):
             # Locked as long as the writer lives, so that no sweep takes the stage for abandoned.
             self._lock = make_held_folder(stage)
@@ -262,6 +251,23 @@ class EpisodeWriter:
             )
         self._attributes = attributes
 
+    def add_remark(self, name: str, remark: BaseModel) -> None:
+        """Put a remark, such as `review.json`, beside the content: it appears with the item."""
+        with disk_errors(f"write {name} of {self._target.name}"):
+            write_file(self._stage / name, remark.model_dump_json().encode())
+
+    def take_files(self, source: GroupFiles, *, metadata: bytes, commit: bytes, link: bool) -> None:
+        """Take the arrays of a committed group as they are, in place of streams.
+
+        `metadata` and `commit` are the files of these names. With `link` the files of a local group
+        are shared with it, where the file system can: committed ones are never written again.
+        """
+        names = set(source.names()) - {METADATA_FILE, COMMIT_FILE, *REMARK_FILES}
+        copy_files(source, sorted(names), self._stage, link=link)
+        with disk_errors(f"copy {source.item_id}"):
+            write_file(self._stage / METADATA_FILE, metadata)
+        self._taken = commit
+
     def __enter__(self) -> "EpisodeWriter":
         return self
 
@@ -284,6 +290,11 @@ class EpisodeWriter:
                 os.close(self._lock)
 
     def _commit(self) -> None:
+        if self._taken is not None:
+            with disk_errors(f"commit {self._target.name}"):
+                write_file(self._stage / COMMIT_FILE, self._taken)
+            _publish(self._stage, self._target)
+            return
         if not self._streams:
             raise InvalidInputError(f"{attributes_id(self._attributes)}: has no stream")
         entries = {

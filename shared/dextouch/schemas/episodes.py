@@ -29,6 +29,8 @@ from dextouch.streams import StreamDescriptor
 FORMAT_VERSION: Final = 1
 # Characters of the reason why a take is incomplete.
 MAX_CAUSE = 500
+# Characters of the parameters of an edit: room for two instructions, quoted.
+MAX_OPERATION = 8000
 RIGID_TOLERANCE: Final = 1e-6
 # Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"
@@ -74,11 +76,16 @@ class StoredAnchor(FrozenModel):
 
 
 class LineageEntry(FrozenModel):
-    """A source of derived data, by id and content hash."""
+    """A source of derived data, by id and content hash.
+
+    `operation` of an edited item is the edit of this source, with its parameters, as on the command
+    line (`trim --steps 15 90`); empty of all other data, and then not written.
+    """
 
     kind: Literal["recording", "episode", "checkpoint", "rollout"]
     id: str
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
+    operation: str = Field(default="", max_length=MAX_OPERATION, exclude_if=not_)
 
 
 class ClockReport(FrozenModel):

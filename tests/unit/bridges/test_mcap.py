@@ -12,6 +12,7 @@ from mcap.writer import CompressionType, Writer
 
 from dextouch.bridges.mcap import MAX_RECORD_BYTES, export_mcap, import_mcap
 from dextouch.episodes import EpisodeStore
+from dextouch.episodes.editing import add_note
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -20,6 +21,7 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
+from dextouch.schemas import NewNote
 from tests.unit.bridges.takes import (
     DISTORTION,
     K_HEAD,
@@ -132,6 +134,8 @@ def test_a_recording_keeps_the_devices_own_words(store, tmp_path):
 
 def test_attachments_and_metadata_say_where_it_comes_from(store, tmp_path):
     reader = write_episode(store)
+    given = NewNote(start_ns=0, stop_ns=10**8, text="it slips", author="p-7")
+    add_note(store, reader.item_id, given)
     export_mcap(reader, tmp_path / "take.mcap")
     with (tmp_path / "take.mcap").open("rb") as file:
         mcap = make_reader(file)
@@ -140,6 +144,8 @@ def test_attachments_and_metadata_say_where_it_comes_from(store, tmp_path):
     assert attached["attributes.json"]["episode_id"] == "stand-bottle-0003"
     assert attached["calibration.json"]["K_head"] == K_HEAD.tolist()
     assert metadata["dextouch"]["content_sha256"] == reader.content_sha256
+    note = json.loads(metadata["dextouch.notes"]["1"])
+    assert {key: note[key] for key in given.model_dump()} == given.model_dump()
     assert metadata["dextouch.num_samples"]["tactile_left"] == str(
         reader.num_samples("tactile_left")
     )

@@ -22,7 +22,14 @@ from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, 
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
 from dextouch.episodes.spool_log import RECORDING_FILE
-from dextouch.episodes.trash import HOMES, REVIEW_FILE, TRASH, put_into_trash, remove_for_good
+from dextouch.episodes.trash import (
+    HOMES,
+    NOTES_FILE,
+    REVIEW_FILE,
+    TRASH,
+    put_into_trash,
+    remove_for_good,
+)
 from dextouch.episodes.writer import STAGING
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
@@ -48,6 +55,9 @@ MAX_BYTES = 16 << 20
 # Files with attributes, and the keys under which they lie.
 _ATTRIBUTES = {METADATA_FILE: ("attributes", ATTRIBUTES_KEY), RECORDING_FILE: ()}
 _SAMPLES = ".log"
+# Remarks that name who wrote them, and the keys under which they do.
+SIGNED_FILES = (REVIEW_FILE, NOTES_FILE)
+_SIGNED = ("reviewer", "author")
 _WORD = "A-Za-z0-9_-"
 _AROUND = {
     STAGING: re.compile(r"(episode|recording)-(.+)-[0-9a-f]{32}"),
@@ -60,8 +70,9 @@ class Facts:
     """Identity of one folder of a store, even a damaged or unfinished one.
 
     `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
-    its sources, `reviewer` the pseudonym in its review; `readable` is false where nothing could be
-    parsed. `started` is `take_start` of a recording.
+    its sources, and whether it is an edit of them; `authors` the pseudonyms in its review and
+    notes; `readable` is false where nothing could be parsed. `started` is `take_start` of a
+    recording.
     """
 
     folder: Path
@@ -69,8 +80,8 @@ class Facts:
     kind: str
     item_id: str
     operator: str | None
-    reviewer: str | None
-    lineage: tuple[tuple[str, str, str | None], ...]
+    authors: frozenset[str]
+    lineage: tuple[tuple[str, str, str | None, bool], ...]
     sha256: str | None
     readable: bool
     station: str | None = None
@@ -95,7 +106,12 @@ def _facts(folder: Path, place: str) -> Facts:
             kind, item_id = known, attributes[f"{known}_id"]
     entries = attributes.get("lineage")
     lineage = tuple(
-        (str(entry.get("kind")), str(entry.get("id")), _text(entry.get("sha256")))
+        (
+            str(entry.get("kind")),
+            str(entry.get("id")),
+            _text(entry.get("sha256")),
+            bool(entry.get("operation")),
+        )
         for entry in (entries if isinstance(entries, list) else [])
         if isinstance(entry, dict)
     )
@@ -105,7 +121,9 @@ def _facts(folder: Path, place: str) -> Facts:
         kind=kind,
         item_id=item_id,
         operator=_text(attributes.get("operator")),
-        reviewer=_text(_dict(folder / REVIEW_FILE).get("reviewer")),
+        authors=frozenset(
+            name for remark in SIGNED_FILES for name in _authors(_dict(folder / remark))
+        ),
         lineage=lineage,
         sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
         readable=bool(attributes) or not any(small_files(folder)),
@@ -142,6 +160,27 @@ def _dict(path: Path, *keys: str) -> dict[str, Any]:
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value if isinstance(value, dict) else {}
+
+
+def _authors(value: object) -> Iterator[str]:
+    """Pseudonyms of those who wrote a remark, or parts of it."""
+    if isinstance(value, dict):
+        yield from (name for key in _SIGNED if isinstance(name := value.get(key), str))
+        value = list(value.values())
+    for one in value if isinstance(value, list) else ():
+        yield from _authors(one)
+
+
+def _without_author(value: object, name: str | None) -> object:
+    """A remark in which no part says that somebody wrote it."""
+    if isinstance(value, list):
+        return [_without_author(one, name) for one in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: None if key in _SIGNED and one == name else _without_author(one, name)
+        for key, one in value.items()
+    }
 
 
 def _text(value: object) -> str | None:
@@ -288,7 +327,11 @@ def plan_deletion(
             if spreads:
                 grown = True
                 # And earlier versions, left behind by a repair.
-                versions = [(k, i, h) for k, i, h in facts.lineage if _is_version(facts, k, i)]
+                versions = [
+                    (k, i, h)
+                    for k, i, h, is_edit in facts.lineage
+                    if (is_edit and k == facts.kind) or _is_version(facts, k, i)
+                ]
                 names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
                 hashes |= {facts.sha256, *(h for _, _, h in versions)} - {None}
     return found
@@ -301,10 +344,10 @@ def _victim(facts: Facts, reason: str) -> Victim:
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
-    """Items whose review was written by the operator of a request."""
+    """Items with a review or notes by the operator of a request."""
     if request.operator is None:
         return []
-    return [facts for facts in all_facts(root) if facts.reviewer == request.operator]
+    return [facts for facts in all_facts(root) if request.operator in facts.authors]
 
 
 def _reason(facts: Facts, request: DeletionRequest) -> str | None:
@@ -321,7 +364,7 @@ def _reason(facts: Facts, request: DeletionRequest) -> str | None:
 def _reason_of_kin(
     facts: Facts, request: DeletionRequest, names: set[tuple[str, str]], hashes: set[str | None]
 ) -> str | None:
-    for kind, item_id, sha256 in facts.lineage:
+    for kind, item_id, sha256, _ in facts.lineage:
         if (kind, item_id) in names or (sha256 is not None and sha256 in hashes):
             return f"made from {kind} {item_id}"
     if facts.sha256 is not None and facts.sha256 in hashes:
@@ -427,11 +470,12 @@ def _remove_all(
         remember()
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
-            # The verdict stays.
-            path = facts.folder / REVIEW_FILE
-            with disk_errors(f"remove the reviewer of {facts.item_id}"):
-                fields = json.loads(path.read_bytes())
-                replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
+            # The verdict and the notes stay.
+            for path in (facts.folder / name for name in SIGNED_FILES):
+                if request.operator in set(_authors(fields := _dict(path))):
+                    with disk_errors(f"remove the author of {path.name} of {facts.item_id}"):
+                        unsigned = _without_author(fields, request.operator)
+                        replace_file(path, json.dumps(unsigned).encode())
             reviewed.append(facts)
         if not any(went):
             break

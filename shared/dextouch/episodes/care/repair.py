@@ -16,7 +16,15 @@ import numpy as np
 
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
-from dextouch.episodes.files import GroupFiles, LocalGroup, disk_errors, replace_file, try_lock
+from dextouch.episodes.files import (
+    PARTIAL,
+    GroupFiles,
+    LocalGroup,
+    disk_errors,
+    replace_file,
+    try_lock,
+    unheld_folders,
+)
 from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
@@ -41,7 +49,7 @@ from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
 from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
-from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage, unheld_folders
+from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -146,7 +154,9 @@ def _stamp_findings(contents: Group) -> list[Finding]:
 
 def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
-    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES}
+    # A killed program may have left a part of a remark, which the next one replaces.
+    partial = (name + PARTIAL for name in REMARK_FILES)
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES, *partial}
     for name, entry in entries.items():
         wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
     folders = {str(parent) for path in wanted for parent in Path(path).parents}
