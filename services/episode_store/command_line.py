@@ -360,7 +360,7 @@ def _delete_all_of(context: Context) -> Outcome:
     gone = {(victim.place, victim.folder) for victim in victims}
     for facts in reviews_by(root, request):
         if (facts.place, facts.folder.name) not in gone:
-            say(f"{facts.place}/{facts.folder.name}  review: loses its reviewer's name")
+            say(f"{facts.place}/{facts.folder.name}  review or notes: lose their author's name")
     if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
