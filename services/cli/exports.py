@@ -1,24 +1,33 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
+import json
 import shutil
 import sys
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
+from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, first_problems
+from dextouch.streams import StreamDescriptor
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]
 # By id and camera.
 DamagedImages = dict[str, dict[str, list[int]]]
+# Options that choose items, as on the dashboard's list.
+FILTERS = (
+    "text", "task", "operator", "station", "domain", "outcome", "origin", "review", "after",
+    "before",
+)  # fmt: skip
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -30,7 +39,13 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
         return export_rrd(reader, path, overwrite=options.force)
     from dextouch.bridges.mcap import export_mcap
 
-    return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
+    return export_mcap(
+        reader,
+        path,
+        overwrite=options.force,
+        jpeg_quality=options.jpeg_quality,
+        touch_images=options.touch_images,
+    )
 
 
 def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
@@ -66,27 +81,23 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
-    wanted = {key: value for key, value in given if value is not None}
+    wanted = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
     if options.ids and wanted:
         raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
         raise InvalidInputError("got an id twice; expected every id once")
     if options.ids:
         return list(options.ids)
-    found, num_rejected = [], 0
-    for item_id in store.list(kind=options.kind):
-        attributes = _open(store, options.kind, item_id).attributes
-        if any(getattr(attributes, key) != value for key, value in wanted.items()):
-            continue
-        if not options.with_rejected and _is_rejected(store, attributes):
-            num_rejected += 1
-        else:
-            found.append(item_id)
+    matching = _matching(store, options.kind, wanted)
+    found = matching
+    if not options.with_rejected and options.review is None:
+        found = [item_id for item_id in matching if not _is_rejected(store, options.kind, item_id)]
+    num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
+        shown = {key: str(value) for key, value in wanted.items()}
         raise NotFoundError(
-            f"{options.store}: no {options.kind} matches {wanted or 'anything'}"
+            f"{options.store}: no {options.kind} matches {shown or 'anything'}"
             f"{f' ({left_out})' if num_rejected else ''}; `dextouch store list` shows its contents"
         )
     if num_rejected:
@@ -94,10 +105,32 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     return found
 
 
-def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttributes) -> bool:
+def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> list[str]:
+    from services.episode_store.catalog import Catalog
+    from services.episode_store.filters import ItemFilter
+
+    stored, catalog = store.list(kind=kind), Catalog(store)
+    every = ItemFilter.model_validate({"kind": kind})
+    known = {item.id for item in catalog.items(every, limit=len(stored) + 1).items}
+    for item_id in sorted({*stored} - known):
+        # The catalog omits damaged items; this tells why.
+        _open(store, kind, item_id)
+    named = {"after": "created_after", "before": "created_before"}
+    try:
+        query = ItemFilter.model_validate(
+            {"kind": kind} | {named.get(key, key): value for key, value in wanted.items()}
+        )
+    except ValidationError as error:
+        raise InvalidInputError(f"filters: {first_problems(error)}") from error
+    return [item.id for item in catalog.items(query, limit=len(stored) + 1).items]
+
+
+def _is_rejected(store: EpisodeStore, kind: str, item_id: str) -> bool:
+    """Whether an item, or of an episode the recording that it was made from, was rejected."""
+    about = _open(store, kind, item_id).attributes
     if isinstance(about, EpisodeAttributes):
         return is_rejected(store, about)
-    review = store.review(about.recording_id, kind="recording")
+    review = store.review(item_id, kind="recording")
     return review is not None and review.verdict == "rejected"
 
 
@@ -137,6 +170,8 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 
 def _export(options: argparse.Namespace) -> Report:
+    from dextouch.bridges.exporting import wall_offset_ns
+
     store, to, form = EpisodeStore(options.store), options.to, options.format
     if form in JOINT_FORMATS and options.kind == "recording":
         raise InvalidInputError(
@@ -158,10 +193,13 @@ def _export(options: argparse.Namespace) -> Report:
         if len(ids) > 1:
             raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
         paths = {ids[0]: to}
-    taken = [path for path in paths.values() if path.exists()]
+    layout = _layout_path(options) if form == "mcap" else None
+    taken = [path for path in (*paths.values(), options.layout) if path and path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
     files: list[dict[str, object]] = []
+    streams: list[StreamDescriptor] = []
+    undated: list[str] = []
     for item_id in shown:
         path = paths[item_id]
         reader = _open(store, options.kind, item_id)
@@ -169,7 +207,37 @@ def _export(options: argparse.Namespace) -> Report:
         count = _export_one(reader, path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
+        streams += reader.attributes.streams
+        if form == "mcap" and wall_offset_ns(reader) is None:
+            undated.append(item_id)
+    if undated:
+        print(
+            f"{len(undated)} of {len(ids)} do not know when they were recorded (created_at, or "
+            "started_at and started_t_host_ns); their times do not begin at a date but near 1970",
+            file=sys.stderr,
+        )
+    if layout is not None:
+        _write_layout(layout, streams)
+        report["layout"] = str(layout)
     return report | {"files": files}
+
+
+def _layout_path(options: argparse.Namespace) -> Path | None:
+    """Where a layout for Foxglove goes: the path that was given, or into the folder of files."""
+    from dextouch.bridges.foxglove import LAYOUT_FILE
+
+    if options.layout is None and options.to.suffix != ".mcap":
+        return Path(options.to / LAYOUT_FILE)
+    return Path(options.layout) if options.layout is not None else None
+
+
+def _write_layout(path: Path, streams: list[StreamDescriptor]) -> None:
+    from dextouch.bridges.exporting import new_file
+    from dextouch.bridges.foxglove import foxglove_layout
+
+    with new_file(path, overwrite=True) as partial:
+        partial.write_text(json.dumps(foxglove_layout(streams), indent=1), encoding="utf-8")
+    print(f"{path}  layout for Foxglove: open it with Import from file")
 
 
 def _import(options: argparse.Namespace) -> Report:
