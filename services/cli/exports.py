@@ -1,7 +1,6 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
-import json
 import shutil
 import sys
 import uuid
@@ -170,8 +169,6 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 
 def _export(options: argparse.Namespace) -> Report:
-    from dextouch.bridges.exporting import wall_offset_ns
-
     store, to, form = EpisodeStore(options.store), options.to, options.format
     if form in JOINT_FORMATS and options.kind == "recording":
         raise InvalidInputError(
@@ -208,7 +205,7 @@ def _export(options: argparse.Namespace) -> Report:
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
         streams += reader.attributes.streams
-        if form == "mcap" and wall_offset_ns(reader) is None:
+        if form == "mcap" and not _has_wall_times(reader):
             undated.append(item_id)
     if undated:
         print(
@@ -217,9 +214,18 @@ def _export(options: argparse.Namespace) -> Report:
             file=sys.stderr,
         )
     if layout is not None:
-        _write_layout(layout, streams)
+        from dextouch.bridges.foxglove import write_layout
+
+        write_layout(layout, streams)
+        print(f"{layout}  layout for Foxglove: open it with Import from file")
         report["layout"] = str(layout)
     return report | {"files": files}
+
+
+def _has_wall_times(reader: Reader) -> bool:
+    from dextouch.bridges.mcap import has_wall_times
+
+    return has_wall_times(reader)
 
 
 def _layout_path(options: argparse.Namespace) -> Path | None:
@@ -229,15 +235,6 @@ def _layout_path(options: argparse.Namespace) -> Path | None:
     if options.layout is None and options.to.suffix != ".mcap":
         return Path(options.to / LAYOUT_FILE)
     return Path(options.layout) if options.layout is not None else None
-
-
-def _write_layout(path: Path, streams: list[StreamDescriptor]) -> None:
-    from dextouch.bridges.exporting import new_file
-    from dextouch.bridges.foxglove import foxglove_layout
-
-    with new_file(path, overwrite=True) as partial:
-        partial.write_text(json.dumps(foxglove_layout(streams), indent=1), encoding="utf-8")
-    print(f"{path}  layout for Foxglove: open it with Import from file")
 
 
 def _import(options: argparse.Namespace) -> Report:

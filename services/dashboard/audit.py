@@ -55,6 +55,7 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/v1/comparisons/stop": "stop replay",
     "/v1/episode_store/catalog/reviews": "review",
     "/v1/episode_store/episodes/{item_id}/clicks": "mark objects",
+    "/v1/episode_store/downloads": "download",
     "/v1/episode_store/trash": "delete",
     "/v1/episode_store/trash/restore": "restore",
     "/v1/episode_store/enrolments": "enrol station",

@@ -3,10 +3,12 @@
 The form is that of layouts which the app itself exports and imports ("Import from file").
 """
 
+import json
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, Final
 
-from dextouch.bridges.exporting import touch_side
+from dextouch.bridges.exporting import new_file, touch_side
 from dextouch.bridges.mcap_messages import ACTIONS, joint_names
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 
@@ -47,6 +49,12 @@ def foxglove_layout(streams: Iterable[StreamDescriptor]) -> dict[str, Any]:
         "playbackConfig": {"speed": 1},
         "layout": _split([*rows, _split(below, "row")], "column"),
     }
+
+
+def write_layout(path: Path, streams: Iterable[StreamDescriptor]) -> None:
+    """Write a layout for these streams, in place of an existing file; raises StorageError."""
+    with new_file(path, overwrite=True) as partial:
+        partial.write_text(json.dumps(foxglove_layout(streams), indent=1), encoding="utf-8")
 
 
 def _split(parts: Sequence[Tree], direction: str) -> Tree:

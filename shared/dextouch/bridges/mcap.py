@@ -106,6 +106,11 @@ def export_mcap(
         return _Export(reader, writer, jpeg_quality).run(touch_images=touch_images)
 
 
+def has_wall_times(reader: Reader) -> bool:
+    """Whether it is known when the item began, so that an export has Unix times."""
+    return wall_offset_ns(reader) is not None
+
+
 def touch_image_topic(stream: str) -> str:
     """Topic of the pictures of a tactile stream."""
     return f"/{stream}/image"
