@@ -14,7 +14,7 @@ from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas import EpisodeAttributes, first_problems
+from dextouch.schemas import first_problems
 from dextouch.streams import StreamDescriptor
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
@@ -90,7 +90,8 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     matching = _matching(store, options.kind, wanted)
     found = matching
     if not options.with_rejected and options.review is None:
-        found = [item_id for item_id in matching if not _is_rejected(store, options.kind, item_id)]
+        about = ((name, _open(store, options.kind, name).attributes) for name in matching)
+        found = [name for name, attributes in about if not is_rejected(store, attributes)]
     num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
@@ -122,15 +123,6 @@ def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> 
     except ValidationError as error:
         raise InvalidInputError(f"filters: {first_problems(error)}") from error
     return [item.id for item in catalog.items(query, limit=len(stored) + 1).items]
-
-
-def _is_rejected(store: EpisodeStore, kind: str, item_id: str) -> bool:
-    """Whether an item, or of an episode the recording that it was made from, was rejected."""
-    about = _open(store, kind, item_id).attributes
-    if isinstance(about, EpisodeAttributes):
-        return is_rejected(store, about)
-    review = store.review(item_id, kind="recording")
-    return review is not None and review.verdict == "rejected"
 
 
 def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
@@ -230,11 +222,12 @@ def _has_wall_times(reader: Reader) -> bool:
 
 def _layout_path(options: argparse.Namespace) -> Path | None:
     """Where a layout for Foxglove goes: the path that was given, or into the folder of files."""
+    if options.layout is not None or options.to.suffix == ".mcap":
+        given: Path | None = options.layout
+        return given
     from dextouch.bridges.foxglove import LAYOUT_FILE
 
-    if options.layout is None and options.to.suffix != ".mcap":
-        return Path(options.to / LAYOUT_FILE)
-    return Path(options.layout) if options.layout is not None else None
+    return Path(options.to / LAYOUT_FILE)
 
 
 def _import(options: argparse.Namespace) -> Report:

@@ -15,10 +15,16 @@ import structlog
 from fastapi import APIRouter, Depends
 from pydantic import Field
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader, is_rejected
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    RecordingReader,
+    is_rejected,
+    kind_of,
+)
 from dextouch.errors import DexTouchError, LimitExceededError, NotFoundError, UnavailableError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import EpisodeAttributes, StoredItem
+from dextouch.schemas import StoredItem
 from dextouch.serving import JSON, KIB, JsonBody, StreamedResponse, takes
 from services.episode_store.keys import MAY_READ
 from services.episode_store.settings import EpisodeStoreSettings
@@ -91,10 +97,12 @@ class Downloads:
             )
         readers = [self._open(item) for item in items]
         if not wanted.with_rejected:
-            readers = [reader for reader in readers if not self._is_rejected(reader)]
+            readers = [one for one in readers if not is_rejected(self._store, one.attributes)]
         if not readers:
             raise NotFoundError(f"download: all {len(items)} items were rejected in review")
-        sizes = [self._store.num_bytes(one.item_id, kind=_kind(one)) for one in readers]
+        sizes = [
+            self._store.num_bytes(one.item_id, kind=kind_of(one.attributes)) for one in readers
+        ]
         most = self._settings.max_download_bytes
         if sum(sizes) > most:
             raise LimitExceededError(
@@ -113,13 +121,6 @@ class Downloads:
     def _open(self, item: StoredItem) -> Reader:
         opened = self._store.recording if item.kind == "recording" else self._store.open
         return opened(item.id)
-
-    def _is_rejected(self, reader: Reader) -> bool:
-        about = reader.attributes
-        if isinstance(about, EpisodeAttributes):
-            return is_rejected(self._store, about)
-        review = self._store.review(reader.item_id, kind="recording")
-        return review is not None and review.verdict == "rejected"
 
     def _response(self, readers: Sequence[Reader], num_bytes: int) -> StreamedResponse:
         folder = tempfile.TemporaryDirectory(prefix="dextouch-download-")
@@ -150,10 +151,6 @@ class Downloads:
         return StreamedResponse(pieces, headers=headers, on_end=end_in_thread)
 
 
-def _kind(reader: Reader) -> Kind:
-    return "recording" if isinstance(reader, RecordingReader) else "episode"
-
-
 def _export(reader: Reader, path: Path) -> dict[str, object]:
     from dextouch.bridges.mcap import export_mcap
 
@@ -165,7 +162,7 @@ def _export(reader: Reader, path: Path) -> dict[str, object]:
         raise
     lost = {name: reader.damaged_images(name).tolist() for name in reader.streams}
     return {
-        "kind": _kind(reader),
+        "kind": kind_of(reader.attributes),
         "id": reader.item_id,
         "num_messages": num_messages,
         "damaged_images": {name: images for name, images in lost.items() if images},
@@ -189,14 +186,14 @@ def _archive(readers: Sequence[Reader], folder: Path) -> Generator[bytes, None, 
     from dextouch.bridges.foxglove import LAYOUT_FILE, foxglove_layout
 
     made, contents = _Collected(), []
-    kinds = {_kind(reader) for reader in readers}
+    kinds = {kind_of(reader.attributes) for reader in readers}
     with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:  # type: ignore[call-overload]
         for reader in readers:
             path = folder / "item.mcap"
             about = _export(reader, path)
             # A recording and its episode may have one id.
             name = f"{reader.item_id}.mcap"
-            name = name if len(kinds) == 1 else f"{_kind(reader)}s/{name}"
+            name = name if len(kinds) == 1 else f"{kind_of(reader.attributes)}s/{name}"
             contents.append({"file": name} | about)
             with archive.open(name, "w", force_zip64=True) as entry:
                 for piece in _pieces(path):

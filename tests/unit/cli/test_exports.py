@@ -67,6 +67,7 @@ def test_filters_choose_and_files_go_into_a_folder(store, dextouch, tmp_path):
     assert EpisodeStore(tmp_path / "other").list(kind="recording") == ["take-0001", "take-0002"]
 
 
+@pytest.mark.long
 def test_filters_are_those_of_the_dashboards_list(store, dextouch, tmp_path):
     noon = datetime(2026, 5, 4, 12, tzinfo=UTC)
     takes = {
