@@ -166,6 +166,8 @@ def _export(options: argparse.Namespace) -> Report:
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
+    if options.layout is not None and form != "mcap":
+        raise InvalidInputError(f"--layout is for format mcap, got {form!r}")
     ids = _ids(store, options)
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))

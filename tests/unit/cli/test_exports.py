@@ -134,6 +134,8 @@ def test_a_layout_for_foxglove_is_written_with_the_files(store, dextouch, tmp_pa
     status, _, err = dextouch(*words, tmp_path / "three.mcap", "--layout", chosen)
     assert (status, (tmp_path / "three.mcap").exists()) == (main.EXIT_REFUSED, False)
     assert "layout.json: exists already" in err
+    words = ("export", "--format", "umi", "--to", tmp_path / "x.zip", "--layout", chosen)
+    assert "--layout is for format mcap" in dextouch(*words, "--force")[2]
 
 
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
