@@ -12,10 +12,16 @@ from pydantic import ValidationError
 
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
-from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader, is_rejected
+from dextouch.episodes import (
+    Attributes,
+    EpisodeReader,
+    EpisodeStore,
+    Kind,
+    RecordingReader,
+    is_rejected,
+)
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import first_problems
-from dextouch.streams import StreamDescriptor
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
 Reader = EpisodeReader | RecordingReader
@@ -169,57 +175,59 @@ def _export(options: argparse.Namespace) -> Report:
     if options.layout is not None and form != "mcap":
         raise InvalidInputError(f"--layout is for format mcap, got {form!r}")
     ids = _ids(store, options)
-    report: Report = {"format": form, "kind": options.kind, "ids": ids}
-    shown = progress(ids, f"export {form}", len(ids))
     damaged: DamagedImages = {}
-    report["damaged_images"] = damaged
+    report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
+    shown = progress(ids, f"export {form}", len(ids))
     if form in JOINT_FORMATS:
         left_out: list[str] = []
         num_steps = _export_all(_episodes(store, shown, damaged, left_out), options)
         print(f"{to}  {len(ids) - len(left_out)} episodes  {num_steps} steps")
         return report | {"path": str(to), "num_steps": num_steps, "left_out": left_out}
-    # One file for one id, a folder of files otherwise.
+    paths = _paths(ids, options)
+    files: list[dict[str, object]] = []
+    exported: list[Attributes] = []
+    for item_id in shown:
+        reader = _open(store, options.kind, item_id)
+        _note_damaged(reader, damaged)
+        count = _export_one(reader, paths[item_id], options)
+        files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})
+        print(f"{paths[item_id]}  {count} messages")
+        exported.append(reader.attributes)
+    return report | {"files": files} | (_end_mcap(exported, options) if form == "mcap" else {})
+
+
+def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
+    """Files by id: the one that was named for one id, otherwise files in a folder."""
+    to, form = options.to, options.format
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":
         if len(ids) > 1:
             raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
         paths = {ids[0]: to}
-    layout = _layout_path(options) if form == "mcap" else None
     taken = [path for path in (*paths.values(), options.layout) if path and path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
-    files: list[dict[str, object]] = []
-    streams: list[StreamDescriptor] = []
-    undated: list[str] = []
-    for item_id in shown:
-        path = paths[item_id]
-        reader = _open(store, options.kind, item_id)
-        _note_damaged(reader, damaged)
-        count = _export_one(reader, path, options)
-        files.append({"id": item_id, "path": str(path), "num_messages": count})
-        print(f"{path}  {count} messages")
-        streams += reader.attributes.streams
-        if form == "mcap" and not _has_wall_times(reader):
-            undated.append(item_id)
-    if undated:
+    return paths
+
+
+def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
+    """Say which files have no dates, and write the layout for Foxglove where there is to be one."""
+    from dextouch.bridges.foxglove import write_layout
+    from dextouch.bridges.mcap import has_wall_times
+
+    num_undated = sum(not has_wall_times(about) for about in exported)
+    if num_undated:
         print(
-            f"{len(undated)} of {len(ids)} do not know when they were recorded (created_at, or "
+            f"{num_undated} of {len(exported)} do not know when they were recorded (created_at, or "
             "started_at and started_t_host_ns); their times do not begin at a date but near 1970",
             file=sys.stderr,
         )
-    if layout is not None:
-        from dextouch.bridges.foxglove import write_layout
-
-        write_layout(layout, streams)
-        print(f"{layout}  layout for Foxglove: open it with Import from file")
-        report["layout"] = str(layout)
-    return report | {"files": files}
-
-
-def _has_wall_times(reader: Reader) -> bool:
-    from dextouch.bridges.mcap import has_wall_times
-
-    return has_wall_times(reader)
+    layout = _layout_path(options)
+    if layout is None:
+        return {}
+    write_layout(layout, [stream for about in exported for stream in about.streams])
+    print(f"{layout}  layout for Foxglove: open it with Import from file")
+    return {"layout": str(layout)}
 
 
 def _layout_path(options: argparse.Namespace) -> Path | None:

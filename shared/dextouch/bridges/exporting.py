@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Int64, Shaped, UInt8
 
-from dextouch.episodes import GOP_IMAGES, EpisodeReader, RecordingReader, disk_errors
+from dextouch.episodes import GOP_IMAGES, Attributes, EpisodeReader, RecordingReader, disk_errors
 from dextouch.errors import ConflictError
 from dextouch.schemas import EpisodeAttributes
 from dextouch.streams import (
@@ -84,14 +84,13 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
             yield Block(t_ns[rows], t_device_ns[rows], sequence[rows], values[part])
 
 
-def wall_offset_ns(reader: Reader) -> int | None:
+def wall_offset_ns(about: Attributes) -> int | None:
     """Unix time minus the item's own time, in nanoseconds; None if it is not known.
 
     Of a recording it is exact to the microseconds of `started_at`. Of an episode, step 0 is taken
     for `created_at`, the start of its recording: seconds that alignment cut off before step 0 are
     not counted.
     """
-    about = reader.attributes
     if isinstance(about, EpisodeAttributes):
         began_at, began_ns = about.created_at, 0
     elif about.started_t_host_ns is None:

@@ -106,9 +106,9 @@ def export_mcap(
         return _Export(reader, writer, jpeg_quality).run(touch_images=touch_images)
 
 
-def has_wall_times(reader: Reader) -> bool:
-    """Whether it is known when the item began, so that an export has Unix times."""
-    return wall_offset_ns(reader) is not None
+def has_wall_times(about: Attributes) -> bool:
+    """Whether it is known when an item began, so that an export has Unix times."""
+    return wall_offset_ns(about) is not None
 
 
 def touch_image_topic(stream: str) -> str:
@@ -136,7 +136,7 @@ class _Export:
         stamps = [self._reader.stamps_ns(name) for name, count in self._counts.items() if count]
         first_ns = min((int(one[0]) for one in stamps), default=0)
         last_ns = max((int(one[-1]) for one in stamps), default=0)
-        offset_ns = wall_offset_ns(self._reader)
+        offset_ns = wall_offset_ns(self._reader.attributes)
         # A clock that was never set, or is wrong by centuries, is none.
         if offset_ns is not None and 0 <= first_ns + offset_ns <= last_ns + offset_ns < 2**63:
             return "unix", offset_ns
