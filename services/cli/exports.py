@@ -2,15 +2,24 @@
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
+from dextouch.episodes import (
+    Attributes,
+    EpisodeReader,
+    EpisodeStore,
+    Kind,
+    RecordingReader,
+    is_rejected,
+)
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.schemas import first_problems
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
 if TYPE_CHECKING:
@@ -22,6 +31,11 @@ Report = dict[str, Any]
 DamagedImages = dict[str, dict[str, list[int]]]
 # Exit status if some of several files were refused, as of a command that is.
 _SOME_FAILED = 3
+# Options that choose items, as on the dashboard's list.
+FILTERS = (
+    "text", "task", "operator", "station", "domain", "outcome", "origin", "review", "after",
+    "before",
+)  # fmt: skip
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -33,7 +47,13 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
         return export_rrd(reader, path, overwrite=options.force)
     from dextouch.bridges.mcap import export_mcap
 
-    return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
+    return export_mcap(
+        reader,
+        path,
+        overwrite=options.force,
+        jpeg_quality=options.jpeg_quality,
+        touch_images=options.touch_images,
+    )
 
 
 def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
@@ -68,27 +88,24 @@ def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
-    wanted = {key: value for key, value in given if value is not None}
+    wanted = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
     if options.ids and wanted:
         raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
         raise InvalidInputError("got an id twice; expected every id once")
     if options.ids:
         return list(options.ids)
-    found, num_rejected = [], 0
-    for item_id in store.list(kind=options.kind):
-        attributes = _open(store, options.kind, item_id).attributes
-        if any(getattr(attributes, key) != value for key, value in wanted.items()):
-            continue
-        if not options.with_rejected and _is_rejected(store, attributes):
-            num_rejected += 1
-        else:
-            found.append(item_id)
+    matching = _matching(store, options.kind, wanted)
+    found = matching
+    if not options.with_rejected and options.review is None:
+        about = ((name, _open(store, options.kind, name).attributes) for name in matching)
+        found = [name for name, attributes in about if not is_rejected(store, attributes)]
+    num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
+        shown = {key: str(value) for key, value in wanted.items()}
         raise NotFoundError(
-            f"{options.store}: no {options.kind} matches {wanted or 'anything'}"
+            f"{options.store}: no {options.kind} matches {shown or 'anything'}"
             f"{f' ({left_out})' if num_rejected else ''}; `dextouch store list` shows its contents"
         )
     if num_rejected:
@@ -96,12 +113,24 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     return found
 
 
-def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttributes) -> bool:
-    if isinstance(about, EpisodeAttributes):
-        return is_rejected(store, about)
-    review = store.review(about.recording_id, kind="recording")
-    review = review and review.standing(lambda name: store.exists(name, kind="recording"))
-    return review is not None and review.verdict == "rejected"
+def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> list[str]:
+    from services.episode_store.catalog import Catalog
+    from services.episode_store.filters import ItemFilter
+
+    stored, catalog = store.list(kind=kind), Catalog(store)
+    every = ItemFilter.model_validate({"kind": kind})
+    known = {item.id for item in catalog.items(every, limit=len(stored) + 1).items}
+    for item_id in sorted({*stored} - known):
+        # The catalog omits damaged items; this tells why.
+        _open(store, kind, item_id)
+    named = {"after": "created_after", "before": "created_before"}
+    try:
+        query = ItemFilter.model_validate(
+            {"kind": kind} | {named.get(key, key): value for key, value in wanted.items()}
+        )
+    except ValidationError as error:
+        raise InvalidInputError(f"filters: {first_problems(error)}") from error
+    return [item.id for item in catalog.items(query, limit=len(stored) + 1).items]
 
 
 def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
@@ -149,35 +178,73 @@ def _export(options: argparse.Namespace) -> Report:
         raise InvalidInputError(
             f"--append: a file of {form!r} cannot grow; only lerobot data sets can"
         )
+    if options.layout is not None and form != "mcap":
+        raise InvalidInputError(f"--layout is for format mcap, got {form!r}")
     ids = _ids(store, options)
-    report: Report = {"format": form, "kind": options.kind, "ids": ids}
-    shown = progress(ids, f"export {form}", len(ids))
     damaged: DamagedImages = {}
-    report["damaged_images"] = damaged
+    report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
+    shown = progress(ids, f"export {form}", len(ids))
     if form in JOINT_FORMATS:
         left_out: list[str] = []
         done = _export_all(_episodes(store, shown, damaged, left_out), options)
         num_new = len(ids) - len(left_out) - len(done.get("present", []))
         print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
         return report | done | {"path": str(to), "left_out": left_out}
-    # One file for one id, a folder of files otherwise.
+    paths = _paths(ids, options)
+    files: list[dict[str, object]] = []
+    exported: list[Attributes] = []
+    for item_id in shown:
+        reader = _open(store, options.kind, item_id)
+        _note_damaged(reader, damaged)
+        count = _export_one(reader, paths[item_id], options)
+        files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})
+        print(f"{paths[item_id]}  {count} messages")
+        exported.append(reader.attributes)
+    return report | {"files": files} | (_end_mcap(exported, options) if form == "mcap" else {})
+
+
+def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
+    """Files by id: the one that was named for one id, otherwise files in a folder."""
+    to, form = options.to, options.format
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":
         if len(ids) > 1:
             raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
         paths = {ids[0]: to}
-    taken = [path for path in paths.values() if path.exists()]
+    taken = [path for path in (*paths.values(), options.layout) if path and path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
-    files: list[dict[str, object]] = []
-    for item_id in shown:
-        path = paths[item_id]
-        reader = _open(store, options.kind, item_id)
-        _note_damaged(reader, damaged)
-        count = _export_one(reader, path, options)
-        files.append({"id": item_id, "path": str(path), "num_messages": count})
-        print(f"{path}  {count} messages")
-    return report | {"files": files}
+    return paths
+
+
+def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
+    """Say which files have no dates, and write the layout for Foxglove where there is to be one."""
+    from dextouch.bridges.foxglove import write_layout
+    from dextouch.bridges.mcap import has_wall_times
+
+    num_undated = sum(not has_wall_times(about) for about in exported)
+    if num_undated:
+        print(
+            f"{num_undated} of {len(exported)} do not know when they were recorded (created_at, or "
+            "started_at and started_t_host_ns); their times do not begin at a date but near 1970",
+            file=sys.stderr,
+        )
+    layout = _layout_path(options)
+    if layout is None:
+        return {}
+    write_layout(layout, [stream for about in exported for stream in about.streams])
+    print(f"{layout}  layout for Foxglove: open it with Import from file")
+    return {"layout": str(layout)}
+
+
+def _layout_path(options: argparse.Namespace) -> Path | None:
+    """Where a layout for Foxglove goes: the path that was given, or into the folder of files."""
+    if options.layout is not None or options.to.suffix == ".mcap":
+        given: Path | None = options.layout
+        return given
+    from dextouch.bridges.foxglove import LAYOUT_FILE
+
+    return Path(options.to / LAYOUT_FILE)
 
 
 def _import(options: argparse.Namespace) -> Report:

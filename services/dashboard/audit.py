@@ -59,6 +59,7 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/v1/episode_store/catalog/relabel": "relabel",
     "/v1/episode_store/notes/{kind}/{item_id}": "add note",
     "/v1/episode_store/notes/{kind}/{item_id}/remove": "remove note",
+    "/v1/episode_store/downloads": "download",
     "/v1/episode_store/trash": "delete",
     "/v1/episode_store/trash/restore": "restore",
     "/v1/episode_store/enrolments": "enrol station",

@@ -28,7 +28,7 @@ from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import JSON, KIB, OCTETS, takes
+from dextouch.serving import JSON, KIB, OCTETS, StreamedResponse, takes
 from services.dashboard.audit import ALL_ACTIONS, AuditLog, AuditPage, used_tokens
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
 from services.dashboard.feeds import (
@@ -56,9 +56,18 @@ CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 # Finds a topic by its name; None where it knows none.
 TopicFinder = Callable[[str], Topic | None]
 # Headers of a response that a browser needs to show and to cache it.
-PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
+PASSED_HEADERS: Final = (
+    "content-type",
+    "etag",
+    "cache-control",
+    "location",
+    "content-disposition",
+    "x-dextouch-estimated-bytes",
+)
 # What a user asked for may take longer to compute than the state that pages fetch again and again.
 TIMEOUT_S: Final = 60.0
+# Without a byte of a download: the time in which the store exports a long recording.
+DOWNLOAD_TIMEOUT_S: Final = 600.0
 # Of administrators, who have it beside that of operators.
 ENROL: Final = "enrol"
 
@@ -261,7 +270,7 @@ def _view(text: str) -> tuple[str, ...]:
 class Forwarded:
     """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
 
-    The key that signed in needs `scope`.
+    The key that signed in needs `scope`. A `streamed` response is passed on as it comes.
     """
 
     service: str
@@ -269,6 +278,7 @@ class Forwarded:
     method: Literal["GET", "POST", "DELETE"] = "GET"
     max_body_bytes: int = 64 * KIB
     scope: str = SCOPE
+    streamed: bool = False
 
 
 FORWARDED: Final = (
@@ -301,6 +311,7 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/playback/episode/{item_id}/robot_hands"),
     Forwarded("episode_store", "/episodes/{item_id}/streams/{stream}"),
     Forwarded("episode_store", "/recordings/{item_id}/streams/{stream}"),
+    Forwarded("episode_store", "/downloads", "POST", max_body_bytes=1024 * KIB, streamed=True),
     Forwarded("episode_store", "/trash"),
     Forwarded("episode_store", "/trash", "POST", max_body_bytes=256 * KIB),
     Forwarded("episode_store", "/trash/restore", "POST", max_body_bytes=256 * KIB),
@@ -367,9 +378,19 @@ def _forwarder(
         if content:
             sent["content-type"] = JSON
         answer = await feeds.upstream(route.service).forward(
-            route.method, path, sent, content, timeout_s=TIMEOUT_S
+            route.method,
+            path,
+            sent,
+            content,
+            timeout_s=DOWNLOAD_TIMEOUT_S if route.streamed else TIMEOUT_S,
+            stream=route.streamed,
         )
         passed = {name: answer.headers[name] for name in PASSED_HEADERS if name in answer.headers}
+        if route.streamed:
+            pieces = answer.aiter_bytes()
+            return StreamedResponse(
+                pieces, answer.status_code, headers=passed, on_end=answer.aclose
+            )
         return Response(answer.content, answer.status_code, headers=passed)
 
     return takes({JSON: route.max_body_bytes})(forward) if route.method == "POST" else forward

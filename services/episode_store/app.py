@@ -16,6 +16,7 @@ from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.deletions import deletions_router
+from services.episode_store.downloads import Downloads, downloads_router
 from services.episode_store.editing_routes import editing_router, notes_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
@@ -167,6 +168,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             notes_router(store),
             content_router(store, settings),
             playback_router(store, settings),
+            downloads_router(Downloads(store, settings)),
             trash_router(store, max_page=settings.max_page),
             deletions_router(deletions),
             enrolment_router(enrolments),

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,7 @@ formats:
 examples:
   dextouch export --format mcap stand-bottle-0003 --to take.mcap
   dextouch export --format mcap --kind recording --operator p17 --to takes/
+  dextouch export --format mcap --outcome success --after 2026-05-04 --to takes/
   dextouch export --format lerobot --task stand_bottle --to data/lerobot
   dextouch export --format lerobot --to data/lerobot --append --license cc-by-4.0
   dextouch export --format umi --domain robot --to robot.zarr.zip
@@ -186,6 +188,16 @@ def _whole_fps(text: str) -> int:
             f"got {text!r}, expected a whole number, since LeRobot counts whole frames{near}"
         )
     return round(rate_hz)
+
+
+def _moment(text: str) -> datetime:
+    """A day, which begins at midnight here, or a time, which is that of here if it has no zone."""
+    try:
+        return datetime.fromisoformat(text).astimezone()
+    except (ValueError, OverflowError) as error:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a day or a time such as 2026-05-04 or 2026-05-04T12:30+02:00"
+        ) from error
 
 
 def _keywords(text: str) -> dict[str, Any]:
@@ -384,6 +396,23 @@ def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _add_filters(parser: argparse.ArgumentParser) -> None:
+    """Add the filters of the dashboard's list, by the names that `ItemFilter` has."""
+    about = "only items that match all of them; a DAY may be a time, too"
+    add = parser.add_argument_group("filters", about).add_argument
+    add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
+    add("--task", metavar="TASK", help="of this task")
+    add("--operator", metavar="P", help="of this operator")
+    add("--station", metavar="NAME", help="of this station")
+    add("--domain", choices=("human", "robot"), help="of this domain")
+    add("--outcome", choices=("success", "failure", "not_judged"), help="with this outcome")
+    add("--origin", choices=("recorded", "twin", "imagined"), help="of this origin")
+    reviews = ("accepted", "rejected", "not_reviewed")
+    add("--review", choices=reviews, help="with this review")
+    add("--after", type=_moment, metavar="DAY", help="recorded on this day or later")
+    add("--before", type=_moment, metavar="DAY", help="recorded before this day")
+
+
 def export_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch export`."""
     parser = _bridge_parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
@@ -395,9 +424,7 @@ def export_parser() -> argparse.ArgumentParser:
     add("--to", required=True, type=Path, metavar="PATH", help=to)
     kinds = ("episode", "recording")
     add("--kind", choices=kinds, default="episode", help="kind of the ids (%(default)s)")
-    add("--task", metavar="TASK", help="only episodes of this task")
-    add("--domain", choices=("human", "robot"), help="only episodes of this domain")
-    add("--operator", metavar="P", help="only items of this operator")
+    _add_filters(parser)
     rejected = "also items that were rejected in review; ids that are given always are"
     add("--with-rejected", action="store_true", help=rejected)
     old = parser.add_mutually_exclusive_group()
@@ -406,6 +433,10 @@ def export_parser() -> argparse.ArgumentParser:
     old.add_argument("--append", action="store_true", help=grow)
     quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
     add("--jpeg-quality", type=int, metavar="1…100", help=quality)
+    pictures = "mcap: pictures of touch beside the numbers (default: with)"
+    add("--touch-images", action=argparse.BooleanOptionalAction, default=True, help=pictures)
+    layout = "mcap: write a layout for Foxglove there (default: beside the files in a folder)"
+    add("--layout", type=Path, metavar="PATH", help=layout)
     rate = "lerobot: frames per second (default: model rate)"
     add("--fps", type=_whole_fps, metavar="N", help=rate)
     name = "lerobot: name of the data set (%(default)s)"

@@ -118,6 +118,7 @@ TABLE = {
         "GET /v1/playback/{kind}/{item_id}/images/{camera}": "store_read",
         "GET /v1/playback/{kind}/{item_id}/signals": "store_read",
         "GET /v1/playback/episode/{item_id}/robot_hands": "store_read",
+        "POST /v1/downloads": "store_read",
         "GET /v1/trash": "store_read",
         "POST /v1/trash": "store_delete",
         "POST /v1/trash/restore": "store_delete",

@@ -9,19 +9,22 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import UInt8
 from rerun.components import ImageFormat
 
-from dextouch.bridges.exporting import Block, Reader, blocks, new_file
+from dextouch.bridges.exporting import (
+    Block,
+    Reader,
+    TouchPictures,
+    blocks,
+    new_file,
+    touch_side,
+)
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
-from dextouch.streams import HEAD_CAMERA, TAXEL_UNIT, StreamDescriptor
-from dextouch.tactile import colour
-from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 
 APPLICATION: Final = "dextouch"
-FULL_SCALE_KPA: Final = 40.0
 AXIS_LENGTH_M: Final = 0.05
 POINT_RADIUS_M: Final = 0.004
 # Columns of the entities of a stream.
@@ -91,7 +94,6 @@ def _blueprint(reader: Reader) -> rrb.Blueprint:
 
 
 def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
-    # Rerun's pinhole has no distortion model, so projected entities are off by the distortion.
     camera = reader.streams.get(HEAD_CAMERA)
     K = reader.attributes.calibration.get("K_head")
     if isinstance(reader, EpisodeReader):
@@ -101,13 +103,20 @@ def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
     height_px, width_px = camera.shape[:2]
     pinhole = rr.Pinhole(image_from_camera=np.array(K), width=width_px, height=height_px)
     stream.log(entity_of(camera), pinhole, static=True)
+    distortion = np.array(reader.attributes.calibration.get("distortion_head", 0.0)).ravel()
+    if distortion.any():
+        # Rerun's pinhole has no distortion model: what is projected is off by the distortion.
+        note = "images are distorted, the pinhole is not: projected entities are off"
+        parts = {"distortion_k1_k2_p1_p2_k3": distortion, "note": note}
+        lens = rr.DynamicArchetype("dextouch.Lens", components=parts)
+        stream.log(entity_of(camera), lens, static=True)
 
 
 def _log(stream: rr.RecordingStream, reader: Reader, descriptor: StreamDescriptor) -> int:
     entity, kind, num_samples = entity_of(descriptor), descriptor.kind, 0
     if kind == "image":
         columns = _images(stream, entity, descriptor)
-    elif kind == "tactile" and _side(descriptor):
+    elif kind == "tactile" and touch_side(descriptor):
         columns = _touch(stream, entity, reader, descriptor)
     elif kind == "pose" and descriptor.shape[-1:] == (7,):
         columns = _poses(stream, entity, descriptor)
@@ -164,20 +173,9 @@ def _pixels(images: np.ndarray) -> Any:  # noqa: ANN401 - the library does not e
 def _touch(
     stream: rr.RecordingStream, entity: str, reader: Reader, descriptor: StreamDescriptor
 ) -> _Columns:
-    full_scale = FULL_SCALE_KPA
-    if descriptor.unit != TAXEL_UNIT:
-        # Raw counts have no absolute scale; the strongest reading of the take is the brightest.
-        largest = [block.values.max() for block in blocks(reader, descriptor.name)]
-        full_scale = float(max(largest, default=1)) or 1.0
-    draw = partial(
-        heat_map,
-        side=_side(descriptor) or "left",
-        full_scale=full_scale,
-        layout=descriptor.tactile_layout,
-        is_raw=_is_raw(descriptor),
-    )
-    _log_format(stream, entity, draw(np.zeros(descriptor.shape)).shape)
-    return lambda block: {entity: _pixels(np.stack([draw(row) for row in block.values]))}
+    pictures = TouchPictures(reader, descriptor)
+    _log_format(stream, entity, pictures.shape)
+    return lambda block: {entity: _pixels(pictures.draw(block.values))}
 
 
 def _poses(stream: rr.RecordingStream, entity: str, descriptor: StreamDescriptor) -> _Columns:
@@ -212,40 +210,3 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
     rows = block.values.reshape(len(block), -1).astype(np.float64)
     columns = rr.Scalars.columns(scalars=rows.ravel())
     return {entity: columns.partition([rows.shape[1]] * len(block))}
-
-
-def heat_map(
-    row: np.ndarray,
-    *,
-    side: Side,
-    full_scale: float,
-    layout: TactileLayout = DEXTOUCH_V1,
-    is_raw: bool = False,
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    """One reading of a glove as a small RGB picture of the hand.
-
-    Args:
-        row: taxels, or the raw cells.
-        side: of the hand.
-        full_scale: reading shown at full brightness, in the unit of the row.
-        layout: of the glove.
-        is_raw: whether the row holds raw cells.
-    """
-    taxels = layout.select(row, side=side) if is_raw else row
-    return colour(layout.hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
-
-
-def _is_raw(descriptor: StreamDescriptor) -> bool:
-    return descriptor.unit != TAXEL_UNIT and descriptor.shape == (
-        descriptor.tactile_layout.num_raw_cells,
-    )
-
-
-def _side(descriptor: StreamDescriptor) -> Side | None:
-    """Side of a tactile stream; None if it cannot be drawn as a hand."""
-    if not (_is_raw(descriptor) or descriptor.shape == (descriptor.tactile_layout.num_taxels,)):
-        return None
-    if descriptor.side is not None:
-        return descriptor.side
-    sides: tuple[Side, Side] = ("left", "right")
-    return next((side for side in sides if descriptor.name.endswith(f"_{side}")), None)

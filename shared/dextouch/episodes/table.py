@@ -15,7 +15,7 @@ import numpy as np
 import structlog
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes.format import KINDS
+from dextouch.episodes.format import KINDS, Attributes, attributes_id, kind_of
 from dextouch.episodes.needs import ACTIONS, OUTCOME, Need
 from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
@@ -37,19 +37,21 @@ logger = structlog.get_logger(__name__)
 
 
 def is_rejected(
-    store: EpisodeStore, about: EpisodeAttributes, *, others: Iterable[EpisodeStore] = ()
+    store: EpisodeStore, about: Attributes, *, others: Iterable[EpisodeStore] = ()
 ) -> bool:
-    """Whether an episode must not be trained on, by its own review.
+    """Whether an episode or recording must not be trained on, by its own review.
 
     One without a review is rejected with a recording or episode that it was made from, if that is
-    in the same store or in one of `others`. An episode that was edited is rejected as long as one
+    in the same store or in one of `others`. An item that was edited is rejected as long as one
     of the results is in one of these stores, and the results are not rejected with it.
     """
-    places = (store, *others)
-    own = store.review(about.episode_id)
-    own = own and own.standing(lambda name: any(place.exists(name) for place in places))
-    if own is not None:
-        return own.verdict == "rejected"
+    places, own_kind = (store, *others), kind_of(about)
+    own = store.review(attributes_id(about), kind=own_kind)
+    own = own and own.standing(
+        lambda name: any(place.exists(name, kind=own_kind) for place in places)
+    )
+    if own is not None or not isinstance(about, EpisodeAttributes):
+        return own is not None and own.verdict == "rejected"
     sources = [(one.id, kind) for one in about.lineage for kind in KINDS if one.kind == kind]
     reviews = (
         place.review(name, kind=kind)

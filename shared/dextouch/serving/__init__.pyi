@@ -44,4 +44,5 @@ from .spans import SPANS as SPANS
 from .state import StateStore as StateStore
 from .state import Versioned as Versioned
 from .state import open_state as open_state
+from .streams import StreamedResponse as StreamedResponse
 from .workers import run_workers as run_workers

@@ -5,11 +5,13 @@ import pytest
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
 
-from dextouch.bridges.rerun import entity_of, export_rrd, heat_map  # noqa: E402
+from dextouch.bridges.exporting import heat_map  # noqa: E402
+from dextouch.bridges.rerun import entity_of, export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
 from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402
 from dextouch.geometry import transform_from_pose  # noqa: E402
 from tests.unit.bridges.takes import (  # noqa: E402
+    DISTORTION,
     K_HEAD,
     descriptor,
     write_episode,
@@ -128,12 +130,13 @@ def test_a_recording_is_shown_on_its_own_clock(store, tmp_path):
     stamps = reader.read("tactile_left").t_host_ns
     assert moving["tactile/tactile_left"]["t_host"] == stamps.tolist()
     assert "take-0001" in still["attributes"]["TextDocument:text"][0][0]
+    lens = still["world/camera_head/image"]["dextouch.Lens:distortion_k1_k2_p1_p2_k3"]
+    np.testing.assert_array_equal(lens[0], DISTORTION)
     largest = reader.read("tactile_left").values.max()
     shown = one(moving["tactile/tactile_left"]["Image:buffer"])[3].reshape(28, 26, 3)
     row = reader.read("tactile_left").values[3]
-    np.testing.assert_array_equal(
-        shown, heat_map(row, side="left", full_scale=float(largest), is_raw=True)
-    )
+    expected = heat_map(row, side="left", full_scale=float(largest), is_raw=True)
+    np.testing.assert_array_equal(shown, expected)
 
 
 def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def dextouch(tmp_path, capsys):
 
 
 def names(folder):
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir() if path.name != "foxglove_layout.json")
 
 
 def test_one_episode_goes_to_one_file_and_comes_back(store, dextouch, tmp_path):
@@ -68,6 +68,77 @@ def test_filters_choose_and_files_go_into_a_folder(store, dextouch, tmp_path):
     assert names(folder) == ["take-0001.mcap", "take-0002.mcap"]
     assert dextouch("import", "--format", "mcap", folder, store="other")[0] == 0
     assert EpisodeStore(tmp_path / "other").list(kind="recording") == ["take-0001", "take-0002"]
+
+
+@pytest.mark.long
+def test_filters_are_those_of_the_dashboards_list(store, dextouch, tmp_path):
+    noon = datetime(2026, 5, 4, 12, tzinfo=UTC)
+    takes = {
+        "a": {"started_at": noon, "success": True, "station": "bench-1"},
+        "b": {"started_at": noon + timedelta(days=1), "success": False},
+        "c": {"started_at": noon + timedelta(days=2)},
+        "d": {},
+    }
+    for name, take in takes.items():
+        write_recording(store, name, count=5, **take)
+    verdict = Review(verdict="accepted", reviewed_at=noon)
+    store.set_review("b", verdict, kind="recording")
+    store.set_review("c", verdict.model_copy(update={"verdict": "rejected"}), kind="recording")
+    cases = {
+        "--outcome success": "a",
+        "--outcome failure": "b",
+        "--outcome not_judged --with-rejected": "cd",
+        "--review accepted": "b",
+        "--review rejected": "c",
+        "--review not_reviewed": "ad",
+        "--station bench-1": "a",
+        "--text BENCH-2": "bd",
+        "--task stand_bottle": "abd",
+        "--after 2026-05-05": "b",
+        "--after 2026-05-04T13:00+01:00 --before 2026-05-05T12:00Z": "a",
+        "--after 2026-05-05T12:00Z --with-rejected": "bc",
+    }
+    for number, (words, expected) in enumerate(cases.items()):
+        to = tmp_path / str(number)
+        given = ("export", "--format", "mcap", "--kind", "recording", "--to", to)
+        status, _, err = dextouch(*given, *words.split())
+        assert (status, names(to)) == (0, [f"{name}.mcap" for name in expected]), (words, err)
+    with pytest.raises(SystemExit):
+        dextouch("export", "--format", "mcap", "--to", tmp_path / "x", "--after", "yesterday")
+    status, _, err = dextouch(
+        "export", "--format", "mcap", "--to", tmp_path / "x", "--text", "x" * 201
+    )
+    assert status == main.EXIT_REFUSED
+    assert "text" in err
+
+
+def test_a_damaged_item_is_told_and_not_left_out(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=3)
+    write_episode(store, "two", num_steps=3)
+    (store.root / "episodes/one/zarr.json").write_text("{")
+    status, _, err = dextouch("export", "--format", "mcap", "--to", tmp_path / "x")
+    assert (status, (tmp_path / "x").exists()) == (main.EXIT_REFUSED, False)
+    assert "one" in err
+
+
+def test_a_layout_for_foxglove_is_written_with_the_files(store, dextouch, tmp_path):
+    write_recording(store, "take-0001", count=5)
+    words = ("export", "--format", "mcap", "--kind", "recording", "take-0001", "--to")
+    status, _, err = dextouch(*words, tmp_path / "takes")
+    assert status == 0
+    assert "1 of 1 do not know when they were recorded" in err
+    beside = json.loads((tmp_path / "takes/foxglove_layout.json").read_text())
+    assert "Image!tactile_left" in beside["configById"]
+    one, chosen = tmp_path / "take.mcap", tmp_path / "layout.json"
+    assert dextouch(*words, one)[0] == 0
+    assert not (tmp_path / "foxglove_layout.json").exists()
+    assert dextouch(*words, tmp_path / "two.mcap", "--layout", chosen)[0] == 0
+    assert json.loads(chosen.read_text()) == beside
+    status, _, err = dextouch(*words, tmp_path / "three.mcap", "--layout", chosen)
+    assert (status, (tmp_path / "three.mcap").exists()) == (main.EXIT_REFUSED, False)
+    assert "layout.json: exists already" in err
+    words = ("export", "--format", "umi", "--to", tmp_path / "x.zip", "--layout", chosen)
+    assert "--layout is for format mcap" in dextouch(*words, "--force")[2]
 
 
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
