@@ -291,9 +291,9 @@ class _Part:
         """Samples of other shapes than the stream's."""
         for form, count in self.forms:
             if not self._source_form.matches(form):
-                yield self._refused(
-                    f"{form.describe()}, and most are {self.form.describe()}", count
-                )
+                other = self._source_form.describe()
+                names = "of other names, " if form.describe() == other else ""
+                yield self._refused(f"{form.describe()}, {names}and most are {other}", count)
 
     def losses(self) -> Iterator[Refused]:
         """Samples that could not be decoded."""
