@@ -23,7 +23,7 @@ from dextouch.episodes import (
     kind_of,
 )
 from dextouch.errors import DexTouchError, LimitExceededError, NotFoundError, UnavailableError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas import StoredItem
 from dextouch.serving import JSON, KIB, JsonBody, StreamedResponse, takes
 from services.episode_store.keys import MAY_READ
@@ -43,6 +43,8 @@ COMMAND: Final = "`dextouch export --format mcap` on the store's computer has no
 
 class DownloadItems(FrozenModel):
     """Items to download; without `with_rejected`, those rejected in review are left out."""
+
+    model_config = example(items=[{"kind": "episode", "id": "take-20260301-1"}])
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_ITEMS)
     with_rejected: bool = True
@@ -216,7 +218,7 @@ def downloads_router(downloads: Downloads) -> APIRouter:
         responses={200: {"content": {ZIP: {}, MCAP: {}}}},
     )
     @takes({JSON: 1024 * KIB})
-    def download(
+    def download_items(
         wanted: Annotated[DownloadItems, Depends(JsonBody(DownloadItems))],
     ) -> StreamedResponse:
         """MCAP files of episodes and recordings: of one item its file, of several one zip."""

@@ -49,7 +49,7 @@ def editing_router(store: EpisodeStore, catalog: Catalog) -> APIRouter:
 
     @router.post("/episodes/{episode_id}/trim", tags=["episodes"])
     @takes({JSON: MAX_NOTE_BYTES})
-    def trim(
+    def trim_episode_steps(
         episode_id: str, body: Annotated[TrimEpisode, Depends(JsonBody(TrimEpisode))]
     ) -> EditedItem:
         """Write steps of an episode as a new one, which takes its place."""
@@ -65,7 +65,9 @@ def editing_router(store: EpisodeStore, catalog: Catalog) -> APIRouter:
 
     @router.post("/catalog/relabel", tags=["catalog"])
     @takes({JSON: MAX_EDIT_BYTES})
-    def relabel(body: Annotated[RelabelItems, Depends(JsonBody(RelabelItems))]) -> EditedItems:
+    def relabel_items(
+        body: Annotated[RelabelItems, Depends(JsonBody(RelabelItems))],
+    ) -> EditedItems:
         """Write items with other attributes as new ones, which take their places."""
         changes = body.model_dump(include={"task", "instruction", "operator"}, exclude_none=True)
         edited, refused = [], []
@@ -93,13 +95,13 @@ def notes_router(store: EpisodeStore) -> APIRouter:
     router = APIRouter(prefix="/v1/notes", tags=["notes"], responses={404: {}})
 
     @router.get("/{kind}/{item_id}", dependencies=[MAY_READ])
-    def listed(kind: ItemKind, item_id: str) -> ItemNotes:
+    def list_notes(kind: ItemKind, item_id: str) -> ItemNotes:
         """Notes on an item, in the order of their starts."""
         return store.notes(item_id, kind=kind)
 
     @router.post("/{kind}/{item_id}", dependencies=[MAY_DELETE])
     @takes({JSON: MAX_NOTE_BYTES})
-    def add(
+    def save_note(
         kind: ItemKind, item_id: str, body: Annotated[NewNote, Depends(JsonBody(NewNote))]
     ) -> ItemNotes:
         """Add a note; the answer has all notes of the item."""
@@ -108,7 +110,7 @@ def notes_router(store: EpisodeStore) -> APIRouter:
 
     @router.post("/{kind}/{item_id}/remove", dependencies=[MAY_DELETE])
     @takes({JSON: MAX_NOTE_BYTES})
-    def remove(
+    def delete_note(
         kind: ItemKind, item_id: str, body: Annotated[RemoveNote, Depends(JsonBody(RemoveNote))]
     ) -> ItemNotes:
         """Remove a note; the answer has those that are left."""

@@ -35,7 +35,8 @@ OPERATIONS = {
         get_episode_window get_episode_samples get_playback get_playback_images
         get_playback_signals get_playback_robot_hands list_deletions get_deletions_revision
         check_takes confirm_deletions list_enrolments issue_enrolment exchange_enrolment
-        revoke_enrolment""",
+        revoke_enrolment trim_episode_steps relabel_items list_notes save_note delete_note
+        download_items""",
     "rating": "get_next_rollout get_step_image submit_mark",
     "studies": "list_studies get_study list_study_rollouts",
     "teleoperation": "stop_hand",

@@ -155,6 +155,10 @@ class ItemNotes(FrozenModel):
 class NewNote(FrozenModel):
     """Request to add a note to an item."""
 
+    model_config = example(
+        start_ns=1_000_000_000, stop_ns=2_500_000_000, text="the bottle slips", author="p17"
+    )
+
     start_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
     stop_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
     text: Annotated[
@@ -168,6 +172,8 @@ class NewNote(FrozenModel):
 class RemoveNote(FrozenModel):
     """Request to remove a note."""
 
+    model_config = example(number=1)
+
     number: int = Field(ge=1)
 
 
@@ -179,6 +185,8 @@ class TrimEpisode(FrozenModel):
     `keep`. With `dry_run` nothing is written.
     """
 
+    model_config = example(first_step=30, stop_step=120, dry_run=True)
+
     first_step: int = Field(ge=0)
     stop_step: int = Field(ge=1)
     outcome: EditedOutcome | None = None
@@ -189,6 +197,10 @@ class TrimEpisode(FrozenModel):
 
 class RelabelItems(FrozenModel):
     """Request to change attributes of items; those that are None stay. Otherwise as a trim."""
+
+    model_config = example(
+        items=[{"kind": "episode", "id": "take-20260301-1"}], task="stand_bottle", dry_run=True
+    )
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
     task: FreeText | None = Field(default=None, min_length=1, max_length=128)
