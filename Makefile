@@ -14,7 +14,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray check-zarr-readers wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -139,6 +139,9 @@ $(OPENPI_VENV)/.complete:
 
 check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: check interoperability with openpi's own client and packing
 	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
+
+check-zarr-readers: $(VENV)/.dev   ## opt-in: list and read an episode with zarr-python, xarray and tensorstore in environments without this package; ARGS="--python python3.13"
+	PYTHONPATH=.:shared $(BIN)/python tests/system/zarr_readers/check.py $(ARGS)
 
 $(LEROBOT_POLICY_VENV)/.complete:
 	$(PYTHON) -m venv $(LEROBOT_POLICY_VENV)

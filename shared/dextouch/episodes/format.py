@@ -8,6 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Annotated, Any, Final, Literal, TypeVar, get_args
 
 from pydantic import Field, ValidationError
@@ -39,8 +40,8 @@ ATTRIBUTES_KEY = "dextouch"
 CHUNK_SECONDS = 0.5
 CHUNK_BYTES = 1 << 20
 ZSTD_LEVEL = 1
-# Storage chunk of encoded images, which lie end to end in one array of bytes.
-IMAGE_CHUNK_BYTES = 1 << 13
+# Smallest and largest storage chunk of encoded images, which lie end to end in an array of bytes.
+IMAGE_CHUNK_BYTES = (1 << 12, 1 << 16)
 # Columns of the index of encoded images.
 INDEX_COLUMNS = ("first byte", "end byte", "crc32c")
 # Images per closed group of pictures.
@@ -123,8 +124,12 @@ def kind_of(attributes: Attributes) -> Kind:
 
 def group_attributes(metadata: bytes, model: type[M]) -> M:
     """Inverse of `group_metadata`; raises MALFORMED."""
-    plain = json.loads(metadata)["attributes"][ATTRIBUTES_KEY]
-    return model.model_validate_json(json.dumps(plain))
+    text, head = metadata.decode(), f'{{"attributes":{{"{ATTRIBUTES_KEY}":'
+    if text.startswith(head):
+        # As we write it: the metadata of the arrays, which follow, need not be read.
+        end = json.JSONDecoder().raw_decode(text, len(head))[1]
+        return model.model_validate_json(text[len(head) : end])
+    return model.model_validate_json(json.dumps(json.loads(text)["attributes"][ATTRIBUTES_KEY]))
 
 
 def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
@@ -185,6 +190,16 @@ def stream_arrays(
     return {name: _described(values, **about)} | stamps
 
 
+def image_chunk_bytes(descriptor: StreamDescriptor) -> int:
+    """Bytes of a storage chunk of encoded images: a power of two, about an H.264 image or more.
+
+    The last one of a file is filled up, so that small images have small ones.
+    """
+    least, most = IMAGE_CHUNK_BYTES
+    height, width, _ = descriptor.shape
+    return min(most, max(least, 1 << (height * width // 8).bit_length() - 1))
+
+
 def image_arrays(
     descriptor: StreamDescriptor, codec: ImageCodec, column: ArrayEntry
 ) -> dict[str, ArrayEntry]:
@@ -194,7 +209,7 @@ def image_arrays(
     data = ArrayEntry(
         dtype="uint8",
         shape=(0,),
-        chunk_rows=IMAGE_CHUNK_BYTES,
+        chunk_rows=image_chunk_bytes(descriptor),
         codec="bytes",
         dimension_names=(f"{name}_byte",),
         sha256=column.sha256,
@@ -307,6 +322,11 @@ def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
 
 def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
     """Inverse of `encode_commit`; raises CorruptDataError, or StorageError for another version."""
+    found = re.fullmatch(rb'\{"record":(\{.*\}),"sha256":"([0-9a-f]{64})"\}', data, re.DOTALL)
+    if found and sha256_hex(found[1]) == found[2].decode():
+        # As we write it, so that the record need not be brought into its canonical form.
+        with suppress(ValidationError):
+            return CommitRecord.model_validate_json(found[1]), found[2].decode()
     try:
         outer = json.loads(data)
         plain, digest = outer["record"], outer["sha256"]

@@ -7,6 +7,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -171,7 +172,7 @@ def _read_group(opened: OpenedGroup, commit: bytes, kind: Kind, model: type[A]) 
     try:
         attributes = group_attributes(group, model)
         expected = {
-            stream.name: stream_arrays(stream, kind, record.format_version)
+            stream.name: _arrays_of(stream, kind, record.format_version)
             for stream in attributes.streams
         }
     except MALFORMED as error:
@@ -213,6 +214,10 @@ def _check_arrays(
             f"{what}: commit record lists arrays {foreign or sorted(names)}, "
             f"expected those of {len(expected)} streams, each once"
         )
+
+
+# Most episodes of a store have the same streams.
+_arrays_of = lru_cache(1024)(stream_arrays)
 
 
 def _layout(entry: ArrayEntry) -> tuple[object, ...]:

@@ -33,6 +33,10 @@ _H264_MIN_BYTES = 4 + 3 + 1
 # Adjacent storage chunks are fetched together up to this many bytes: enough for most windows in one
 # request, while whole arrays are still read in pieces.
 _SPAN_BYTES = 1 << 21
+# A writer collects small storage chunks, such as those of stamps, up to this many bytes.
+_WRITE_BYTES = 1 << 16
+# At most IOV_MAX of Linux, 1024.
+_WRITE_PARTS = 512
 # Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
 # earlier releases wrote.
 MAX_CHUNK_BYTES = 1 << 29
@@ -71,9 +75,14 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
         raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
 
 
+def crc_of(data: bytes) -> bytes:
+    """The crc32c of bytes as it is stored."""
+    return google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
+
+
 def with_crc(data: bytes) -> bytes:
     """Append the crc32c to bytes."""
-    return data + google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
+    return data + crc_of(data)
 
 
 def _without_crc(
@@ -317,7 +326,7 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 
 
 class ShardWriter:
-    """Appends rows to a new shard of a stage; buffers at most one storage chunk.
+    """Appends rows to a new shard of a stage; buffers at most one storage chunk and 64 KiB.
 
     The entry of the array has 0 rows and no hash yet. Raises StorageError if a file cannot be
     created, StorageFullError without space; nothing can be appended afterwards.
@@ -334,8 +343,11 @@ class ShardWriter:
         )
         self._num_pending = 0
         # Of a `bytes` array, what does not fill a storage chunk yet.
-        self._rest = bytearray()
+        self._rest = b""
         self._crcs = bytearray()
+        # Not written yet.
+        self._parts: list[bytes] = []
+        self._num_waiting = 0
         self._sha256 = hashlib.sha256()
         # Offset and length of each storage chunk.
         self._index: list[tuple[int, int]] = []
@@ -358,13 +370,13 @@ class ShardWriter:
     def append_bytes(self, data: bytes) -> None:
         """Append to a `bytes` array, whose sha256 is the caller's to compute."""
         self.num_rows += len(data)
-        self._rest += data
         size = self._entry.chunk_rows
-        starts = range(0, len(self._rest) - size + 1, size)
-        parts = [self._indexed(bytes(self._rest[start : start + size])) for start in starts]
-        if parts:
-            del self._rest[: len(parts) * size]
-            self._write(b"".join(parts))
+        place = min(len(data), size - len(self._rest))
+        self._rest += data[:place]
+        while len(self._rest) == size:
+            self._write(self._rest, crc_of(self._rest))
+            self._rest = data[place : place + size]
+            place += size
 
     def finish(self) -> ArrayEntry:
         """Complete the shard and return the array's entry of the commit record."""
@@ -372,9 +384,14 @@ class ShardWriter:
             self._chunk[self._num_pending :] = 0
             self._write_rows()
         if self._rest:
-            self._write(self._indexed(bytes(self._rest.ljust(self._entry.chunk_rows, b"\0"))))
-        index = np.array(self._index, dtype="<u8").reshape(-1, 2).tobytes()
-        self._write(with_crc(index))
+            self._write(with_crc(self._rest.ljust(self._entry.chunk_rows, b"\0")))
+        index = np.array(self._index, dtype="<u8").reshape(-1, 2)
+        if self._entry.codec == "bytes":
+            step = self._entry.chunk_rows + CRC_BYTES
+            numbers = np.arange(-(-self.num_rows // self._entry.chunk_rows), dtype="<u8")
+            index = np.stack([numbers * step, np.full_like(numbers, step)], axis=1)
+        self._write(with_crc(index.tobytes()))
+        self._flush()
         self.close()
         update: dict[str, object] = {"sha256": self._sha256.hexdigest()}
         if self._entry.codec == "zstd":
@@ -403,6 +420,13 @@ class ShardWriter:
         self._index.append((sum(self._index[-1]) if self._index else 0, len(data)))
         return data
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
+        self._parts += parts
+        self._num_waiting += sum(map(len, parts))
+        if self._num_waiting >= _WRITE_BYTES or len(self._parts) >= _WRITE_PARTS:
+            self._flush()
+
+    def _flush(self) -> None:
+        parts, self._parts, self._num_waiting = self._parts, [], 0
         with disk_errors(f"write array {self._name}", advice="free space on the disk of the store"):
-            write_parts(self._file, data)
+            write_parts(self._file, *parts)

@@ -12,6 +12,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import accumulate
 from pathlib import Path
 
 import google_crc32c
@@ -398,10 +399,10 @@ class StreamWriter:
         if self._images is None:
             self.arrays[name].append(values)
         else:
-            for image in values:
-                data = self._images.encoded(image)
-                self.arrays[name].append_bytes(data)
-                self.arrays[index_name(name)].append(self._images.index_row(data))
+            images = [self._images.encoded(image) for image in values]
+            for image in images:
+                self.arrays[name].append_bytes(image)
+            self.arrays[index_name(name)].append(self._images.index_rows(images))
         for stamp, column in stamps.items():
             self.arrays[f"{name}_{stamp}"].append(column)
         self._is_broken = False
@@ -492,10 +493,12 @@ class _EncodedImages:
         self.digest.add(data)
         return data
 
-    def index_row(self, data: bytes) -> np.ndarray:
-        """Row of the index for the next image."""
-        start, self._num_bytes = self._num_bytes, self._num_bytes + len(data)
-        return np.array([[start, self._num_bytes, google_crc32c.value(data)]])
+    def index_rows(self, images: list[bytes]) -> np.ndarray:
+        """Rows of the index for the next images."""
+        bounds = list(accumulate(map(len, images), initial=self._num_bytes))
+        self._num_bytes = bounds[-1]
+        crcs = map(google_crc32c.value, images)
+        return np.array(list(zip(bounds[:-1], bounds[1:], crcs, strict=True)), dtype=np.int64)
 
     def _encode(self, image: np.ndarray) -> bytes:
         if self._codec == "jpeg":

@@ -14,7 +14,6 @@ from numcodecs.zstd import Zstd
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import (
-    IMAGE_CHUNK_BYTES,
     ArrayEntry,
     array_metadata,
     canonical_json,
@@ -26,6 +25,8 @@ ID = "stand-bottle-0003"
 VIDEO, STILLS, TOUCH = "camera_head", "camera_wrist_left", "tactile_left"
 # More than any test here needs, far less than what the forged numbers ask for.
 MEMORY_BYTES = 64 << 20
+# Of images of 64 x 64 pixels and fewer.
+IMAGE_CHUNK = 4096
 _WRITTEN: list[EpisodeStore] = []
 
 
@@ -144,7 +145,7 @@ def forge_chunks(folder, name, chunks):
 def write_images(folder, name, images):
     """Write other encoded images, as many as before, with all checksums right."""
     data, ends = b"".join(images), np.cumsum([len(image) for image in images])
-    size = IMAGE_CHUNK_BYTES
+    size = record_of(folder)["arrays"][name]["chunk_rows"]
     parts = [data[at : at + size].ljust(size, b"\0") for at in range(0, len(data), size)]
     write_shard(shard_of(folder, name), [with_crc(part) for part in parts])
     crcs = [google_crc32c.value(image) for image in images]

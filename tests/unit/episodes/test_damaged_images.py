@@ -7,11 +7,11 @@ import pytest
 
 from dextouch.episodes import EpisodeStore, GopEncoder, VideoSettings, first_gap
 from dextouch.episodes.care import inspect_group, repair_group
-from dextouch.episodes.format import IMAGE_CHUNK_BYTES
 from dextouch.errors import CorruptDataError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import encoded_values
+from tests.unit.episodes.hostile_group import IMAGE_CHUNK
 
 CAMERA = "camera_head"
 NUM_STEPS = 41
@@ -146,7 +146,7 @@ def test_a_copy_with_the_same_damaged_image_still_mends_the_rest(make_episode, s
     shard = store.root / "recordings/take" / CAMERA / "c/0"
     data = bytearray(shard.read_bytes())
     place = sum(map(len, images[:15])) + 100
-    chunk = place // IMAGE_CHUNK_BYTES
+    chunk = place // IMAGE_CHUNK
     data[place + 4 * chunk] ^= 1
     shard.write_bytes(data)
     findings = inspect_group(store.files("take", kind="recording"), "recording").findings

@@ -17,6 +17,7 @@ from tests.unit.episodes.hostile_group import (
     forge_attributes,
     forge_first_group,
     forge_images,
+    forge_record,
     group,
     memory_bound,
     rows_of,
@@ -237,6 +238,10 @@ def test_images_larger_than_any_are_refused_before_they_are_made(store, folder, 
     data = (folder / "zarr.json").read_bytes()
     shape = f'"shape":[{size},{size},3]'.encode()
     forge_attributes(folder, data.replace(b'"shape":[64,64,3]', shape))
-
+    # That of images of so many pixels.
+    forge_record(
+        folder,
+        lambda record: [record["arrays"][n].update(chunk_rows=65536) for n in (VIDEO, STILLS)],
+    )
     with pytest.raises(StorageError, match=says):
         store.open(ID)

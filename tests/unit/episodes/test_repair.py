@@ -7,9 +7,9 @@ import pytest
 
 from dextouch.episodes import GOP_IMAGES, EpisodeStore, LocalGroup
 from dextouch.episodes.care import inspect_group, repair_group
-from dextouch.episodes.format import CHUNK_SECONDS, IMAGE_CHUNK_BYTES
+from dextouch.episodes.format import CHUNK_SECONDS
 from dextouch.errors import ConflictError, CorruptDataError
-from tests.unit.episodes.hostile_group import as_v2, flip, record_of, rows_of
+from tests.unit.episodes.hostile_group import IMAGE_CHUNK, as_v2, flip, record_of, rows_of
 
 ID = "stand-bottle-0003"
 NEW = f"{ID}-salvaged-1"
@@ -46,7 +46,7 @@ def shard_of(folder, name):
 def place_of_image(folder, name, number):
     """File offset of an image of format v3, and the storage chunk it begins in."""
     start = int(rows_of(folder, f"{name}_index")[number, 0])
-    chunk = start // IMAGE_CHUNK_BYTES
+    chunk = start // IMAGE_CHUNK
     return start + 4 * chunk, chunk
 
 
