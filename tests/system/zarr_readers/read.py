@@ -1,11 +1,11 @@
 """Reads one group of the episode store with zarr-python, xarray and tensorstore, without dextouch.
 
-Run it with the Python of an environment that has only those: `python zarr_readers.py GROUP TRUTH`.
+Run it with the Python of an environment that has only those: `read.py GROUP TRUTH
+[xarray] [tensorstore]`.
 TRUTH is an .npz of what the arrays hold and of the decoded images (`pixels/CAMERA`), of which
 `write_truth` in tests/unit/episodes/test_interop.py is the source. Every warning is an error.
 """
 
-import importlib.util
 import io
 import sys
 import warnings
@@ -101,15 +101,15 @@ def read_with_tensorstore(group_path, truth):
     print("tensorstore: all arrays")
 
 
-def main(group_path, truth_path):
+def main(group_path, truth_path, *libraries):
     with np.load(truth_path) as file:
         truth = dict(file)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read_with_zarr(Path(group_path), truth)
-        if importlib.util.find_spec("xarray"):
+        if "xarray" in libraries:
             read_with_xarray(Path(group_path), truth)
-        if importlib.util.find_spec("tensorstore"):
+        if "tensorstore" in libraries:
             read_with_tensorstore(Path(group_path), truth)
 
 
