@@ -15,7 +15,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments check-zarr-readers wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -150,6 +150,9 @@ $(API_CLIENT_VENV)/.complete:
 
 check-api-client: $(VENV)/.dev $(API_CLIENT_VENV)/.complete   ## opt-in: generate clients of all services by their OpenAPI documents, and run a rollout with one
 	PYTHONPATH=.:shared $(BIN)/python -m tests.system.api_client.check $(abspath $(API_CLIENT_VENV))/bin/python
+
+check-zarr-readers: $(VENV)/.dev   ## opt-in: list and read an episode with zarr-python, xarray and tensorstore in environments without this package; ARGS="--python python3.13"
+	PYTHONPATH=.:shared $(BIN)/python tests/system/zarr_readers/check.py $(ARGS)
 
 $(LEROBOT_POLICY_VENV)/.complete:
 	$(PYTHON) -m venv $(LEROBOT_POLICY_VENV)

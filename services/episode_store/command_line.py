@@ -172,9 +172,10 @@ def show(context: Context) -> Outcome:
     rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
     for name, descriptor in reader.streams.items():
         entry = contents.entries[name]
+        codec = entry.attributes.get("encoding", entry.codec)
         # Steps between samples above one and a half nominal periods.
         num_gaps = int((np.diff(reader.stamps_ns(name)) > 1.5 * descriptor.period_ns()).sum())
-        arrays = stream_arrays(descriptor, kind)
+        arrays = stream_arrays(descriptor, kind, contents.version)
         shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
@@ -183,11 +184,11 @@ def show(context: Context) -> Outcome:
             "num_samples": num_samples,
             "num_gaps": num_gaps,
             "num_bytes": num_bytes,
-            "codec": entry.codec,
+            "codec": codec,
             "encoder": entry.encoder,
         }
         numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
-        rows.append((name, *numbers, entry.codec, entry.encoder or ""))
+        rows.append((name, *numbers, codec, entry.encoder or ""))
     result = {
         "attributes": json_ready(reader.attributes),
         "num_samples": {name: reader.num_samples(name) for name in reader.streams},

@@ -39,7 +39,7 @@ def fill(store, count):
         folder = store.root / "episodes" / f"e-{number:05d}"
         folder.mkdir()
         own = {"episode_id": folder.name, "task": f"task_{number % 7}"}
-        group = group_metadata(attributes | own)
+        group = group_metadata(attributes | own, record_of_source.arrays)
         changed = {"id": folder.name, "attributes_sha256": sha256_hex(group)}
         mine = record_of_source.model_copy(update=changed)
         (folder / "zarr.json").write_bytes(group)

@@ -1,9 +1,8 @@
 """Image codecs of the store: JPEG, and H.264 in closed groups of pictures through PyAV.
 
-A `jpeg` storage chunk is the bytes of one JPEG image. An `h264` one is a closed group of pictures:
-u32 number of images, u32 length of each access unit, the access units; little endian. One access
-unit is one image; without B-frames their order is that of the input, so image k of a group needs
-exactly its first k + 1 access units. No other module of the store uses PyAV.
+A `jpeg` group is one image, an `h264` one a closed group of pictures. One access unit is one image;
+without B-frames their order is that of the input, so image k of a group needs exactly its first
+k + 1 access units. No other module of the store uses PyAV.
 
 A decoder fills in what is missing of a damaged image, and the place of a lost reference picture;
 such an image is refused here, and so are the images of its group that depend on it. The headers of
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from dextouch.episodes.format import GOP_IMAGES, Codec
+from dextouch.episodes.format import GOP_IMAGES, GROUP_IMAGES, ImageCodec
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import check_jpeg, decode_jpeg
@@ -301,76 +300,73 @@ def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None
         pass
 
 
-def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:
-    """Pack one JPEG image, or the access units of one group of pictures, into a storage chunk."""
+def pack_group(codec: ImageCodec, images: Sequence[bytes]) -> bytes:
+    """Bytes of a group in hashes, and in storage chunks of v2.
+
+    Of `jpeg` the image; of `h264` u32 number of images, u32 length of each, the images; little
+    endian.
+    """
     if codec == "jpeg":
         return images[0]
     return struct.pack(f"<{1 + len(images)}I", len(images), *map(len, images)) + b"".join(images)
 
 
-@dataclass(frozen=True)
-class ImageChunks:
-    """Decoder for the storage chunks of one image array.
+def unpack_group(codec: ImageCodec, payload: bytes, what: str) -> list[bytes]:
+    """Inverse of `pack_group`; raises CorruptDataError, `what` names the storage chunk in it."""
+    if codec == "jpeg":
+        return [payload]
+    count, most = int.from_bytes(payload[:4], "little"), GROUP_IMAGES[codec]
+    if not 1 <= count <= most or len(payload) < 4 * (1 + count):
+        raise CorruptDataError(f"{what}: got {count} images, expected 1 … {most}")
+    lengths = struct.unpack_from(f"<{count}I", payload, 4)
+    bounds = list(accumulate(lengths, initial=4 * (1 + count)))
+    if bounds[-1] != len(payload):
+        raise CorruptDataError(f"{what}: images end at byte {bounds[-1]} of {len(payload)}")
+    return [payload[start:stop] for start, stop in pairwise(bounds)]
 
-    `shape` is [h, w, 3] of an image, `rows` the number of images per storage chunk, `what` the
-    array's name in errors.
+
+@dataclass(frozen=True)
+class ImageGroups:
+    """Decoder for the groups of one stream of encoded images.
+
+    `shape` is [h, w, 3] of an image, `what` the array's name in errors.
     """
 
-    codec: Codec
+    codec: ImageCodec
     shape: tuple[int, ...]
-    rows: int
     what: str
 
-    def unpack(self, payload: bytes, number: int) -> list[bytes]:
-        """Split storage chunk `number` into its encoded images, the inverse of `pack_chunk`.
-
-        Raises CorruptDataError if it is invalid.
-        """
-        if self.codec == "jpeg":
-            return [payload]
-        what = f"{self.what}: storage chunk {number}"
-        count = int.from_bytes(payload[:4], "little") if len(payload) >= 4 else 0
-        if not 1 <= count <= self.rows or len(payload) < 4 * (1 + count):
-            raise CorruptDataError(f"{what}: got {count} images, expected 1 … {self.rows}")
-        lengths = struct.unpack_from(f"<{count}I", payload, 4)
-        bounds = list(accumulate(lengths, initial=4 * (1 + count)))
-        if bounds[-1] != len(payload):
-            raise CorruptDataError(f"{what}: images end at byte {bounds[-1]} of {len(payload)}")
-        return [payload[start:stop] for start, stop in pairwise(bounds)]
+    @property
+    def size(self) -> int:
+        """Images of a group; the last one may have fewer."""
+        return GROUP_IMAGES[self.codec]
 
     def decode(
-        self, payload: bytes, number: int, places: list[int], form: ImageForm, out: np.ndarray
+        self, images: list[bytes], number: int, places: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
+        """Decode images of group `number` into `out`.
 
-        `places` are the ascending indices of the requested images in the chunk, `out` is uint8
-        [len(places), *form.shape(shape)]. Raises CorruptDataError for invalid image data.
+        `images` are those of the group up to the last requested one, `places` the ascending indices
+        of the requested ones in the group, `out` is uint8 [len(places), *form.shape(shape)]. Raises
+        CorruptDataError for invalid image data.
         """
-        images = self.unpack(payload, number)
-        if places[-1] >= len(images):
-            raise CorruptDataError(
-                f"{self.what}: storage chunk {number} holds {len(images)} images, "
-                f"expected image {places[-1]}"
-            )
         with self._located(number):
             if self.codec == "jpeg":
                 self._decode_jpeg(images[0], form, out[0])
             else:
-                decoder = decoder_of_this_thread(*self.shape[:2])
-                decoder.decode(images[: places[-1] + 1], places, form, out)
+                decoder_of_this_thread(*self.shape[:2]).decode(images, places, form, out)
 
-    def check(self, payload: bytes, number: int) -> None:
-        """Decode storage chunk `number` by the rule of `decode`, and discard the images.
+    def check(self, images: list[bytes], number: int) -> None:
+        """Decode group `number` by the rule of `decode`, and discard the images.
 
-        Raises CorruptDataError if it is invalid, or for an image that cannot be decoded: then
-        `place` in the details is the first such image of the chunk.
+        Raises CorruptDataError for an image that cannot be decoded; `place` in the details is the
+        first such image of the group.
         """
-        images, size_px = self.unpack(payload, number), (self.shape[0], self.shape[1])
         with self._located(number):
             if self.codec == "jpeg":
-                check_jpeg(images[0], size_px)
+                check_jpeg(images[0], (self.shape[0], self.shape[1]))
             else:
-                check_group(images, size_px)
+                check_group(images, (self.shape[0], self.shape[1]))
 
     @contextmanager
     def _located(self, number: int) -> Iterator[None]:
@@ -380,10 +376,11 @@ class ImageChunks:
         except CorruptDataError as error:
             place = int(str(error.details.get("place", 0)))
             raise CorruptDataError(
-                f"{self.what}: storage chunk {number}: image {number * self.rows + place}: "
+                f"{self.what}: image {number * self.size + place}: "
                 f"{error.message}; readers by time leave out such images, and "
                 "`dextouch store repair` writes the item without them",
                 place=place,
+                image=number * self.size + place,
             ) from error
 
     def _decode_jpeg(self, data: bytes, form: ImageForm, out: np.ndarray) -> None:

@@ -12,8 +12,10 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import accumulate
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 from pydantic import BaseModel
 
@@ -30,17 +32,20 @@ from dextouch.episodes.files import (
 from dextouch.episodes.format import (
     COMMIT_FILE,
     GOP_IMAGES,
+    GROUP_IMAGES,
     METADATA_FILE,
     STAMPS,
     ArrayEntry,
     Attributes,
     CommitRecord,
+    ImageCodec,
     Kind,
     array_metadata,
     attributes_id,
-    codec_of,
     encode_commit,
     group_metadata,
+    image_codec,
+    index_name,
     kind_of,
     sha256_hex,
     shard_path,
@@ -52,7 +57,7 @@ from dextouch.episodes.image_codecs import (
     VideoSettings,
     check_video_size,
     is_keyframe,
-    pack_chunk,
+    pack_group,
 )
 from dextouch.episodes.shards import ShardWriter
 from dextouch.episodes.trash import REMARK_FILES
@@ -100,7 +105,7 @@ def commit_stage(
 
     Raises ConflictError if the target exists.
     """
-    group = group_metadata(json_ready(attributes))
+    group = group_metadata(json_ready(attributes), entries)
     record = CommitRecord(
         kind=kind_of(attributes),
         id=attributes_id(attributes),
@@ -308,8 +313,6 @@ class EpisodeWriter:
 
 
 MAX_WAITING_IMAGES = 32
-# Images of a storage chunk.
-_CHUNK_IMAGES = {"jpeg": 1, "h264": GOP_IMAGES}
 Stamps = Mapping[str, np.ndarray]
 
 
@@ -328,9 +331,9 @@ class StreamWriter:
         self._plain: bool | None = None
         # Whether a block was interrupted, after which arrays are misaligned.
         self._is_broken = False
-        self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
-        self._images = _EncodedImages(descriptor)
+        codec = image_codec(descriptor)
+        self._images = None if codec is None else _EncodedImages(descriptor, codec)
         self._queue: _ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
         self.arrays = {name: ShardWriter(stage, name, entry) for name, entry in entries.items()}
@@ -347,19 +350,19 @@ class StreamWriter:
         if not len(values):
             return
         # All checks come before the first write, so that a refused block has no effect.
-        plain = self._codec == "zstd" or values.dtype != object
+        plain = self._images is None or values.dtype != object
         if self._plain is not None and self._plain != plain:
             raise InvalidInputError(
                 f"{name}: got {'plain' if plain else 'encoded'} images after "
                 f"{'encoded' if plain else 'plain'} ones, expected one kind in a stream"
             )
-        if plain:
+        if self._images is None or plain:
             self._check_values(values)
         else:
             self._images.check(values)
         self._check_order(stamps[STAMPS[self._kind][0]])
         self._plain = plain
-        if self._codec == "zstd" or (self._queue is None and values.dtype == object):
+        if self._images is None or (self._queue is None and values.dtype == object):
             self._write(values, stamps)
         else:
             # Once there is a queue, everything goes through it to keep the order.
@@ -403,14 +406,16 @@ class StreamWriter:
     def _write(self, values: np.ndarray, stamps: Stamps) -> None:
         self._check_unbroken()
         self._is_broken = True
-        array = self.arrays[self.descriptor.name]
-        if self._codec == "zstd":
-            array.append(values)
+        name = self.descriptor.name
+        if self._images is None:
+            self.arrays[name].append(values)
         else:
-            for payload, num_images in self._images.chunks(values):
-                array.append_encoded(payload, num_images)
+            images = [self._images.encoded(image) for image in values]
+            for image in images:
+                self.arrays[name].append_bytes(image)
+            self.arrays[index_name(name)].append(self._images.index_rows(images))
         for stamp, column in stamps.items():
-            self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
+            self.arrays[f"{name}_{stamp}"].append(column)
         self._is_broken = False
 
     def _check_unbroken(self) -> None:
@@ -429,11 +434,12 @@ class StreamWriter:
             self._queue.drain()
         self._check_unbroken()
         name = self.descriptor.name
-        for payload, num_images in self._images.rest():
-            self.arrays[name].append_encoded(payload, num_images)
         entries = {name: array.finish() for name, array in self.arrays.items()}
-        entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
         counts = {array: entry.shape[0] for array, entry in entries.items()}
+        if self._images is not None:
+            update = {"encoder": self._images.encoder, "sha256": self._images.digest.hexdigest()}
+            entries[name] = entries[name].model_copy(update=update)
+            del counts[name]  # of bytes
         if len(set(counts.values())) != 1:
             raise StorageError(f"{name}: a block was written partially ({counts}); write it again")
         return entries
@@ -446,17 +452,36 @@ class StreamWriter:
             array.close()
 
 
-class _EncodedImages:
-    """Groups the images of a `jpeg` or `h264` stream into storage chunks."""
+class _GroupDigest:
+    """Digest of the encoded images of a stream, group by group."""
 
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        self._descriptor = descriptor
-        self._codec = codec_of(descriptor)
-        self._num_given = 0
-        self._video: GopEncoder | None = None
+    def __init__(self, codec: ImageCodec) -> None:
+        self._codec, self._sha256 = codec, hashlib.sha256()
         self._group: list[bytes] = []
+
+    def add(self, image: bytes) -> None:
+        self._group.append(image)
+        if len(self._group) == GROUP_IMAGES[self._codec]:
+            self._sha256.update(pack_group(self._codec, self._group))
+            self._group = []
+
+    def hexdigest(self) -> str:
+        sha256 = self._sha256.copy()
+        if self._group:
+            sha256.update(pack_group(self._codec, self._group))
+        return sha256.hexdigest()
+
+
+class _EncodedImages:
+    """Checks or encodes the images of a `jpeg` or `h264` stream, and says where each lies."""
+
+    def __init__(self, descriptor: StreamDescriptor, codec: ImageCodec) -> None:
+        self._descriptor, self._codec = descriptor, codec
+        self._num_given = self._num_bytes = 0
+        self._video: GopEncoder | None = None
+        self.digest = _GroupDigest(codec)
         self.encoder: str | None = None
-        if self._codec == "h264":
+        if codec == "h264":
             check_video_size(*descriptor.shape[:2])
 
     def check(self, values: np.ndarray) -> None:
@@ -473,19 +498,18 @@ class _EncodedImages:
                 )
         self._num_given += len(values)
 
-    def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
-        """Add images; returns the completed storage chunks with their number of images."""
-        images = list(values) if values.dtype == object else [self._encode(v) for v in values]
-        complete = []
-        for data in images:
-            self._group.append(data)
-            if len(self._group) == _CHUNK_IMAGES[self._codec]:
-                complete += self.rest()
-        return complete
+    def encoded(self, image: np.ndarray | bytes) -> bytes:
+        """The bytes of the next image, encoded here unless the caller gave them."""
+        data = image if isinstance(image, bytes) else self._encode(image)
+        self.digest.add(data)
+        return data
 
-    def rest(self) -> list[tuple[bytes, int]]:
-        group, self._group = self._group, []
-        return [(pack_chunk(self._codec, group), len(group))] if group else []
+    def index_rows(self, images: list[bytes]) -> np.ndarray:
+        """Rows of the index for the next images."""
+        bounds = list(accumulate(map(len, images), initial=self._num_bytes))
+        self._num_bytes = bounds[-1]
+        crcs = map(google_crc32c.value, images)
+        return np.array(list(zip(bounds[:-1], bounds[1:], crcs, strict=True)), dtype=np.int64)
 
     def _encode(self, image: np.ndarray) -> bytes:
         if self._codec == "jpeg":
@@ -560,31 +584,25 @@ class ContentDigest:
     """
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
-        self._codec = codec_of(descriptor)
+        codec = image_codec(descriptor)
         self._dtype = descriptor.numpy_dtype().newbyteorder("<")
-        # As in `stream_arrays`: values first.
-        self._columns = [hashlib.sha256() for _ in range(1 + len(STAMPS["recording"]))]
-        self._group: list[bytes] = []
+        self._images = None if codec is None else _GroupDigest(codec)
+        self._numbers = hashlib.sha256()
+        self._stamps = [hashlib.sha256() for _ in STAMPS["recording"]]
         self._num_samples = 0
 
     def add(self, batch: SampleBatch) -> None:
         """Add the next samples of the stream."""
-        values, *stamps = self._columns
         self._num_samples += len(batch)
-        for column, stamp in zip(stamps, STAMPS["recording"], strict=True):
+        for column, stamp in zip(self._stamps, STAMPS["recording"], strict=True):
             column.update(getattr(batch, stamp).astype("<i8").tobytes())
-        if self._codec == "zstd":
-            values.update(batch.values.astype(self._dtype, order="C", copy=False).data)
+        if self._images is None:
+            self._numbers.update(batch.values.astype(self._dtype, order="C", copy=False).data)
             return
         for image in batch.values:
-            self._group.append(image)
-            if len(self._group) == _CHUNK_IMAGES[self._codec]:
-                values.update(pack_chunk(self._codec, self._group))
-                self._group = []
+            self._images.add(image)
 
     def content(self) -> StreamContent:
         """What was added so far."""
-        values, *stamps = (column.copy() for column in self._columns)
-        if self._group:
-            values.update(pack_chunk(self._codec, self._group))
-        return stream_content(self._num_samples, [c.hexdigest() for c in (values, *stamps)])
+        columns = (self._numbers if self._images is None else self._images, *self._stamps)
+        return stream_content(self._num_samples, [column.hexdigest() for column in columns])

@@ -1,5 +1,6 @@
 """How large storage chunks are, and what a stream must not be: memory stays bounded."""
 
+import base64
 import json
 
 import numpy as np
@@ -140,10 +141,12 @@ def test_a_stored_chunk_of_gigabytes_is_refused_before_it_is_unpacked(store):
     with store.writer(kind="recording", attributes=take(heavy)) as writer:
         writer.append("raw", values=np.zeros((1, 50_000)), t_host_ns=np.array([7]))
     folder = store.root / "recordings" / "take-1"
-    forge_record(folder, lambda record: record["arrays"]["raw"].update(chunk_rows=5000))
+    chunk = with_crc(repeated_zeros(5000 * 400_000))
+    forged = {"chunk_rows": 5000, "crc32c": base64.b64encode(chunk[-4:]).decode()}
+    forge_record(folder, lambda record: record["arrays"]["raw"].update(forged))
     record, _ = decode_commit((folder / "commit.json").read_bytes(), what="take-1")
     (folder / "raw" / "zarr.json").write_bytes(array_metadata(record.arrays["raw"]))
-    write_shard(shard_of(folder, "raw"), [with_crc(repeated_zeros(5000 * 400_000))])
+    write_shard(shard_of(folder, "raw"), [chunk])
     reader = store.recording("take-1")
     for read in (lambda: reader.read("raw"), reader.verify):
         with memory_bound(), pytest.raises(CorruptDataError, match=r"'raw'.*2000000000 bytes"):

@@ -163,9 +163,9 @@ def test_a_recording_with_and_without_what_was_made_of_it(filled, tmp_path):
     assert [v.id for v in plan_deletion(filled.root, alone)] == ["a-take"]
     receipt = delete_for_good(filled.root, alone, tmp_path / "r.json")
     assert not receipt.complete
-    assert [(r.where, r.names[-1]) for r in receipt.remaining] == [
-        ("episodes/a-episode/zarr.json", "a-take")
-    ]
+    (remaining,) = receipt.remaining
+    assert remaining.where == "episodes/a-episode/zarr.json"
+    assert "a-take" in remaining.names
     request = DeletionRequest(recording="b-take")
     assert sorted(v.id for v in plan_deletion(filled.root, request)) == [
         "b-episode",

@@ -35,6 +35,7 @@ from dextouch.episodes.format import (
     Attributes,
     CommitRecord,
     Kind,
+    Version,
     array_metadata,
     attributes_id,
     decode_commit,
@@ -43,6 +44,7 @@ from dextouch.episodes.format import (
     sha256_hex,
     shard_path,
     stream_arrays,
+    version_of_group,
     with_rows,
 )
 from dextouch.episodes.groups import GroupContents, read_group
@@ -70,11 +72,12 @@ LOST = "lost_to_damage"
 
 @dataclass(frozen=True)
 class Finding:
-    """One damaged part; without `array` the whole item, without `chunk` the whole array."""
+    """One damaged part: of an item, or of an array, or a storage chunk or an image of it."""
 
     message: str
     array: str | None = None
     chunk: int | None = None
+    image: int | None = None
     foreign: bool = False
 
 
@@ -122,7 +125,7 @@ def inspect_group(
         progress(size)
 
     findings = [
-        Finding(error.message, name, number)
+        Finding(error.message, name, number, _image_of(error))
         for name in contents.entries
         for number, error in contents.inspect_array(name, progress=count)
     ]
@@ -136,6 +139,11 @@ def inspect_group(
     if findings:
         contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
+
+
+def _image_of(error: StorageError) -> int | None:
+    image = error.details.get("image")
+    return image if isinstance(image, int) else None
 
 
 def _stamp_findings(contents: Group) -> list[Finding]:
@@ -407,11 +415,13 @@ def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
         _put(files.folder, path, bytes(source.read(0, source.size() or 0)))
 
 
-def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[int | None]]:
-    found: dict[str, frozenset[int | None]] = {}
+def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[tuple[object, object]]]:
+    found: dict[str, frozenset[tuple[object, object]]] = {}
     for finding in inspect_group(files, kind).findings:
         if finding.array is not None:
-            found[finding.array] = found.get(finding.array, frozenset()) | {finding.chunk}
+            found[finding.array] = found.get(finding.array, frozenset()) | {
+                (finding.chunk, finding.image)
+            }
     return found
 
 
@@ -446,14 +456,14 @@ def _known(
         raise CorruptDataError(f"{what}: attributes are those of {attributes_id(attributes)!r}")
     if record is not None:
         return attributes, record[0].arrays, record[1]
-    return attributes, _entries(files, attributes), None
+    return attributes, _entries(files, attributes, version_of_group(group)), None
 
 
-def _entries(files: LocalGroup, attributes: Attributes) -> dict[str, ArrayEntry]:
+def _entries(files: LocalGroup, attributes: Attributes, version: Version) -> dict[str, ArrayEntry]:
     """Array entries without a commit record, with the lengths of the arrays' own metadata."""
     entries = {}
     for stream in attributes.streams:
-        for name, entry in stream_arrays(stream, kind_of(attributes)).items():
+        for name, entry in stream_arrays(stream, kind_of(attributes), version).items():
             try:
                 plain = json.loads(files.get(f"{name}/{METADATA_FILE}") or b"")
                 count = int(plain["shape"][0])
