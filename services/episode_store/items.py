@@ -15,6 +15,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta, timezone
+from functools import lru_cache
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -387,16 +388,24 @@ _COLLECTED: Final[Mapping[str, tuple[str, Callable[[Iterable[float]], float]]]] 
 }
 
 
+# More than the streams and hands of all stations have.
+@lru_cache(maxsize=1 << 14)
+def _collected_into(key: str) -> tuple[str, ...]:
+    """The figures that are made of a figure of quality."""
+    return tuple(name for name, (form, _) in _COLLECTED.items() if re.fullmatch(form, key))
+
+
 def figures_of(
     attributes: EpisodeAttributes | RecordingAttributes, *, num_steps: int, duration_s: float
 ) -> dict[str, float]:
     """The figures that an item has; `num_steps` are those of an episode."""
     quality = attributes.quality
     found = {"duration_s": duration_s}
-    for name, (pattern, collect) in _COLLECTED.items():
-        values = [value for key, value in quality.items() if re.fullmatch(pattern, key)]
-        if values:
-            found[name] = float(collect(values))
+    values: defaultdict[str, list[float]] = defaultdict(list)
+    for key, value in quality.items():
+        for name in _collected_into(key):
+            values[name].append(value)
+    found |= {name: float(_COLLECTED[name][1](some)) for name, some in values.items()}
     if "coverage" in quality:
         found["coverage"] = quality["coverage"]
     elif num_steps and "num_steps_refused" in quality:
