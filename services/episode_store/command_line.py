@@ -191,7 +191,7 @@ def list_items(context: Context) -> Outcome:
         raise NotFoundError(f"store {root}: no such folder; name another with --store")
     if options.kind == "recording" and options.origin is not None:
         raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
-    catalog = Catalog(context.store)
+    catalog = Catalog(context.store, progress)
     # Recordings have no origin to match.
     kind: Kind | None = "episode" if options.origin is not None else options.kind
     result: dict[str, Any] = {"num_matching": 0, "next_after": None}
@@ -299,9 +299,13 @@ def verify(context: Context) -> Outcome:
             reports.append(inspect_group(files, kind))
         except NotFoundError:
             say(f"{item_id}  deleted meanwhile  {kind}")
-    if not context.options.ids and root is not None:
-        for what, folder in unfinished_folders(root):
+    if not context.options.ids:
+        for what, folder in () if root is None else unfinished_folders(root):
             reports.append(_inspect_unfinished(what, folder))
+        reports += [
+            ItemReport("catalog", "catalog", findings=(Finding(problem, foreign=True),))
+            for problem in Catalog(context.store).index.verify()
+        ]
     for report in reports:
         _say_report(report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}

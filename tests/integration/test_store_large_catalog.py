@@ -1,4 +1,4 @@
-"""A catalog of many episodes with real metadata is listed from memory."""
+"""A catalog of many takes with real metadata is read from its file."""
 
 import json
 import os
@@ -32,6 +32,8 @@ def test_a_thousand_are_listed_at_once(tmp_path):
     report = measured(tmp_path / "store", 1000)
     print(json.dumps(report))  # noqa: T201
     assert report["num"] == 1000
-    assert report["settled_list_ms"] < 50
-    assert report["settled_filtered_ms"] < 50
-    assert report["settled_hours_ms"] < 50
+    # Several times what it takes without other programs beside it.
+    assert report["takes_ms"] < 25
+    assert report["after_a_take_ms"] < 100
+    assert report["hours_ms"] < 10
+    assert report["build_ms"] < 2000 * 6
