@@ -135,6 +135,11 @@ class CatalogCheck(PeriodicThread):
         """Check once."""
         self._index.check()
 
+    def stop(self) -> None:
+        """End soon: reading a large store takes minutes, and can be interrupted anywhere."""
+        self._stopping.set()
+        self._thread.join(timeout=2.0)
+
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; it clears up after killed writers."""

@@ -66,7 +66,7 @@ CREATE TABLE grp (
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
 CREATE INDEX item_dirty ON item(is_dirty) WHERE is_dirty;
-CREATE INDEX item_group ON item(grp) WHERE is_compared;
+CREATE INDEX item_group ON item(grp, is_compared);
 CREATE INDEX item_aligned ON item(aligned) WHERE aligned IS NOT NULL;
 CREATE INDEX item_hours ON item(kind, task, domain, origin, success, duration_s);
 CREATE INDEX item_clickable ON item(id) WHERE is_clickable;
@@ -145,6 +145,7 @@ class CatalogFile:
     def _locked(self) -> Iterator[None]:
         """No other process opens or creates a file meanwhile."""
         self._folder.mkdir(exist_ok=True, parents=self._is_bucket)
+        self._give_to_owner(self._folder)
         descriptor = os.open(self._folder, os.O_RDONLY)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -169,10 +170,17 @@ class CatalogFile:
             remove_catalog(path)
         self._path = self._folder / f"{self._prefix}{uuid.uuid4().hex[:12]}.sqlite"
         connection = _created(str(self._path))
+        self._give_to_owner(self._path)
         for other in self._folder.glob("v*.sqlite"):
             if not other.name.startswith(f"v{VERSION}-"):
                 remove_catalog(other)
         return connection
+
+    def _give_to_owner(self, path: Path) -> None:
+        """What an administrator makes is for the user of the service."""
+        if os.geteuid() == 0:
+            owner = self._root.stat()
+            os.chown(path, owner.st_uid, owner.st_gid)
 
     def give_up(self, error: Exception) -> None:
         """After an error: begin a damaged file anew; keep the catalog in memory otherwise."""

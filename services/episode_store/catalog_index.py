@@ -87,6 +87,7 @@ class CatalogIndex:
         def look_and_read(connection: sqlite3.Connection) -> T:
             for kind in KINDS:
                 self._look(connection, kind)
+            _relink(connection)
             return query(connection)
 
         return self._run(look_and_read)
@@ -158,7 +159,7 @@ class CatalogIndex:
                 )
                 self._known[kind] = {name: Stamps(*stamps) for name, *stamps in rows}
         self._data_version = version
-        # What a killed process, or an erasure, has left to do.
+        # What a change, a killed process or an erasure has left to do.
         _relink(connection)
         return connection
 
@@ -214,7 +215,7 @@ class CatalogIndex:
         return row is not None and 0 <= time.time() - row[0] < BUCKET_CHECK_PERIOD_S
 
     def _apply(self, connection: sqlite3.Connection, listing: "_Listing") -> None:
-        """Bring the rows of items up to date."""
+        """Bring the rows of items up to date; they are linked before the next query."""
         kind, before, found, stamps = listing
         known, omitted = self._known[kind], self._omitted[kind]
         # What another thread or process has changed since is left to the next look.
@@ -253,7 +254,6 @@ class CatalogIndex:
             for name in gone:
                 known.pop(name, None)
         self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
-        _relink(connection)
 
     def _read(
         self, kind: Kind, name: str, stamps: Stamps

@@ -48,7 +48,7 @@ _LINK_EPISODES: Final = f"""UPDATE item SET
   WHERE is_dirty AND +kind = 'episode'"""
 # What changes with an episode may change the takes of its recordings.
 _MARK_RECORDINGS: Final = """UPDATE item SET is_dirty = 1 WHERE kind = 'recording' AND id IN (
-  SELECT l.source FROM item e JOIN lineage l ON l.row = e.row
+  SELECT l.source FROM item e CROSS JOIN lineage l ON l.row = e.row
   WHERE e.is_dirty AND +e.kind = 'episode' AND l.kind = 'recording')"""
 _LINK_RECORDINGS: Final = """UPDATE item SET
   is_take = 1, verdict = own_verdict, is_whole = complete,
@@ -251,7 +251,7 @@ def relink(connection: sqlite3.Connection) -> None:
 def _compare(connection: sqlite3.Connection, group: int) -> None:
     """Compare the items of a group with each other, and sort them by what is unusual."""
     rows = connection.execute(
-        "SELECT row, figures, fixed, weight FROM item WHERE grp = ? AND is_compared", (group,)
+        "SELECT row, figures, fixed, weight FROM item WHERE grp = ? AND is_compared = 1", (group,)
     ).fetchall()
     values = np.frombuffer(b"".join(row[1] for row in rows)).reshape(-1, len(FIGURES))
     spread = spread_of(values)

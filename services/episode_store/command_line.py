@@ -53,8 +53,10 @@ from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
+    EpisodeList,
     EpisodeSummary,
     RecordingAttributes,
+    RecordingList,
     RecordingSummary,
     SceneObject,
     SceneObjects,
@@ -214,12 +216,20 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
         for row in episodes.episodes:
             facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
             say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
-        return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+        return _result_of(context, episodes), catalog.index.num_items(kind)
     recordings = catalog.recordings(query, limit=sys.maxsize)
     for each in recordings.recordings:
         facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
         say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
-    return json_ready(recordings), catalog.recordings(limit=1).num_matching
+    return _result_of(context, recordings), catalog.index.num_items(kind)
+
+
+def _result_of(context: Context, found: EpisodeList | RecordingList) -> dict[str, Any]:
+    # Of many items it takes as long as listing them.
+    if context.options.json is None:
+        return {"num_matching": found.num_matching}
+    result: dict[str, Any] = json_ready(found)
+    return result
 
 
 def _outcome(

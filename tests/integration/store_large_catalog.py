@@ -125,8 +125,8 @@ def measured(store, count):
     (episode_id,) = [name for name in store.list() if not name.startswith("e-")]
     (recording_id,) = [n for n in store.list(kind="recording") if not n.startswith("r-")]
     times = []
-    for number in range(NUM_ROUNDS):
-        copy_take(store, recording_id, episode_id, f"{10**6 + number}")
+    for _ in range(NUM_ROUNDS):
+        copy_take(store, recording_id, episode_id, str(time.time_ns()))
         started = time.process_time()
         catalog.items(ItemFilter(), limit=50, page=Page(sort="time", descending=True))
         times.append((time.process_time() - started) * 1e3)
