@@ -87,6 +87,7 @@ class CatalogIndex:
         def look_and_read(connection: sqlite3.Connection) -> T:
             for kind in KINDS:
                 self._look(connection, kind)
+            # Also what a check, a killed process or an erasure has left to do.
             _relink(connection)
             return query(connection)
 
@@ -159,8 +160,6 @@ class CatalogIndex:
                 )
                 self._known[kind] = {name: Stamps(*stamps) for name, *stamps in rows}
         self._data_version = version
-        # What a change, a killed process or an erasure has left to do.
-        _relink(connection)
         return connection
 
     def _look(self, connection: sqlite3.Connection, kind: Kind) -> None:
