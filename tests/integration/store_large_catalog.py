@@ -150,7 +150,9 @@ def measured_queries(store, count, report):
     lookups = {
         "takes": lambda: catalog.items(ItemFilter(), limit=50),
         "episodes": lambda: catalog.episodes(EpisodeFilter(), limit=50),
-        "last_page": lambda: catalog.items(ItemFilter(), limit=50, page=Page(offset=count - 50)),
+        "last_page": lambda: catalog.items(
+            ItemFilter(), limit=50, page=Page(offset=max(count - 50, 0))
+        ),
         "of_task": lambda: catalog.items(ItemFilter(task=task), limit=50),
         "of_quality": lambda: catalog.items(ItemFilter(min_quality=quality), limit=50),
         "with_text": lambda: catalog.items(ItemFilter(text="e-000012"), limit=50),
