@@ -126,6 +126,23 @@ class DeletionWatch(PeriodicThread):
             self._revision = revision
 
 
+class CatalogCheck(PeriodicThread):
+    """Compares a catalog with its store: at once, as a large one takes time, and now and then."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        super().__init__("catalog_not_checked", catalog.index.check_period_s)
+        self._index = catalog.index
+
+    def work(self) -> None:
+        """Check once."""
+        self._index.check()
+
+    def stop(self) -> None:
+        """End soon: reading a large store takes minutes, and can be interrupted anywhere."""
+        self._stopping.set()
+        self._thread.join(timeout=2.0)
+
+
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
@@ -139,19 +156,19 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
     watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
-    pending = PendingUploads(store)
+    pending, check = PendingUploads(store), CatalogCheck(catalog)
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         pending.start()
-        # The first listing of a large store takes seconds, so it is warmed up in the background.
-        threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
+        check.start()
         watch.start()
         try:
             yield
         finally:
             pending.stop()
+            check.stop()
             watch.stop()
             ingest.close()
 
@@ -179,13 +196,6 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     enrolments.connect(app.state.access)
     app.state.registry.register(metrics.registry)
     return app
-
-
-def _warm_up(catalog: Catalog) -> None:
-    try:
-        catalog.warm_up()
-    except DexTouchError as error:
-        logger.warning("warm_up_failed", reason=error.message)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -48,8 +48,10 @@ from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
+    EpisodeList,
     EpisodeSummary,
     RecordingAttributes,
+    RecordingList,
     RecordingSummary,
     SceneObject,
     SceneObjects,
@@ -112,7 +114,7 @@ def list_items(context: Context) -> Outcome:
         raise NotFoundError(f"store {root}: no such folder; name another with --store")
     if options.kind == "recording" and options.origin is not None:
         raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
-    catalog = Catalog(context.store)
+    catalog = Catalog(context.store, progress)
     # Recordings have no origin to match.
     kind: Kind | None = "episode" if options.origin is not None else options.kind
     result: dict[str, Any] = {"num_matching": 0, "next_after": None}
@@ -135,12 +137,20 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
         for row in episodes.episodes:
             facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
             say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
-        return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+        return _result_of(context, episodes), catalog.index.num_items(kind)
     recordings = catalog.recordings(query, limit=sys.maxsize)
     for each in recordings.recordings:
         facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
         say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
-    return json_ready(recordings), catalog.recordings(limit=1).num_matching
+    return _result_of(context, recordings), catalog.index.num_items(kind)
+
+
+def _result_of(context: Context, found: EpisodeList | RecordingList) -> dict[str, Any]:
+    # Of many items it takes as long as listing them.
+    if context.options.json is None:
+        return {"num_matching": found.num_matching}
+    result: dict[str, Any] = json_ready(found)
+    return result
 
 
 def _outcome(
@@ -221,9 +231,13 @@ def verify(context: Context) -> Outcome:
             reports.append(inspect_group(files, kind))
         except NotFoundError:
             say(f"{item_id}  deleted meanwhile  {kind}")
-    if not context.options.ids and root is not None:
-        for what, folder in unfinished_folders(root):
+    if not context.options.ids:
+        for what, folder in () if root is None else unfinished_folders(root):
             reports.append(_inspect_unfinished(what, folder))
+        reports += [
+            ItemReport("catalog", "catalog", findings=(Finding(problem, foreign=True),))
+            for problem in Catalog(context.store).index.verify()
+        ]
     for report in reports:
         _say_report(report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}

@@ -406,7 +406,7 @@ def _queue(catalog: Catalog, objects: ObjectClicks, task: str | None, limit: int
     chosen = tasks[0] if task is None and tasks else task or ""
     if chosen not in objects.tasks:
         raise NotFoundError(f"clicks: task {chosen!r} has no objects; {', '.join(tasks)} have")
-    found = {name: one for name, one in catalog.clickable().items() if one.item.task == chosen}
+    found = {name: one for name, one in catalog.clickable().items() if one.task == chosen}
     # In the order of recording, the first takes would be those of one person and one day.
     names = sorted(found, key=lambda name: (zlib.crc32(name.encode()), name))
     marked = [name for name in names if found[name].clicks]

@@ -4,6 +4,7 @@ from . import needs as needs
 from . import spool as spool
 from .files import GroupFiles as GroupFiles
 from .files import LocalGroup as LocalGroup
+from .files import Stamps as Stamps
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
 from .files import replace_file as replace_file

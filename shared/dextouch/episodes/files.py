@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError, StorageFullError
@@ -162,6 +162,14 @@ def folder_bytes(folder: Path) -> int:
                 except FileNotFoundError:
                     continue
     return total
+
+
+class Stamps(NamedTuple):
+    """What changes when a group is replaced or edited: its folder, its content and its remarks."""
+
+    folder: int
+    content: str
+    remarks: str
 
 
 @runtime_checkable

@@ -20,16 +20,18 @@ from pathlib import Path
 import structlog
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.files import disk_errors, unheld_folders, write_file
+from dextouch.episodes.files import Stamps, disk_errors, unheld_folders, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
     KINDS,
+    METADATA_FILE,
     Attributes,
     Kind,
     attributes_id,
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
+from dextouch.episodes.trash import REMARK_FILES
 from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
 from dextouch.errors import (
     ConflictError,
@@ -57,6 +59,8 @@ _DELETING = b"deleting"
 # Uploads older than this count as abandoned.
 ORPHAN_AGE = timedelta(days=1)
 _PARALLEL_REQUESTS = 8
+# Listing one group takes a request, listing all of them one per 1000 objects.
+_MAX_ONE_BY_ONE = 20
 
 
 class ObjectFile:
@@ -250,6 +254,28 @@ class ObjectStorage:
         """Sorted committed ids; takes one request per 1000 objects in the bucket."""
         keys = (facts.key.split("/") for facts in self._bucket.list(f"{kind}s"))
         return sorted(parts[1] for parts in keys if len(parts) == 3 and parts[2] == COMMIT_FILE)
+
+    def folder_numbers(self, kind: Kind) -> dict[str, int]:
+        """Ids of a kind; takes one request per 1000 of them."""
+        return dict.fromkeys(self._bucket.folders(f"{kind}s"), 0)
+
+    def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
+        """Entity tags of what a catalog is made of: of few ids one by one, of many from a list."""
+        is_few = len(numbers) <= _MAX_ONE_BY_ONE
+        folders = [group_key(kind, name) for name in numbers] if is_few else [f"{kind}s"]
+        tags: dict[str, dict[str, str]] = {}
+        for facts in (one for folder in folders for one in self._bucket.list(folder)):
+            _, name, *rest = facts.key.split("/")
+            tags.setdefault(name, {})["/".join(rest)] = facts.etag
+        return {
+            name: Stamps(
+                number,
+                f"{tags[name][COMMIT_FILE]} {tags[name].get(METADATA_FILE, '')}",
+                " ".join(tags[name].get(file, "") for file in REMARK_FILES),
+            )
+            for name, number in numbers.items()
+            if COMMIT_FILE in tags.get(name, {})
+        }
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""

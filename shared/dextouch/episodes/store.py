@@ -14,6 +14,7 @@ import numpy as np
 from dextouch.episodes.files import (
     GroupFiles,
     LocalGroup,
+    Stamps,
     disk_errors,
     folder_bytes,
     replace_file,
@@ -23,6 +24,7 @@ from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
     KINDS,
+    METADATA_FILE,
     Attributes,
     Kind,
     attributes_id,
@@ -33,6 +35,7 @@ from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.trash import (
     CLICKS_FILE,
     NOTES_FILE,
+    REMARK_FILES,
     REVIEW_FILE,
     TrashEntry,
     TrashKind,
@@ -70,6 +73,8 @@ if TYPE_CHECKING:
 
 
 _OBJECT_SCHEME = "s3://"
+# The files of a group that a catalog is made of: its content, and remarks beside it.
+_STAMPED = (COMMIT_FILE, METADATA_FILE, *REMARK_FILES)
 
 
 class EpisodeStore:
@@ -151,6 +156,21 @@ class EpisodeStore:
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Sorted committed ids."""
         return self._storage.list(_check_kind(kind))
+
+    def folder_numbers(self, *, kind: Kind = "episode") -> dict[str, int]:
+        """Ids of a kind, committed or not, each with a number that changes with its folder.
+
+        Far faster than `list`: one look at the folder, and in a bucket one request per 1000 ids,
+        where all numbers are 0.
+        """
+        return self._storage.folder_numbers(_check_kind(kind))
+
+    def stamps(self, numbers: Mapping[str, int], *, kind: Kind = "episode") -> dict[str, Stamps]:
+        """Stamps of those of these ids that are committed; `numbers` are their folder's.
+
+        They change when the content or the remarks of an item are replaced, or edited by hand.
+        """
+        return self._storage.stamps(_check_kind(kind), numbers)
 
     def review(self, item_id: str, *, kind: Kind = "episode") -> Review | None:
         """The review of an item; None if nobody reviewed it.
@@ -359,6 +379,29 @@ class _LocalStorage:
                 return []
             return sorted(path.name for path in folder.iterdir() if _is_committed(path))
 
+    def folder_numbers(self, kind: Kind) -> dict[str, int]:
+        with disk_errors(f"list {kind}s"):
+            try:
+                with os.scandir(self.root / f"{kind}s") as entries:
+                    return {entry.name: entry.inode() for entry in entries}
+            except FileNotFoundError:
+                return {}
+
+    def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
+        folder, found = f"{self.root}/{kind}s", {}
+        with disk_errors(f"look at {kind}s"):
+            for name, number in numbers.items():
+                if not re.fullmatch(ID_PATTERN, name):
+                    continue
+                try:
+                    commit, *others = (_stamp(f"{folder}/{name}/{file}") for file in _STAMPED)
+                except PermissionError:
+                    # Reading it says what is wrong.
+                    commit, others = "?", ["", "", ""]
+                if commit:
+                    found[name] = Stamps(number, f"{commit} {others[0]}", " ".join(others[1:]))
+        return found
+
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group permanently; it disappears atomically and is then removed from disk."""
         remove_for_good(put_into_trash(self.root, kind, item_id))
@@ -404,6 +447,15 @@ class _LocalStorage:
 
     def _folder(self, kind: Kind, item_id: str) -> Path:
         return self.root / f"{kind}s" / item_id
+
+
+def _stamp(path: str) -> str:
+    """What changes with a file; empty without it. Plain paths: a store has many files."""
+    try:
+        state = os.stat(path)  # noqa: PTH116
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    return f"{state.st_mtime_ns}.{state.st_size}.{state.st_ino}"
 
 
 def _is_committed(folder: Path) -> bool:

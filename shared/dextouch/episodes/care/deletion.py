@@ -18,6 +18,7 @@ from typing import Any
 from pydantic import BaseModel, Field, ValidationError
 
 from dextouch.data_folder import is_system_file
+from dextouch.episodes.care.catalog_erasure import erase_from_catalog, search_catalog
 from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, take_start
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
@@ -205,6 +206,10 @@ class IdentifierSearch:
             escaped = {word for word in self._words if json.dumps(word)[1:-1] in text}
             return sorted(escaped.union(self.in_text(text)))
         return self.in_text(texts)
+
+    def in_column(self, text: str) -> list[str]:
+        """Identifiers in a text that may be JSON."""
+        return self.found_in(text.encode()) if text.startswith("{") else self.in_text(text)
 
     def in_text(self, text: str) -> list[str]:
         """Identifiers in a text."""
@@ -423,6 +428,7 @@ def delete_for_good(
     reviewed = _remove_all(root, request, known, remember, unsent=unsent)
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
     wanted = IdentifierSearch(words)
+    erase_from_catalog(root, wanted.in_column)
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
@@ -497,8 +503,8 @@ def _search(
 ) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Searched are attributes files, names of folders, and of checkpoints JSON and safetensors'
-    headers.
+    Searched are attributes files, names of folders, the catalog, and of checkpoints JSON and
+    safetensors' headers.
     """
     found, files = [], []
     facts = all_facts(root)
@@ -513,6 +519,7 @@ def _search(
             files += [(str(path), path) for path in sorted(paths) if path.is_file()]
     others = ((f"{INTENTS}/{p.name}", p) for p in small_files(root / INTENTS) if p != skip)
     found += _references(wanted, [*files, *others])
+    found += [Reference(*named) for named in search_catalog(root, wanted.in_column)]
     unreadable = [f"{item.place}/{item.folder.name}" for item in facts if not item.readable]
     return found, unreadable, len(files)
 
