@@ -78,7 +78,7 @@ _KEYS: Final[Mapping[str, str]] = {
     "operator": "coalesce(i.operator, '')", "station": "coalesce(i.station, '')",
 }  # fmt: skip
 _BEYOND_LIMIT: Final = number_key(WEIGHTS["beyond_limit"])
-_BODIES: Final = """SELECT i.row, i.kind, i.id, i.is_compared, b.item, b.review, g.spread
+_BODIES: Final = """SELECT i.row, i.kind, i.stands, i.is_compared, b.item, b.review, g.spread
   FROM item i JOIN body b USING (row) JOIN grp g ON g.number = i.grp
   WHERE i.row IN (SELECT value FROM json_each(?))"""
 _SOURCES: Final = """SELECT l.row, s.kind, s.id, b.consent, s.complete, b.incomplete_cause, b.review
@@ -360,9 +360,13 @@ def _items(connection: sqlite3.Connection, found: Sequence[Found]) -> tuple[Cata
     for row, item_id in connection.execute(_PRODUCTS, (wanted,)):
         products[row].append(item_id)
     items = {}
-    for row, kind, _, is_compared, text, review, spread in connection.execute(_BODIES, (wanted,)):
+    for row, kind, stands, is_compared, text, written, spread in connection.execute(
+        _BODIES, (wanted,)
+    ):
         item = CatalogItem.model_validate_json(text)
-        changes = {"review": _review(review), "episodes": tuple(products[row])}
+        review = _review(written)
+        counts = review if stands or review is None else review.earlier
+        changes = {"review": counts, "episodes": tuple(products[row])}
         item = item.model_copy(update=changes)
         if kind == "episode":
             item = linked_episode(item, sources[row])

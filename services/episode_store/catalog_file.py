@@ -34,6 +34,7 @@ _INDEXES: Final = "".join(
     f"CREATE INDEX take_{name} ON item({key}, name) WHERE is_take;"
     for name, key in _KEYS.items()
 )
+# `result` has what edits made of an item, `stands` whether one of these is stored.
 # Columns after `is_dirty` are derived from other items (`catalog_rows.relink`). Triggers mark what
 # a change of an item alters elsewhere: its sources, what was made from it, and its group.
 _SCHEMA: Final = f"""
@@ -44,9 +45,11 @@ CREATE TABLE item (
   success INTEGER, recovered INTEGER NOT NULL, trace_id TEXT, complete INTEGER NOT NULL,
   at_us INTEGER, at_key TEXT NOT NULL, duration_s REAL NOT NULL, duration_key TEXT NOT NULL,
   num_bytes INTEGER, beyond_limit INTEGER NOT NULL, in_doubt INTEGER NOT NULL,
-  is_clickable INTEGER NOT NULL, own_verdict TEXT, figures BLOB NOT NULL, grp INTEGER NOT NULL,
+  is_clickable INTEGER NOT NULL, own_verdict TEXT, earlier_verdict TEXT,
+  is_superseded INTEGER NOT NULL, figures BLOB NOT NULL, grp INTEGER NOT NULL,
   text TEXT NOT NULL, is_dirty INTEGER NOT NULL DEFAULT 1,
-  is_take INTEGER NOT NULL DEFAULT 0, aligned INTEGER, verdict TEXT, is_whole INTEGER,
+  is_take INTEGER NOT NULL DEFAULT 0, stands INTEGER NOT NULL DEFAULT 1, aligned INTEGER,
+  verdict TEXT, is_whole INTEGER,
   is_compared INTEGER NOT NULL DEFAULT 0, fixed REAL NOT NULL DEFAULT 0,
   weight TEXT NOT NULL DEFAULT '{NO_WEIGHT}',
   take_verdict TEXT, take_weight TEXT NOT NULL DEFAULT '{NO_WEIGHT}', UNIQUE (kind, id));
@@ -56,6 +59,8 @@ CREATE TABLE body (
 CREATE TABLE lineage (
   row INTEGER, position INTEGER, kind TEXT NOT NULL, source TEXT NOT NULL,
   PRIMARY KEY (row, position)) WITHOUT ROWID;
+CREATE TABLE result (
+  row INTEGER, id TEXT NOT NULL, PRIMARY KEY (row, id)) WITHOUT ROWID;
 CREATE TABLE figure_name (number INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL);
 CREATE TABLE figure (
   number INTEGER, row INTEGER, value REAL NOT NULL, PRIMARY KEY (number, row)) WITHOUT ROWID;
@@ -65,6 +70,7 @@ CREATE TABLE grp (
   UNIQUE (task, domain, origin, kind));
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
+CREATE INDEX result_id ON result(id);
 CREATE INDEX item_dirty ON item(is_dirty) WHERE is_dirty;
 CREATE INDEX item_group ON item(grp, is_compared);
 CREATE INDEX item_aligned ON item(aligned) WHERE aligned IS NOT NULL;
@@ -81,16 +87,21 @@ CREATE TRIGGER item_gone AFTER DELETE ON item BEGIN
     WHERE l.row = old.row AND item.kind = l.kind AND item.id = l.source;
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = old.id AND kind = old.kind);
+  UPDATE item SET is_dirty = 1
+    WHERE row IN (SELECT row FROM result WHERE id = old.id) AND kind = old.kind;
   UPDATE grp SET is_stale = 1 WHERE number = old.grp;
   DELETE FROM body WHERE row = old.row;
+  DELETE FROM result WHERE row = old.row;
   DELETE FROM lineage WHERE row = old.row;
   DELETE FROM figure WHERE row = old.row AND number IN (SELECT number FROM figure_name);
 END;
 CREATE TRIGGER item_made AFTER INSERT ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = new.id AND kind = new.kind);
+  UPDATE item SET is_dirty = 1
+    WHERE row IN (SELECT row FROM result WHERE id = new.id) AND kind = new.kind;
 END;
-CREATE TRIGGER item_reviewed AFTER UPDATE OF own_verdict ON item BEGIN
+CREATE TRIGGER item_reviewed AFTER UPDATE OF own_verdict, is_superseded ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = new.id AND kind = new.kind);
 END;

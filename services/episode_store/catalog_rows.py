@@ -39,10 +39,15 @@ _weight_key = lru_cache(maxsize=1 << 12)(number_key)
 # plus and CROSS JOIN keep SQLite from beginning with all items of a kind.
 _SOURCES: Final = """FROM lineage l JOIN item s ON s.kind = l.kind AND s.id = l.source
   WHERE l.row = item.row"""
+# The review of an edit counts as long as one of the results is stored (`Review.standing`).
+_STAND: Final = """UPDATE item SET stands = NOT is_superseded OR EXISTS (
+  SELECT 1 FROM result r JOIN item p ON p.kind = item.kind AND p.id = r.id WHERE r.row = item.row)
+  WHERE is_dirty"""
+_OWN_VERDICT: Final = "iif(stands, own_verdict, earlier_verdict)"
 _LINK_EPISODES: Final = f"""UPDATE item SET
   is_take = origin = 'imagined' OR NOT EXISTS (SELECT 1 {_SOURCES} AND s.kind = 'recording'),
-  verdict = coalesce(own_verdict,
-    (SELECT 'rejected' {_SOURCES} AND s.own_verdict = 'rejected' LIMIT 1)),
+  verdict = coalesce({_OWN_VERDICT}, (SELECT 'rejected' {_SOURCES}
+    AND s.own_verdict = 'rejected' AND NOT s.is_superseded LIMIT 1)),
   is_whole = complete AND NOT EXISTS (SELECT 1 {_SOURCES} AND s.kind = 'recording'
     AND NOT s.complete)
   WHERE is_dirty AND +kind = 'episode'"""
@@ -50,8 +55,8 @@ _LINK_EPISODES: Final = f"""UPDATE item SET
 _MARK_RECORDINGS: Final = """UPDATE item SET is_dirty = 1 WHERE kind = 'recording' AND id IN (
   SELECT l.source FROM item e CROSS JOIN lineage l ON l.row = e.row
   WHERE e.is_dirty AND +e.kind = 'episode' AND l.kind = 'recording')"""
-_LINK_RECORDINGS: Final = """UPDATE item SET
-  is_take = 1, verdict = own_verdict, is_whole = complete,
+_LINK_RECORDINGS: Final = f"""UPDATE item SET
+  is_take = 1, verdict = {_OWN_VERDICT}, is_whole = complete,
   aligned = (SELECT p.row FROM lineage l CROSS JOIN item p ON p.row = l.row
     WHERE l.source = item.id AND l.kind = 'recording'
       AND p.kind = 'episode' AND p.origin <> 'imagined' ORDER BY p.id DESC LIMIT 1)
@@ -72,12 +77,13 @@ _TAKES: Final = """UPDATE item SET is_dirty = 0,
 
 @dataclass(frozen=True)
 class ItemRow:
-    """What a catalog keeps of an item: columns of `item` and `body`, lineage and quality."""
+    """What a catalog keeps of an item: columns of `item` and `body`, lineage, quality, results."""
 
     item: Mapping[str, object]
     body: Mapping[str, object]
     lineage: tuple[LineageEntry, ...]
     quality: Mapping[str, float]
+    results: tuple[str, ...]
 
 
 def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> ItemRow:
@@ -108,7 +114,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
         "beyond_limit": bool(item.findings),
         "in_doubt": bool(item.time_doubts),
         "is_clickable": is_clickable,
-        "own_verdict": None if review is None else review.verdict,
+        **_verdicts(review),
         "figures": figure_row(item.figures).tobytes(),
         "text": "\n".join(part or "" for part in parts).casefold(),
     }
@@ -120,7 +126,8 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
         "review": _json(review),
         "clicks": _json(clicks),
     }
-    return ItemRow(columns, body, about.lineage, about.quality)
+    results = () if review is None else review.superseded_by
+    return ItemRow(columns, body, about.lineage, about.quality, results)
 
 
 def _episode(reader: EpisodeReader) -> EpisodeSummary:
@@ -190,6 +197,7 @@ def write_row(connection: sqlite3.Connection, row: ItemRow) -> None:
         "INSERT INTO lineage VALUES (?, ?, ?, ?)",
         [(number, place, one.kind, one.id) for place, one in enumerate(row.lineage)],
     )
+    _insert_results(connection, number, row.results)
     known = dict(execute("SELECT name, number FROM figure_name"))
     for name in row.quality.keys() - known.keys():
         known[name] = execute("INSERT INTO figure_name (name) VALUES (?)", (name,)).lastrowid
@@ -214,16 +222,34 @@ def write_remarks(
     clicks: EpisodeClicks | None,
 ) -> None:
     """Change what people say of an item, by kind and id; `relink` must follow."""
-    verdict = None if review is None else review.verdict
+    found = connection.execute("SELECT row FROM item WHERE kind = ? AND id = ?", name).fetchone()
+    if found is None:
+        return
     connection.execute(
-        "UPDATE item SET folder = ?, content = ?, remarks = ?, own_verdict = ?, is_dirty = 1 "
-        "WHERE kind = ? AND id = ?",
-        (*stamps, verdict, *name),
+        "UPDATE item SET folder = ?, content = ?, remarks = ?, own_verdict = ?, "
+        "earlier_verdict = ?, is_superseded = ?, is_dirty = 1 WHERE row = ?",
+        (*stamps, *_verdicts(review).values(), *found),
     )
     connection.execute(
-        "UPDATE body SET review = ?, clicks = ? "
-        "WHERE row = (SELECT row FROM item WHERE kind = ? AND id = ?)",
-        (_json(review), _json(clicks), *name),
+        "UPDATE body SET review = ?, clicks = ? WHERE row = ?",
+        (_json(review), _json(clicks), *found),
+    )
+    connection.execute("DELETE FROM result WHERE row = ?", found)
+    _insert_results(connection, found[0], () if review is None else review.superseded_by)
+
+
+def _verdicts(review: Review | None) -> dict[str, object]:
+    earlier = None if review is None else review.earlier
+    return {
+        "own_verdict": None if review is None else review.verdict,
+        "earlier_verdict": None if earlier is None else earlier.verdict,
+        "is_superseded": review is not None and bool(review.superseded_by),
+    }
+
+
+def _insert_results(connection: sqlite3.Connection, row: int, results: tuple[str, ...]) -> None:
+    connection.executemany(
+        "INSERT OR IGNORE INTO result VALUES (?, ?)", [(row, name) for name in results]
     )
 
 
@@ -235,7 +261,7 @@ def relink(connection: sqlite3.Connection) -> None:
     """Make derived columns of changed items, and of those that they change, fit again."""
     execute = connection.execute
     if execute("SELECT 1 FROM item WHERE is_dirty LIMIT 1").fetchone():
-        for statement in (_LINK_EPISODES, _MARK_RECORDINGS, _LINK_RECORDINGS, _JUDGE):
+        for statement in (_STAND, _LINK_EPISODES, _MARK_RECORDINGS, _LINK_RECORDINGS, _JUDGE):
             execute(statement)
         execute("UPDATE grp SET is_stale = 1 WHERE number IN (SELECT grp FROM item WHERE is_dirty)")
         execute(f"UPDATE item SET weight = '{NO_WEIGHT}' WHERE is_dirty AND NOT is_compared")

@@ -60,7 +60,8 @@ def _entry(store, kind, name):
 def listed(recordings, episodes):
     """Linked entries by the kind of list and by `ID/KIND`, with the findings of all."""
     theirs = {name: _linked(one, recordings, episodes) for name, one in episodes.items()}
-    made, ours = defaultdict(list), dict(recordings)
+    made = defaultdict(list)
+    ours = {n: one.having(review=_standing(one, recordings)) for n, one in recordings.items()}
     for name, entry in theirs.items():
         for source in entry.item.recordings if entry.item.origin != "imagined" else ():
             made[source].append(name)
@@ -84,15 +85,20 @@ def listed(recordings, episodes):
     }
 
 
+def _standing(entry, stored):
+    review = entry.item.review
+    return review and review.standing(lambda name: name in stored)
+
+
 def _linked(entry, recordings, episodes):
     names = [one.id for one in entry.lineage if one.kind == "recording" and one.id in recordings]
     sources = [recordings[name].item for name in names]
     torn = next((one for one in (entry.item, *sources) if not one.complete), entry.item)
-    review = entry.item.review
+    review = _standing(entry, episodes)
     if review is None:
         above = [one.id for one in entry.lineage if one.kind == "episode" and one.id in episodes]
         reviews = [one.review for one in (*sources, *(episodes[name].item for name in above))]
-        review = next((one for one in reviews if one and one.verdict == "rejected"), None)
+        review = next((one for one in reviews if one and one.spreads), None)
     return entry.having(
         recordings=tuple(names),
         consent=all(one.consent for one in sources) if names else None,
