@@ -204,19 +204,31 @@ def test_requests_of_several_rollouts_go_together_where_the_server_says_so():
     np.testing.assert_allclose(results[4], results[1], rtol=0, atol=1e-6)
 
 
+def wait_for_others(policy, count):
+    for _ in range(2000):
+        if len(policy._server._waiting) == count:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{len(policy._server._waiting)} requests wait, expected {count}")
+
+
 def test_a_batch_that_fails_fails_for_all_and_the_next_one_works():
-    asked = []
+    is_asked, may_answer = threading.Event(), threading.Event()
 
     def answer(request):
-        asked.append(request)
-        time.sleep(0.3)
+        is_asked.set()
+        assert may_answer.wait(20)
         if "batch" in request:
             return {"batch": [linear(request["batch"][0])]}
         return linear(request)
 
     with policy_server(answer, max_batch=8) as url, ThreadPoolExecutor(4) as threads:
         policies = [OpenPiPolicy(url) for _ in range(4)]
-        pending = [threads.submit(one.act, observation()) for one in policies]
+        pending = [threads.submit(policies[0].act, observation())]
+        assert is_asked.wait(20)
+        pending += [threads.submit(one.act, observation()) for one in policies[1:]]
+        wait_for_others(policies[0], 3)
+        may_answer.set()
         errors = [future.exception(20) for future in pending]
         # The first goes alone; the others wait for it, and are answered short.
         assert sum(error is None for error in errors) == 1
