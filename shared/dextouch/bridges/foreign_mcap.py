@@ -159,7 +159,7 @@ class _Readings:
                 self._survey.refuse(topic, "calibration", reason)
 
 
-def _decoder_of(encoding: str, schema: Schema | None) -> Decoder | str:
+def _decoder_of(encoding: str, schema: "Schema | None") -> Decoder | str:
     """Function that decodes messages to plain values, or the reason why there is none."""
     if schema is not None and len(schema.data) > MAX_SCHEMA_BYTES:
         return f"schema of more than {MAX_SCHEMA_BYTES} bytes"
