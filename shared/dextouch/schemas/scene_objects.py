@@ -1,5 +1,6 @@
 """Schemas of the files that describe the objects of tasks, and say where they were clicked."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -37,7 +38,7 @@ _UNIT = 1e-3
 
 
 def _is_turned(pose: Pose) -> Pose:
-    norm = sum(value**2 for value in pose[3:]) ** 0.5
+    norm = math.hypot(*pose[3:])
     if abs(norm - 1.0) > _UNIT:
         raise ValueError(f"got a quaternion (w x y z) of length {norm:.4g}, expected 1")
     return pose
