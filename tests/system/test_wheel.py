@@ -14,14 +14,13 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.system.wheel_environment import NAME, ROOT, build, own_packages
+from tests.system.wheel_environment import MAX_WHEEL_BYTES, NAME, ROOT, build, own_packages
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 SERVICES = {
     *("episode_store", "alignment", "acquisition", "twin", "world_model", "studies", "dashboard")
 }
-MAX_WHEEL_BYTES = 3_000_000
 # Of a machine that is busy with other things; the solver may be compiled first.
 READY_LIMIT_S = 900
 # A program of a user, with one mistake.
