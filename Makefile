@@ -118,7 +118,7 @@ fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, commits, tags and builds the wheel in dist
+release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, builds the wheels in dist, commits and tags
 	$(BIN)/python deploy/release.py $(VERSION)
 
 vendor:                  ## fetch the vendored files of the pages again (needs npm); git diff shows whether they changed

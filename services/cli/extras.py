@@ -6,15 +6,15 @@ from dextouch.installation import install_command
 # Import names; if several extras provide a package, the most relevant one has it.
 _PACKAGES = {
     "store": "zarr zstandard google_crc32c av structlog",
-    "station": "serial fastcrc hid usb cv2",
+    "station": "serial fastcrc hid hidraw usb cv2",
     "serve": "fastapi uvicorn uvloop httptools rich redis httpx pydantic_settings "
-    "prometheus_client jinja2 websockets shtab",
+    "prometheus_client jinja2 markdown_it websockets shtab",
     "align": "scipy numba",
     "model": "torch safetensors PIL",
     "full": "diffusers transformers",
     "twin": "mujoco",
     "gym": "gymnasium",
-    "export": "pyarrow mcap mcap_ros2 foxglove_schemas_protobuf",
+    "export": "pyarrow mcap mcap_ros2 lz4 foxglove_schemas_protobuf google",
     "rerun": "rerun",
     "s3": "obstore",
     "scale": "ray",

@@ -24,6 +24,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import DexTouchError, LimitExceededError, NotFoundError, UnavailableError
 from dextouch.frozen_model import FrozenModel, example
+from dextouch.installation import install_command
 from dextouch.schemas import StoredItem
 from dextouch.serving import JSON, KIB, JsonBody, StreamedResponse, takes
 from services.episode_store.keys import MAY_READ
@@ -38,6 +39,8 @@ BUSY_RETRY_S: Final = 5
 # More than any limit of a service, so that its message about the limit is the one that is seen.
 MAX_ITEMS: Final = 10_000
 ESTIMATE: Final = "x-dextouch-estimated-bytes"
+# Of those that the extra `export` brings, what MCAP files need.
+_PACKAGES: Final = ("mcap", "foxglove_schemas_protobuf", "lz4")
 COMMAND: Final = "`dextouch export --format mcap` on the store's computer has no limit"
 
 
@@ -86,10 +89,11 @@ class Downloads:
             UnavailableError: the packages of the extra `export` are missing.
             StorageError: an item is damaged.
         """
-        if find_spec("mcap") is None or find_spec("foxglove_schemas_protobuf") is None:
+        absent = [name for name in _PACKAGES if find_spec(name) is None]
+        if absent:
             raise UnavailableError(
-                "downloads need packages that this store was installed without: pip install "
-                "'dextouch-wm[export]'"
+                "downloads need packages that this store was installed without, such as "
+                f"{absent[0]}: {install_command('export')}"
             )
         most = self._settings.max_download_items
         items = list(dict.fromkeys(wanted.items))

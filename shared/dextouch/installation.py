@@ -27,14 +27,11 @@ def install_command(extra: str) -> str:
 
     The installer's record (PEP 610, direct_url.json) tells of a checkout, a wheel file or a
     repository; without one the package came from an index. Of a wheel file that is gone, the
-    command names the packages of the extra. Without an installation, as with PYTHONPATH, it is that
-    of the checkout.
+    command names the packages of the extra. Weights, which extras with networks need, are taken
+    from the same place. Without an installation, as with PYTHONPATH, it is that of the checkout.
     """
-    from importlib import metadata  # of a cost that most commands can do without
-
-    try:
-        installed = metadata.distribution(NAME)
-    except metadata.PackageNotFoundError:
+    installed = _installed()
+    if installed is None:
         return pip_install("-e", f"{Path(__file__).parents[2]}[{extra}]")
     record = installed.read_text("direct_url.json")
     origin: dict[str, Any] | None = None if record is None else json.loads(record)
@@ -46,12 +43,8 @@ def pip_install(*arguments: str) -> str:
 
     It names this Python where another environment is active.
     """
-    from importlib import metadata
-
-    try:
-        installer = metadata.distribution(NAME).read_text("INSTALLER") or ""
-    except metadata.PackageNotFoundError:
-        installer = ""
+    installed = _installed()
+    installer = (installed and installed.read_text("INSTALLER")) or ""
     if installer.strip() == "uv":
         is_active = os.environ.get("VIRTUAL_ENV", "") == sys.prefix
         start = ["uv", "pip", "install", *([] if is_active else ["--python", sys.executable])]
@@ -62,27 +55,45 @@ def pip_install(*arguments: str) -> str:
     return shlex.join([*start, *arguments])
 
 
+def _installed() -> "Distribution | None":
+    from importlib import metadata  # of a cost that most commands can do without
+
+    try:
+        return metadata.distribution(NAME)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def _arguments(installed: "Distribution", origin: dict[str, Any] | None, extra: str) -> list[str]:
     """Arguments of `pip install`."""
     wanted = f"{NAME}[{extra}]"
     if origin is None:
         return [wanted]
     url: str = origin["url"]
+    packages = _packages_of(installed, extra)
+    others = [package for package in packages if not package.startswith(WEIGHTS)]
+    needs_weights = len(others) < len(packages)
     if "dir_info" in origin:
-        folder, brought = _path_of(url), _packages_of(installed, extra)
+        folder = _path_of(url)
         if origin["dir_info"].get("editable"):
             return ["-e", f"{folder}[{extra}]"]
-        weights = [str(folder / "weights")] if any(b.startswith(WEIGHTS) for b in brought) else []
-        return [*weights, f"{folder}[{extra}]"]
+        return [*([str(folder / "weights")] if needs_weights else []), f"{folder}[{extra}]"]
     if "vcs_info" in origin:
         vcs = origin["vcs_info"]
         url = f"{vcs['vcs']}+{url}@{vcs['commit_id']}"
-    wheel = _path_of(url) if url.startswith("file:") else None
-    if wheel is None or wheel.is_file():
-        # Other wheels of the release lie beside it.
-        beside = ["--find-links", str(wheel.parent)] if wheel else []
-        return [*beside, f"{wanted} @ {url}"]
-    return _packages_of(installed, extra) or [wanted]
+    weights = [f"{WEIGHTS} @ {_weights_beside(url)}"] if needs_weights else []
+    if not url.startswith("file:") or _path_of(url).is_file():
+        return [*weights, f"{wanted} @ {url}"]
+    return [*weights, *others] or [wanted]
+
+
+def _weights_beside(url: str) -> str:
+    """Where the weights are: the wheel beside that of the code, or a folder of its repository."""
+    place, slash, name = url.partition("?")[0].rpartition("/")
+    if not name.endswith(".whl"):
+        return f"{url}#subdirectory=weights"
+    own, dash, rest = name.partition("-")
+    return f"{place}{slash}{own}_weights{dash}{rest}"
 
 
 def _packages_of(installed: "Distribution", extra: str) -> list[str]:

@@ -17,6 +17,8 @@ Requires-Dist: numpy>=2.2
 Requires-Dist: av<20,>=15; extra == 'store'
 Requires-Dist: uvloop>=0.22; (sys_platform != 'win32') and extra == 'serve'
 Requires-Dist: zarr<4,>=3.1; extra == 'store'
+Requires-Dist: torch<3,>=2.7; extra == 'model'
+Requires-Dist: dextouch-wm-weights==0.1.0; extra == 'model'
 """
 ROOT = Path(__file__).parents[2]
 
@@ -74,14 +76,63 @@ def test_each_way_of_installing_has_its_command(installed, origin, command):
     assert installation.install_command("store") == command
 
 
-def test_a_wheel_is_named_with_the_folder_of_the_release(installed, tmp_path):
+def test_wheels_of_a_folder_are_named(installed, tmp_path):
     wheel = tmp_path / "dist/dextouch_wm-0.1.0-py3-none-any.whl"
     wheel.parent.mkdir()
     wheel.touch()
     installed({"url": wheel.as_uri(), "archive_info": {}})
-    assert installation.install_command("store") == (
-        f"pip install --find-links {wheel.parent} 'dextouch-wm[store] @ {wheel.as_uri()}'"
+    place = wheel.as_uri()
+    assert installation.install_command("store") == f"pip install 'dextouch-wm[store] @ {place}'"
+    weights = place.replace("dextouch_wm-", "dextouch_wm_weights-")
+    assert installation.install_command("model") == (
+        f"pip install 'dextouch-wm-weights @ {weights}' 'dextouch-wm[model] @ {place}'"
     )
+
+
+_WHEEL = "dextouch_wm-0.1.0-py3-none-any.whl"
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [
+        (None, "pip install 'dextouch-wm[model]'"),
+        # An editable installation reads the weights of the checkout.
+        (
+            {"url": "file:///home/ada/touch", "dir_info": {"editable": True}},
+            "pip install -e '/home/ada/touch[model]'",
+        ),
+        (
+            {"url": "file:///home/ada/touch", "dir_info": {}},
+            "pip install /home/ada/touch/weights '/home/ada/touch[model]'",
+        ),
+        (
+            {"url": "https://example.org/d.git", "vcs_info": {"vcs": "git", "commit_id": "79be15"}},
+            "pip install "
+            "'dextouch-wm-weights @ git+https://example.org/d.git@79be15#subdirectory=weights' "
+            "'dextouch-wm[model] @ git+https://example.org/d.git@79be15'",
+        ),
+        (
+            {"url": f"https://example.org/a/{_WHEEL}?key=a/b", "archive_info": {}},
+            "pip install 'dextouch-wm-weights @ "
+            "https://example.org/a/dextouch_wm_weights-0.1.0-py3-none-any.whl' "
+            f"'dextouch-wm[model] @ https://example.org/a/{_WHEEL}?key=a/b'",
+        ),
+        (
+            {"url": "https://example.org/d.zip", "archive_info": {}},
+            "pip install 'dextouch-wm-weights @ https://example.org/d.zip#subdirectory=weights' "
+            "'dextouch-wm[model] @ https://example.org/d.zip'",
+        ),
+        # The wheel is gone; pip names the one of the weights, if that is gone as well.
+        (
+            {"url": f"file:///tmp/gone/{_WHEEL}", "archive_info": {}},
+            "pip install 'dextouch-wm-weights @ "
+            "file:///tmp/gone/dextouch_wm_weights-0.1.0-py3-none-any.whl' 'torch<3,>=2.7'",
+        ),
+    ],
+)
+def test_weights_come_from_where_the_package_came_from(installed, origin, command):
+    installed(origin)
+    assert installation.install_command("model") == command
 
 
 def test_markers_other_than_the_extra_are_left_to_pip(installed):

@@ -15,6 +15,7 @@ pytest.importorskip("mcap", reason="mcap is not installed: pip install '.[export
 
 from dextouch.bridges.mcap import import_mcap
 from dextouch.episodes import EpisodeStore
+from dextouch.installation import install_command
 from dextouch.schemas import Review
 from services.episode_store import downloads
 from services.episode_store.app import create_app
@@ -113,11 +114,12 @@ async def test_refusals_have_a_reason(connect, store, changes, wanted, status, w
         assert "dextouch export --format mcap" in answer.json()["detail"]
 
 
-async def test_a_store_without_the_packages_says_which(connect, store, monkeypatch):
-    monkeypatch.setattr(downloads, "find_spec", lambda _: None)
+@pytest.mark.parametrize("absent", ["mcap", "lz4", "foxglove_schemas_protobuf"])
+async def test_a_store_without_the_packages_says_which(connect, store, monkeypatch, absent):
+    monkeypatch.setattr(downloads, "find_spec", lambda name: None if name == absent else name)
     answer = await connect().post("/v1/downloads", json=items("one"))
     assert answer.status_code == 503
-    assert "dextouch-wm[export]" in answer.json()["detail"]
+    assert answer.json()["detail"].endswith(f"such as {absent}: {install_command('export')}")
 
 
 async def ask(app, body, sent, *, leave_after):

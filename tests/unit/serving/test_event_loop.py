@@ -1,4 +1,4 @@
-"""Services run on uvloop, however they are started, and on a version of uvicorn that was tested."""
+"""Services run on uvloop, however they are started, and on versions that were tested."""
 
 import asyncio
 import re
@@ -47,11 +47,12 @@ def test_all_services_of_up_run_on_uvloop(app):
     assert answers == ["uvloop"]
 
 
-def test_a_uvicorn_that_was_not_tested_is_not_installed():
-    # Limits of connections subclass its protocols, which it may change in any release.
+@pytest.mark.parametrize("name", ["uvicorn", "websockets"])
+def test_versions_that_were_not_tested_are_not_installed(name):
+    # Limits of connections subclass and set what is not public and may change in any release.
     text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
     asked = map(Requirement, tomllib.loads(text)["project"]["optional-dependencies"]["serve"])
-    (uvicorn,) = [one.specifier for one in asked if one.name == "uvicorn"]
-    assert uvicorn.contains(version("uvicorn"))
-    major, minor = map(int, re.match(r"(\d+)\.(\d+)", version("uvicorn")).groups())
-    assert not uvicorn.contains(f"{major}.{minor + 1}.0")
+    (wanted,) = [one.specifier for one in asked if one.name == name]
+    assert wanted.contains(version(name))
+    major, minor = map(int, re.match(r"(\d+)\.(\d+)", version(name)).groups())
+    assert not wanted.contains(f"{major}.{minor + 1}.0")
