@@ -1,4 +1,5 @@
 from .api_page import file_router as file_router
+from .api_page import page_headers as page_headers
 from .app import create_service_app as create_service_app
 from .child_process import Answer as Answer
 from .child_process import ChildProcess as ChildProcess
