@@ -275,11 +275,10 @@ class _Server:
     def _receive(self, connection: ClientConnection) -> dict[str, Any]:
         with self._lost_on_errors():
             answer = connection.recv(self._timeout_s)
-        if isinstance(answer, str):
-            # openpi sends errors, tracebacks included, as text, and closes the connection.
-            self._disconnect()
-            raise InvalidInputError(f"policy server {self._url}: reported {answer[-2000:]}")
-        return unpack_openpi(answer, max_bytes=MAX_ANSWER_BYTES)
+            if isinstance(answer, str):
+                # openpi sends errors, tracebacks included, as text, and closes the connection.
+                raise InvalidInputError(f"policy server {self._url}: reported {answer[-2000:]}")
+            return unpack_openpi(answer, max_bytes=MAX_ANSWER_BYTES)
 
     @contextmanager
     def _lost_on_errors(self) -> Iterator[None]:
