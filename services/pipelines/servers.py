@@ -139,6 +139,8 @@ def stop_on_signals(stop: asyncio.Event) -> None:
     def on_signal(number: signal.Signals) -> None:
         stop.set()
         loop.remove_signal_handler(number)
+        # Python's own handler of SIGINT would print what each service was doing.
+        signal.signal(number, signal.SIG_DFL)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, on_signal, number)

@@ -12,7 +12,14 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
 from dextouch.free_text import FreeLines
 from dextouch.frozen_model import FrozenModel, example
-from dextouch.serving import RequireScope, ServedFolder, create_service_app, file_router, serve
+from dextouch.serving import (
+    RequireScope,
+    ServedFolder,
+    create_service_app,
+    file_router,
+    page_headers,
+    serve,
+)
 from services.evaluation.rating.marks import (
     Judgement,
     Mark,
@@ -28,14 +35,6 @@ from services.evaluation.settings import RatingSettings
 STATIC: Final = FilePath(__file__).parent / "static"
 FILES: Final = {"/": "rate.html"} | {
     f"/rate.{kind}": f"rate.{kind}" for kind in ("js", "css", "svg")
-}
-PAGE_HEADERS: Final = {
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
-        "connect-src 'self'; form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
-    ),
-    "x-content-type-options": "nosniff",
-    "cache-control": "no-store",
 }
 Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
 
@@ -102,7 +101,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     text = "Marks given since the start, with corrections."
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
-    page = file_router(STATIC, FILES, PAGE_HEADERS)
+    page = file_router(STATIC, FILES, page_headers(images="'self' blob:"))
     routers = [page, rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),

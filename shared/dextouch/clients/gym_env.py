@@ -1,30 +1,36 @@
 """Gymnasium environments of a served world, single and vector; one step is one action chunk.
 
-    env = gymnasium.make("dextouch/Rollout-v0", url=url, world="twin", task=…, instruction=…)
+    name = "dextouch.clients.gym_env:dextouch/Rollout-v0"
+    env = gymnasium.make(name, url=url, world="twin", task=…, instruction=…)
     observation, info = env.reset(seed=3)
     observation, reward, terminated, truncated, info = env.step(actions)  # [chunk_steps, 67]
 
-Importing this module registers the name. `WorldEnv` is the same for a client of your own.
+Importing this module, as the first part of the name does, registers the rest of it. `WorldEnv` is
+the same for a client of your own.
 `WorldVectorEnv` steps several at the same time, so that the service computes them in batches.
 Gymnasium's autoreset would draw new starts by itself, but policies are compared from matched ones;
-so it is disabled there, and every reset has its seeds.
+so it is disabled there, and every reset has its seeds. `gymnasium.make_vec` makes one, too.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from typing import Any, Final, TypeVar, cast
 
 import gymnasium
 import numpy as np
+import structlog
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from jaxtyping import Bool, Float, Float64
 
 from dextouch.clients.rollouts import Rollout, RolloutClient
-from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
+from dextouch.errors import EndedError, InvalidInputError, UnavailableError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, POSE_SLICES
 from dextouch.schemas import Observation, WorldDescription
+
+logger = structlog.get_logger(__name__)
 
 # Bounds of the action space. They limit its samples, not what worlds accept.
 MAX_REACH_M = 2.0
@@ -152,9 +158,13 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         self._end()
 
     def _end(self) -> None:
-        if self._rollout is not None:
-            self._rollout.close()
-            self._rollout = None
+        rollout, self._rollout = self._rollout, None
+        if rollout is not None:
+            try:
+                rollout.close()
+            except UnavailableError as error:
+                # The service ends rollouts that nobody uses, or is gone with them.
+                logger.warning("rollout_not_closed", rollout=rollout.id, error=error.message)
 
     @staticmethod
     def _info(rollout: Rollout) -> dict[str, Any]:
@@ -178,16 +188,35 @@ class RolloutEnv(WorldEnv):
         api_key: str | None = None,
         **options: Any,  # noqa: ANN401 - as WorldEnv
     ) -> None:
-        super().__init__(RolloutClient(url, api_key=api_key), **options)
+        with ExitStack() as opened:
+            super().__init__(opened.enter_context(RolloutClient(url, api_key=api_key)), **options)
+            opened.pop_all()
 
     def close(self) -> None:
         """End the running rollout, and close the client."""
-        super().close()
-        self.client.close()
+        with self.client:
+            super().close()
+
+
+def make_vector(
+    *,
+    num_envs: int,
+    **options: Any,  # noqa: ANN401 - as RolloutEnv
+) -> "WorldVectorEnv":
+    """Environments with clients of their own, as `gymnasium.make_vec` makes them."""
+    with ExitStack() as opened:
+        envs = [opened.enter_context(closing(RolloutEnv(**options))) for _ in range(num_envs)]
+        vector = WorldVectorEnv(envs)
+        opened.pop_all()
+    return vector
 
 
 if ENV_ID not in gymnasium.registry:
-    gymnasium.register(ENV_ID, entry_point=f"{__name__}:{RolloutEnv.__name__}")
+    gymnasium.register(
+        ENV_ID,
+        entry_point=f"{__name__}:{RolloutEnv.__name__}",
+        vector_entry_point=f"{__name__}:{make_vector.__name__}",
+    )
 
 
 class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
@@ -196,8 +225,8 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
     Autoreset is disabled: once an episode has ended, its environment must be reset before the next
     step, by `options={"reset_mask": terminations | truncations}`. If a reset or a step raises, some
     environments may have done it and others not; reset all of them. Spaces are equal, and each has
-    a client of its own, which is not thread-safe; they are closed with this one, their clients are
-    not.
+    a client of its own, which is not thread-safe; they are closed with this one, clients of a
+    `WorldEnv` are not.
     """
 
     def __init__(self, envs: Sequence[WorldEnv]) -> None:
@@ -270,6 +299,8 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
                 f"step: environments {np.flatnonzero(self._needs_reset).tolist()} have no episode; "
                 "reset them first, with options={'reset_mask': …}"
             )
+        if len(actions) != self.num_envs:
+            raise InvalidInputError(f"actions: got {len(actions)} chunks, expected {self.num_envs}")
         self._needs_reset[:] = True
         every = range(self.num_envs)
         results = self._together(lambda i: self._envs[i].step(actions[i]), every)
@@ -286,8 +317,8 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
 
     def close_extras(self) -> None:
         """End the running rollouts."""
-        self._together(lambda i: self._envs[i].close(), range(self.num_envs))
-        self._threads.shutdown()
+        with self._threads:
+            self._together(lambda i: self._envs[i].close(), range(self.num_envs))
 
     def _chosen(self, mask: object) -> list[int]:
         if mask is None:

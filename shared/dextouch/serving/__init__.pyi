@@ -1,4 +1,5 @@
 from .api_page import file_router as file_router
+from .api_page import page_headers as page_headers
 from .app import create_service_app as create_service_app
 from .child_process import Answer as Answer
 from .child_process import ChildProcess as ChildProcess
@@ -21,6 +22,7 @@ from .guard import MSGPACK as MSGPACK
 from .guard import OCTETS as OCTETS
 from .guard import JsonBody as JsonBody
 from .guard import RequireScope as RequireScope
+from .guard import decoded as decoded
 from .guard import media_type as media_type
 from .guard import takes as takes
 from .keys import AccessControl as AccessControl

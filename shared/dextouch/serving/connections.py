@@ -67,8 +67,8 @@ def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[
     """Options of uvicorn for a limited number of connections with clients that are not too slow.
 
     A connection without a request makes room for a new one, the oldest first; if there is none, new
-    ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
-    the response; only time at less than 16 KiB/s counts.
+    ones get status 503. A client may take `client_timeout_s` in all to send a request, or a message
+    of a WebSocket, and to read the response; only time at less than 16 KiB/s counts.
     """
     limits = _Limits(max_connections, client_timeout_s)
     return {
@@ -148,7 +148,41 @@ class _Watched(asyncio.Protocol):
 
 
 class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
-    """WebSocket whose client must read; uvicorn's pings find those that are gone."""
+    """WebSocket whose client must read, and end each message that it begins.
+
+    uvicorn's pings find clients that are gone.
+    """
+
+    def __init__(self, *, limits: _Limits, **given: Any) -> None:  # noqa: ANN401 - uvicorn's
+        super().__init__(limits=limits, **given)
+        # Frames of a message that has not ended, joined: each by itself may be a single byte.
+        self._begun = bytearray()
+        self._unfinished_bytes = 0
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        buffered = len(self.conn.reader.buffer)
+        unfinished = buffered + len(self._begun) + sum(len(frame) for frame in self.frames)
+        # Only what is of a message counts: pings could be sent for ever.
+        if not self.transport.get_write_buffer_size():
+            self._moved_bytes += max(0, unfinished - self._unfinished_bytes)
+        self._unfinished_bytes = unfinished
+
+    def handle_cont(self, event: Any) -> None:  # noqa: ANN401 - of websockets
+        self._begun += b"".join([*self.frames, event.data])
+        self.frames = []
+        if event.fin:
+            self.frames = [bytes(self._begun)]
+            self._begun.clear()
+            self.send_receive_event_to_app()
+
+    def send_receive_event_to_app(self) -> None:
+        super().send_receive_event_to_app()
+        if not self.transport.get_write_buffer_size():
+            self._left_s = self._limits.client_timeout_s
+
+    def _waits_for_request(self) -> bool:
+        return self._unfinished_bytes > 0 and not self.read_paused
 
     def handle_connect(self, event: Any) -> None:  # noqa: ANN401 - of websockets
         super().handle_connect(event)

@@ -330,8 +330,17 @@ class GuardMiddleware:
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
-# Bodies above it are decoded in a thread, so that others need not wait.
+DecodedT = TypeVar("DecodedT")
+
+# What is larger is decoded in a thread, so that others need not wait.
 MAX_INLINE_BYTES = 64 * KIB
+
+
+async def decoded(decode: Callable[[bytes], DecodedT], body: bytes) -> DecodedT:
+    """What `decode` makes of a body or message, in a thread for one of more than 64 KiB."""
+    if len(body) <= MAX_INLINE_BYTES:
+        return decode(body)
+    return await run_in_threadpool(decode, body)
 
 
 @dataclass(frozen=True)
@@ -345,10 +354,7 @@ class JsonBody(Generic[ModelT]):
 
     async def __call__(self, request: Request) -> ModelT:
         """The body; raises RequestValidationError, or InvalidInputError for too many mistakes."""
-        body = await request.body()
-        if len(body) <= MAX_INLINE_BYTES:
-            return self._decode(body)
-        return await run_in_threadpool(self._decode, body)
+        return await decoded(self._decode, await request.body())
 
     def _decode(self, body: bytes) -> ModelT:
         try:

@@ -14,11 +14,11 @@ is answered with a map, or with text that says why it was refused (docs/rollout_
 
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from fastapi import APIRouter
-from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dextouch.errors import DexTouchError, InvalidInputError
@@ -30,7 +30,7 @@ from dextouch.schemas import (
     start_of_parts,
     validate_fields,
 )
-from dextouch.serving import MAX_WEBSOCKET_BYTES, accept_messages_of
+from dextouch.serving import MAX_WEBSOCKET_BYTES, accept_messages_of, decoded
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
@@ -41,8 +41,6 @@ CLIENT: Final = "openpi"
 _REFUSED: Final = 1008
 _FORMS: Final = ("start", "resume", "actions", "end")
 _KNOWN: Final = {*_FORMS, "chunk", "return"}
-# Longer messages are decoded in a thread, so that other rollouts need not wait.
-_MAX_INLINE_BYTES: Final = MAX_WEBSOCKET_BYTES
 
 
 def largest_message(worlds: Sequence[WorldDescription], *, max_body_bytes: int) -> int:
@@ -106,10 +104,7 @@ class _Session:
         """Carry out one message; raises DexTouchError without a change of the rollout."""
         if data is None:
             raise InvalidInputError("message: got text, expected msgpack in a binary message")
-        if len(data) > _MAX_INLINE_BYTES:
-            message = await run_in_threadpool(unpack_openpi, data, max_bytes=self._max_bytes)
-        else:
-            message = unpack_openpi(data, max_bytes=self._max_bytes)
+        message = await decoded(partial(unpack_openpi, max_bytes=self._max_bytes), data)
         given = [name for name in _FORMS if name in message]
         known = set(_KNOWN)
         if "start" in given:

@@ -44,6 +44,7 @@ from dextouch.serving import (
     OCTETS,
     AccessControl,
     RequireScope,
+    decoded,
     media_type,
     takes,
     timed,
@@ -57,8 +58,6 @@ MAX_BODY_BYTES = 2**28
 MAX_CHUNK_BYTES = 2**20
 # Of a chunk as JSON; more than any world takes at once.
 MAX_ROWS = 4096
-# Bodies above it are decoded in a thread, so that others need not wait.
-MAX_INLINE_BYTES = 64 * KIB
 
 SCOPE: Final = "rollout"
 WATCH_SCOPE: Final = "watch"
@@ -294,9 +293,7 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
     kind, parameters = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == JSON:
-        if len(body) > MAX_INLINE_BYTES:
-            return await run_in_threadpool(_actions_from_json, body)
-        return _actions_from_json(body)
+        return await decoded(_actions_from_json, body)
     return actions_from(body, parameters.get("dtype", ""))
 
 

@@ -3,8 +3,10 @@
 import sys
 import threading
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -15,8 +17,8 @@ from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dextouch.clients import RolloutClient
-from dextouch.clients.gym_env import ENV_ID, WorldEnv, WorldVectorEnv
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.clients.gym_env import ENV_ID, RolloutEnv, WorldEnv, WorldVectorEnv, make_vector
+from dextouch.errors import InvalidInputError, UnavailableError, UnknownNameError
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
@@ -282,6 +284,42 @@ def test_each_of_the_vector_begins_from_its_own_observation(make_envs):
     env.close()
 
 
+@pytest.fixture
+def closed(monkeypatch):
+    """Clients that were closed."""
+    clients, close = [], RolloutClient.close
+    monkeypatch.setattr(RolloutClient, "close", lambda one: (clients.append(one), close(one)))
+    return clients
+
+
+def test_an_environment_that_cannot_be_made_leaves_no_client_open(url, closed):
+    for num_failed, make in enumerate([RolloutEnv, partial(make_vector, num_envs=2)], start=1):
+        with pytest.raises(UnknownNameError, match="moon"):
+            make(url=url, world="moon", **ASKED)
+        assert len(closed) == num_failed
+
+
+def test_everything_is_closed_where_the_service_is_gone(url, closed, monkeypatch):
+    vector = make_vector(num_envs=2, url=url, world="sum", chunk_steps=4, **ASKED)
+    vector.reset(seed=0)
+    gone = Mock(side_effect=UnavailableError("the service does not answer"))
+    monkeypatch.setattr("dextouch.clients.rollouts.Rollout.close", gone)
+    vector.close()
+    assert (gone.call_count, len(closed)) == (2, 2)
+    assert vector._threads._shutdown
+
+
+def test_make_vec_gives_starts_that_are_asked_for(url):
+    given = {"url": url, "world": "sum", "chunk_steps": 4, "max_chunks": 1} | ASKED
+    env = gymnasium.make_vec(f"dextouch.clients.gym_env:{ENV_ID}", num_envs=2, **given)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    env.reset(seed=[3, 4])
+    env.step(np.stack([actions(4)] * 2))
+    with pytest.raises(InvalidInputError, match=r"environments \[0, 1\] have no episode"):
+        env.step(np.stack([actions(4)] * 2))
+    env.close()
+
+
 def test_wrong_use_of_the_vector_is_named(make_envs, vector):
     envs = make_envs(2)
     with pytest.raises(InvalidInputError, match="same client"):
@@ -290,13 +328,20 @@ def test_wrong_use_of_the_vector_is_named(make_envs, vector):
         WorldVectorEnv([envs[0], *make_envs(1, chunk_steps=8)])
     with pytest.raises(InvalidInputError, match=r"environments \[0, 1, 2\] have no episode"):
         vector.step(np.stack([actions(4)] * 3))
+    vector.reset(seed=5)
+    for num_chunks in (0, 2, 4):
+        with pytest.raises(InvalidInputError, match=f"got {num_chunks} chunks, expected 3"):
+            vector.step(np.zeros((num_chunks, 4, 67)))
+    # None has advanced.
+    _, _, _, _, infos = vector.step(np.stack([actions(4)] * 3))
+    assert infos["last_step"].tolist() == [4, 4, 4]
     with pytest.raises(UnknownNameError, match="valid: inits, reset_mask"):
         vector.reset(options={"init": None})
     for seed in ([1, 2], range(4)):
         with pytest.raises(InvalidInputError, match=r"seed: got \d, expected 3"):
             vector.reset(seed=seed)
     with pytest.raises(InvalidInputError, match="none at the first reset"):
-        vector.reset(options={"reset_mask": np.array([True, False, True])})
+        WorldVectorEnv(make_envs(3)).reset(options={"reset_mask": np.array([True, False, True])})
     for mask in ([True, False], [1, 0, 1], [False] * 3, "all"):
         with pytest.raises(InvalidInputError, match="reset_mask: got"):
             vector.reset(options={"reset_mask": mask})
