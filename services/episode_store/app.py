@@ -76,6 +76,11 @@ class PeriodicThread(ABC):
                 if error.message != problem:
                     logger.error(self._event, reason=error.message)  # noqa: TRY400
                 problem = error.message
+            except Exception as error:
+                # A mistake of ours, or of a driver, must not end the thread for good.
+                if repr(error) != problem:
+                    logger.exception(self._event)
+                problem = repr(error)
             self._stopping.wait(self._period_s)
 
 

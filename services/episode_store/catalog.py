@@ -3,7 +3,7 @@
 import json
 import sqlite3
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
@@ -37,6 +37,7 @@ from services.episode_store.catalog_index import CatalogIndex, Progress
 from services.episode_store.filters import (
     EARLIEST,
     NO_WEIGHT,
+    SORT_COLUMNS,
     WEIGHTS,
     CatalogFilter,
     Condition,
@@ -73,10 +74,7 @@ MAX_LIMIT: Final = 1 << 60
 Found = tuple[int, int | None]
 # Kind and id of an item.
 Name = tuple[str, str]
-_KEYS: Final[Mapping[str, str]] = {
-    "id": "''", "time": "i.at_key", "duration": "i.duration_key", "task": "i.task",
-    "operator": "coalesce(i.operator, '')", "station": "coalesce(i.station, '')",
-}  # fmt: skip
+_KEYS: Final = {"id": "''"} | {name: key.format("i.") for name, key in SORT_COLUMNS.items()}
 _BEYOND_LIMIT: Final = number_key(WEIGHTS["beyond_limit"])
 _BODIES: Final = """SELECT i.row, i.kind, i.stands, i.is_compared, b.item, b.review, g.spread
   FROM item i JOIN body b USING (row) JOIN grp g ON g.number = i.grp
@@ -314,7 +312,7 @@ class _Order:
             return where
         later = replace(where, terms=[*where.terms], values=[*where.values])
         sign = "<" if self.page.descending else ">"
-        place = place_of(self.page.after)
+        place = place_of(self.page.after, descending=self.page.descending)
         if self.page.sort == "id" and not place[0]:
             later.add(f"{self.name} {sign} ?", place[1])
         else:

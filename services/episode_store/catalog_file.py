@@ -15,24 +15,25 @@ from typing import Final
 import structlog
 
 from dextouch.episodes.care import CATALOG_FOLDER, remove_catalog
-from services.episode_store.filters import NO_WEIGHT
+from services.episode_store.filters import NO_WEIGHT, SORT_COLUMNS
 
 logger = structlog.get_logger(__name__)
 
 # To be incremented with any change of the tables, or of what is read of an item.
-VERSION: Final = 1
+VERSION: Final = 2
 # How long a process waits for another one that writes: longer than linking 100,000 items takes.
 BUSY_S: Final = 30.0
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-# Keys by which lists are sorted, `name` behind each: of all items of a kind, and of takes.
-_KEYS: Final = {
-    "at": "at_key", "duration": "duration_key", "task": "task",
-    "operator": "coalesce(operator, '')", "station": "coalesce(station, '')",
-}  # fmt: skip
+# Any other error is one of a query.
+_UNUSABLE: Final = (
+    *_DAMAGED, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_PROTOCOL,
+)  # fmt: skip
+# Of all items of a kind, and of takes.
 _INDEXES: Final = "".join(
     f"CREATE INDEX kind_{name} ON item(kind, {key}, name);"
     f"CREATE INDEX take_{name} ON item({key}, name) WHERE is_take;"
-    for name, key in _KEYS.items()
+    for name, key in ((name, column.format("")) for name, column in SORT_COLUMNS.items())
 )
 # `result` has what edits made of an item, `stands` whether one of these is stored.
 # Columns after `is_dirty` are derived from other items (`catalog_rows.relink`). Triggers mark what
@@ -225,6 +226,11 @@ def _is_damage(error: Exception) -> bool:
     return (getattr(error, "sqlite_errorcode", 0) & 0xFF) in _DAMAGED
 
 
+def is_unusable(error: sqlite3.Error) -> bool:
+    """Whether an error is one of the file: damage, no space, no permission, a lock that stays."""
+    return (getattr(error, "sqlite_errorcode", 0) & 0xFF) in _UNUSABLE
+
+
 def _connected(path: Path | str) -> sqlite3.Connection:
     # A user who may only read the folder could not take part in WAL mode.
     connection = sqlite3.connect(
@@ -261,6 +267,17 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
         with suppress(sqlite3.Error):
             connection.execute("ROLLBACK")
         raise
+
+
+@contextmanager
+def snapshot(connection: sqlite3.Connection) -> Iterator[None]:
+    """Read from one state of the file, whatever others write meanwhile."""
+    connection.execute("BEGIN")
+    try:
+        yield
+    finally:
+        with suppress(sqlite3.Error):
+            connection.execute("ROLLBACK")
 
 
 def check_file(path: Path) -> str:

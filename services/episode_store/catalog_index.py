@@ -4,11 +4,13 @@ What is noticed when:
 
 - a look, before each query: items that were committed, deleted, restored or replaced. It costs one
   `stat` while the folder of a kind is unchanged, one listing without a `stat` of each item
-  otherwise; a bucket is listed at most once per BUCKET_PERIOD_NS, by ids only;
+  otherwise; a bucket is listed at most once per BUCKET_PERIOD_NS, by ids only; a look that lists
+  the same although the folder changed is a check: numbers of folders are used again;
 - a check: also reviews and clicks by other processes, files of an item that were exchanged or
   edited by hand (time, size, inode; in a bucket the entity tag), and items of a bucket that were
-  deleted and written again. Each process checks at its first look, the service also once per
-  `check_period_s`, and in a folder of at most ALWAYS_CHECKED items each look that lists it.
+  deleted and written again, and those that could not be read at the last one. Each process checks
+  at its first look, the service also once per `check_period_s`, and in a folder of at most
+  ALWAYS_CHECKED items each look that lists it.
 """
 
 import hashlib
@@ -23,9 +25,21 @@ from typing import Final, NamedTuple, TypeVar
 import structlog
 
 from dextouch.episodes import COMMIT_FILE, KINDS, EpisodeStore, Kind, Stamps, disk_errors
-from dextouch.errors import DexTouchError, NotFoundError, StorageError
-from services.episode_store.catalog_file import CatalogFile, check_file, transaction
-from services.episode_store.catalog_rows import read_row, relink, write_remarks, write_row
+from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError, StorageError
+from services.episode_store.catalog_file import (
+    CatalogFile,
+    check_file,
+    is_unusable,
+    snapshot,
+    transaction,
+)
+from services.episode_store.catalog_rows import (
+    read_remarks,
+    read_row,
+    relink,
+    write_remarks,
+    write_row,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -42,6 +56,7 @@ ALWAYS_CHECKED: Final = 500
 # Items of one transaction: others can write in between, and a kill loses little.
 BATCH: Final = 200
 Progress = Callable[[list[str], str, int], Iterable[str]]
+Write = Callable[[sqlite3.Connection], None]
 
 
 class _Listing(NamedTuple):
@@ -56,7 +71,8 @@ class _Listing(NamedTuple):
 class CatalogIndex:
     """The rows of a store's items; thread-safe.
 
-    A damaged item is omitted and logged once by each process; `verify` reports the damage.
+    An item that cannot be read is omitted until the next check, and logged once by each process;
+    `verify` reports damage.
 
     Args:
         store: whose items they are.
@@ -70,11 +86,14 @@ class CatalogIndex:
         self._file = CatalogFile(store.root, tag)
         self._progress = progress or (lambda items, _what, _total: items)
         self._guard = threading.RLock()
-        # Of this connection: stamps of the rows, those of omitted items, and when it looked.
+        # Of this connection: stamps of the rows, those of omitted items, and when it looked; a mark
+        # is forgotten where something is left to the next look.
         self._known: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
         self._omitted: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
         self._is_checked: dict[Kind, bool] = dict.fromkeys(KINDS, False)
         self._marks: dict[Kind, int | None] = dict.fromkeys(KINDS, None)
+        self._listed: dict[Kind, tuple[int, Mapping[str, int]]] = {kind: (0, {}) for kind in KINDS}
+        self._told: set[tuple[Kind, str, str]] = set()
         self._data_version = 0
 
     def num_items(self, kind: Kind) -> int:
@@ -87,9 +106,13 @@ class CatalogIndex:
         def look_and_read(connection: sqlite3.Connection) -> T:
             for kind in KINDS:
                 self._look(connection, kind)
-            # Also what a check, a killed process or an erasure has left to do.
-            _relink(connection)
-            return query(connection)
+            with snapshot(connection):
+                if not _is_dirty(connection):
+                    return query(connection)
+            # What was changed, or a check, a killed process or an erasure has left to do.
+            with transaction(connection):
+                relink(connection)
+                return query(connection)
 
         return self._run(look_and_read)
 
@@ -99,7 +122,7 @@ class CatalogIndex:
         for kind in KINDS:
             found = self._store.folder_numbers(kind=kind)
             listing = _Listing(kind, known[kind], found, self._store.stamps(found, kind=kind))
-            self._run(partial(self._apply, listing=listing))
+            self._run(partial(self._apply, listing=listing, again=True))
             self._is_checked[kind] = True
 
     def reread(self, kind: Kind, item_id: str) -> None:
@@ -139,7 +162,7 @@ class CatalogIndex:
                     connection = self._connection()
                     result = work(connection)
                 except sqlite3.Error as error:
-                    if is_last:
+                    if is_last or not is_unusable(error):
                         raise
                     self._file.give_up(error)
                 else:
@@ -158,7 +181,11 @@ class CatalogIndex:
                 rows = connection.execute(
                     "SELECT id, folder, content, remarks FROM item WHERE kind = ?", (kind,)
                 )
-                self._known[kind] = {name: Stamps(*stamps) for name, *stamps in rows}
+                known = {name: Stamps(*stamps) for name, *stamps in rows}
+                if self._known[kind].keys() - known.keys():
+                    # An erasure removes rows of items that stay.
+                    self._marks[kind] = None
+                self._known[kind] = known
         self._data_version = version
         return connection
 
@@ -172,28 +199,30 @@ class CatalogIndex:
         )
         if is_current and not is_check:
             return
-        is_check = is_check or (self._is_local and len(self._known[kind]) <= ALWAYS_CHECKED)
         known, found = self._known[kind], self._store.folder_numbers(kind=kind)
-        wanted = (
-            found
-            if is_check
-            else {
-                name: number
-                for name, number in found.items()
-                if name not in known or known[name][0] != number
-            }
-        )
+        wanted = {
+            name: number
+            for name, number in found.items()
+            if name not in known or known[name][0] != number
+        }
+        if self._is_local:
+            last_mark, last_found = self._listed[kind]
+            is_odd = mark != last_mark and found == last_found
+            is_check = is_check or is_odd or len(known) <= ALWAYS_CHECKED
+            self._listed[kind] = mark, found
+        if is_check:
+            wanted = found
         stamps = self._store.stamps(wanted, kind=kind)
         names = known.keys() if is_check else (known.keys() - found.keys()) | wanted.keys()
         before = {name: known[name] for name in names if name in known}
-        self._apply(connection, _Listing(kind, before, found, stamps))
+        is_done = self._apply(connection, _Listing(kind, before, found, stamps), again=is_check)
         if is_check:
             self._is_checked[kind] = True
             if not self._is_local:
                 fact = (kind, int(time.time()))
                 connection.execute("INSERT OR REPLACE INTO fact VALUES (?, ?)", fact)
         is_settled = time.time_ns() - mark > SETTLED_NS if self._is_local else bool(found)
-        self._marks[kind] = mark if is_settled else None
+        self._marks[kind] = mark if is_settled and is_done else None
 
     def _mark(self, kind: Kind) -> int:
         """Stamp of the folder of a kind, 0 without it; of a bucket the time."""
@@ -213,10 +242,18 @@ class CatalogIndex:
         # A clock that went back makes the time of the check one of the future.
         return row is not None and 0 <= time.time() - row[0] < BUCKET_CHECK_PERIOD_S
 
-    def _apply(self, connection: sqlite3.Connection, listing: "_Listing") -> None:
-        """Bring the rows of items up to date; they are linked before the next query."""
+    def _apply(
+        self, connection: sqlite3.Connection, listing: "_Listing", *, again: bool = False
+    ) -> bool:
+        """Bring the rows of items up to date; they are linked before the next query.
+
+        `again` also tries those that could not be read at the last check. Returns whether nothing
+        is left to the next look.
+        """
         kind, before, found, stamps = listing
-        known, omitted = self._known[kind], self._omitted[kind]
+        omitted = {} if again else self._omitted[kind]
+        known = self._known[kind]
+        self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
         # What another thread or process has changed since is left to the next look.
         gone = [
             name for name, one in before.items() if name not in stamps and known.get(name) == one
@@ -230,21 +267,18 @@ class CatalogIndex:
             changed_now = self._progress(changed, f"read {kind}s", len(changed))
         else:
             changed_now = changed
-        done: dict[str, Stamps] = {}
-        writes: list[Callable[[sqlite3.Connection], None]] = []
+        writes: dict[str, Write] = {}
+        is_done = True
         for number, name in enumerate(changed_now, start=1):
             write = self._read(kind, name, stamps[name])
-            if write is not None:
-                writes.append(write)
-                done[name] = stamps[name]
-            elif name in known:
+            if write is not None and write is not _no_row:
+                writes[name] = write
+            elif write is _no_row and name in known:
                 gone.append(name)
             if len(writes) == BATCH or (writes and number == len(changed)):
-                with transaction(connection):
-                    for each in writes:
-                        each(connection)
-                known |= done
-                writes, done = [], {}
+                read = {each: stamps[each] for each in writes}
+                is_done &= self._write(connection, kind, read, writes)
+                writes = {}
         if gone:
             with transaction(connection):
                 connection.executemany(
@@ -252,36 +286,57 @@ class CatalogIndex:
                 )
             for name in gone:
                 known.pop(name, None)
-        self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
+        return is_done
 
-    def _read(
-        self, kind: Kind, name: str, stamps: Stamps
-    ) -> Callable[[sqlite3.Connection], None] | None:
-        """What writes the row of an item; None for one that has none."""
+    def _write(
+        self,
+        connection: sqlite3.Connection,
+        kind: Kind,
+        stamps: Mapping[str, Stamps],
+        writes: Mapping[str, Write],
+    ) -> bool:
+        """Write rows of items that are still as they were read; returns whether all were."""
+        numbers = {name: one.folder for name, one in stamps.items()}
+        with transaction(connection):
+            # What was deleted since must not get a row, after its erasure from this file.
+            now = self._store.stamps(numbers, kind=kind) if self._is_local else stamps
+            done = {name: one for name, one in stamps.items() if now.get(name) == one}
+            for name in done:
+                writes[name](connection)
+        self._known[kind] |= done
+        return len(done) == len(writes)
+
+    def _read(self, kind: Kind, name: str, stamps: Stamps) -> Write | None:
+        """What writes the row of an item; `_no_row`, or None for one that is left as it is."""
         before, store = self._known[kind].get(name), self._store
         try:
             if before is None or before[:2] != stamps[:2]:
                 return partial(write_row, row=read_row(store, kind, name, stamps))
-            review = store.review(name, kind=kind)
-            clicks = store.clicks(name) if kind == "episode" else None
+            review, clicks = read_remarks(store, kind, name)
         except NotFoundError:
             # Deleted while we were listing; one that comes back is read again.
-            return None
+            return _no_row
         except StorageError as error:
             self._omitted[kind][name] = stamps
-            logger.warning("omitted_from_catalog", kind=kind, id=name, reason=error.message)
-            return None
+            told = (kind, name, error.message)
+            if told not in self._told:
+                self._told.add(told)
+                logger.warning("omitted_from_catalog", kind=kind, id=name, reason=error.message)
+            # A disk or a limit of the system changes nothing of what was read before.
+            return _no_row if isinstance(error, CorruptDataError) else None
         return partial(
             write_remarks, name=(kind, name), stamps=stamps, review=review, clicks=clicks
         )
 
 
-def _relink(connection: sqlite3.Connection) -> None:
-    """Finish what changes of rows, a killed process or an erasure have left to do."""
-    changed = connection.execute(
+def _no_row(_: sqlite3.Connection) -> None:
+    """Stands for an item that has no row."""
+
+
+def _is_dirty(connection: sqlite3.Connection) -> bool:
+    """Whether rows were changed that do not fit each other yet."""
+    (found,) = connection.execute(
         "SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)"
         " OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"
-    )
-    if changed.fetchone()[0]:
-        with transaction(connection):
-            relink(connection)
+    ).fetchone()
+    return bool(found)

@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+import structlog
 
 from dextouch.episodes import (
     EpisodeReader,
@@ -16,13 +17,16 @@ from dextouch.episodes import (
     Stamps,
     has_object_poses,
 )
+from dextouch.errors import CorruptDataError
 from dextouch.schemas import EpisodeClicks, EpisodeSummary, LineageEntry, RecordingSummary, Review
 from services.episode_store.filters import (
     NO_WEIGHT,
     WEIGHTS,
+    item_name,
     microseconds,
     number_key,
     time_key,
+    within_calendar,
 )
 from services.episode_store.items import (
     FIGURES,
@@ -32,6 +36,8 @@ from services.episode_store.items import (
     outlier_scores,
     spread_of,
 )
+
+logger = structlog.get_logger(__name__)
 
 # Most items have no findings, or those of one weight.
 _weight_key = lru_cache(maxsize=1 << 12)(number_key)
@@ -89,15 +95,16 @@ class ItemRow:
 def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> ItemRow:
     """Read an item; raises as `EpisodeStore.open`."""
     reader = store.open(item_id) if kind == "episode" else store.recording(item_id)
-    about, review = reader.attributes, store.review(item_id, kind=kind)
+    about = reader.attributes
     summary: EpisodeSummary | RecordingSummary
     if isinstance(reader, EpisodeReader):
         summary, at = _episode(reader), reader.attributes.created_at
     else:
         summary, at = _recording(store, reader), reader.attributes.started_at
+    at = at and within_calendar(at)
     item = item_of(reader, summary, None)
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
-    clicks = store.clicks(item_id) if is_clickable else None
+    review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
     names = (
         "kind", "id", "task", "operator", "station", "domain", "origin", "success", "recovered",
@@ -105,7 +112,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     )  # fmt: skip
     columns: dict[str, object] = {name: getattr(item, name) for name in names}
     columns |= stamps._asdict() | {
-        "name": f"{item_id}/{kind}",
+        "name": item_name(item_id, kind),
         "sha256": reader.content_sha256,
         "at_us": None if at is None else microseconds(at),
         "at_key": time_key(at),
@@ -128,6 +135,22 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     }
     results = () if review is None else review.superseded_by
     return ItemRow(columns, body, about.lineage, about.quality, results)
+
+
+def read_remarks(
+    store: EpisodeStore, kind: Kind, item_id: str
+) -> tuple[Review | None, EpisodeClicks | None]:
+    """Review of an item and clicks of an episode; None, with a line of the log, if damaged."""
+    review, clicks = None, None
+    for name in ("review", "clicks")[: 1 + (kind == "episode")]:
+        try:
+            if name == "review":
+                review = store.review(item_id, kind=kind)
+            else:
+                clicks = store.clicks(item_id)
+        except CorruptDataError as error:
+            logger.warning("remark_unreadable", kind=kind, id=item_id, reason=error.message)
+    return review, clicks
 
 
 def _episode(reader: EpisodeReader) -> EpisodeSummary:

@@ -253,7 +253,7 @@ def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
     if not folder.is_dir() or folder.is_symlink():
         finding = Finding(f"{kind} {folder.name}: is not a folder; move it away", foreign=True)
         return ItemReport(kind, folder.name, findings=(finding,))
-    return inspect_stage(folder) if kind == "stage" else inspect_upload(folder)
+    return inspect_upload(folder) if kind == "upload" else inspect_stage(folder, kind)
 
 
 def _say_report(report: ItemReport) -> None:

@@ -1,8 +1,10 @@
 """HTTP route by which people without a shell get MCAP files of some items: one file, or a zip."""
 
 import json
-import tempfile
+import os
+import shutil
 import threading
+import uuid
 import zipfile
 from collections.abc import Generator, Iterator, Sequence
 from datetime import UTC, datetime
@@ -16,11 +18,14 @@ from fastapi import APIRouter, Depends
 from pydantic import Field
 
 from dextouch.episodes import (
+    DOWNLOADS,
     EpisodeReader,
     EpisodeStore,
     RecordingReader,
+    disk_errors,
     is_rejected,
     kind_of,
+    make_held_folder,
 )
 from dextouch.errors import DexTouchError, LimitExceededError, NotFoundError, UnavailableError
 from dextouch.frozen_model import FrozenModel, example
@@ -73,6 +78,27 @@ class _Collected:
         return taken
 
 
+class _Folder:
+    """Locked folder of one download in its store; a sweep removes those that a kill has left.
+
+    A deletion finds in `items.json` whose data it holds. Raises StorageError.
+    """
+
+    def __init__(self, root: Path, readers: Sequence[Reader]) -> None:
+        self.path = root / DOWNLOADS / uuid.uuid4().hex
+        with disk_errors("begin a download"):
+            self._lock = make_held_folder(self.path)
+            try:
+                (self.path / "items.json").write_text(json.dumps([one.item_id for one in readers]))
+            except BaseException:
+                self.remove()
+                raise
+
+    def remove(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+
 class Downloads:
     """Makes downloads, of limited size and a few at a time."""
 
@@ -87,7 +113,7 @@ class Downloads:
             NotFoundError: an item is not in the store, or all of them were rejected.
             LimitExceededError: too many items or bytes, or downloads at the same time.
             UnavailableError: the packages of the extra `export` are missing.
-            StorageError: an item is damaged.
+            StorageError: an item is damaged, or the disk of the store is full.
         """
         absent = [name for name in _PACKAGES if find_spec(name) is None]
         if absent:
@@ -122,15 +148,19 @@ class Downloads:
                 reason="busy",
                 retry_after_s=BUSY_RETRY_S,
             )
-        return self._response(readers, sum(sizes))
+        try:
+            return self._response(readers, sum(sizes))
+        except BaseException:
+            self._free.release()
+            raise
 
     def _open(self, item: StoredItem) -> Reader:
         opened = self._store.recording if item.kind == "recording" else self._store.open
         return opened(item.id)
 
     def _response(self, readers: Sequence[Reader], num_bytes: int) -> StreamedResponse:
-        folder = tempfile.TemporaryDirectory(prefix="dextouch-download-")
-        pieces = (_archive if len(readers) > 1 else _single)(readers, Path(folder.name))
+        folder = _Folder(self._store.root, readers)
+        pieces = (_archive if len(readers) > 1 else _single)(readers, folder.path)
         name = f"{readers[0].item_id}.mcap"
         if len(readers) > 1:
             name = f"dextouch-{datetime.now(UTC):%Y-%m-%d}-{len(readers)}.zip"
@@ -139,8 +169,8 @@ class Downloads:
         def end() -> None:
             try:
                 pieces.close()
-                folder.cleanup()
             finally:
+                folder.remove()
                 self._free.release()
 
         async def end_in_thread() -> None:

@@ -25,6 +25,11 @@ WEIGHTS: Final = {
     "recovered": 5.0,
     "not_judged": 1.0,
 }
+# Columns by which lists are sorted, `name` behind each, with a place for the name of the table.
+SORT_COLUMNS: Final = {
+    "time": "{}at_key", "duration": "{}duration_key", "task": "{}task",
+    "operator": "coalesce({}operator, '')", "station": "coalesce({}station, '')",
+}  # fmt: skip
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FIGURE = "SELECT value FROM figure JOIN figure_name USING (number) WHERE name = ?"
 EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
@@ -93,7 +98,7 @@ class CatalogFilter(FrozenModel):
     text: str | None = Field(default=None, max_length=200)
     min_quality: tuple[
         Annotated[str, AfterValidator(lambda text: quality_bound(text) and text)], ...
-    ] = ()
+    ] = Field(default=(), max_length=20)
     created_after: AwareDatetime | None = None
     created_before: AwareDatetime | None = None
 
@@ -164,8 +169,8 @@ class ItemFilter(CatalogFilter):
 class Page(FrozenModel):
     """Page of a list in an order: after a cursor, or from an offset.
 
-    Rows of equal keys are in the order of ids; rows without a key come first. `findings` sorts
-    items by how far they are from what is usual.
+    Rows of equal keys are in the order of ids, the episode of an id before the recording; rows
+    without a key come first. `findings` sorts items by how far they are from what is usual.
     """
 
     sort: SortKey = "id"
@@ -206,9 +211,19 @@ class ItemQuery(ItemFilter, Page):
     """Filter and page of items."""
 
 
+def within_calendar(at: datetime) -> datetime:
+    """The same time in UTC, or the first or last one where that has no date in UTC."""
+    return min(max(at, EARLIEST), LATEST).astimezone(UTC)
+
+
 def time_key(at: datetime | None) -> str:
-    """Text by which rows are sorted by time."""
-    return "" if at is None else at.astimezone(UTC).isoformat(timespec="microseconds")
+    """Text by which rows are sorted by time, which is `within_calendar`."""
+    return "" if at is None else at.isoformat(timespec="microseconds")
+
+
+def item_name(item_id: str, kind: str) -> str:
+    """Name by which items of both kinds are sorted: a comma comes before any part of an id."""
+    return f"{item_id},{kind}"
 
 
 def number_key(number: float) -> str:
@@ -231,7 +246,11 @@ def cursor_of(place: tuple[str, str]) -> str:
     return f"{key}|{item_id}" if key else item_id
 
 
-def place_of(cursor: str) -> tuple[str, str]:
-    """Key and id of a cursor; the row itself may be gone."""
+def place_of(cursor: str, *, descending: bool = False) -> tuple[str, str]:
+    """Key and id or name of a cursor; the row itself may be gone.
+
+    In the list of both kinds an id alone stands for all items of it: they come before its place, or
+    after it where the list is `descending`.
+    """
     key, _, item_id = cursor.rpartition("|")
-    return key, item_id
+    return key, item_id if descending or "," in item_id else item_name(item_id, "~")

@@ -90,7 +90,7 @@ def rows_alone(store, folder, count):
         with transaction(connection):
             for number in range(first, min(first + 1000, count)):
                 name, task = f"e-{number:06d}", f"task_{number % 7}"
-                own = {"id": name, "name": f"{name}/episode", "task": task, "folder": number}
+                own = {"id": name, "name": f"{name},episode", "task": task, "folder": number}
                 write_row(connection, replace(row, item={**row.item, **own}))
     with transaction(connection):
         relink(connection)

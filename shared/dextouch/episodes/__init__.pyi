@@ -7,6 +7,7 @@ from .files import LocalGroup as LocalGroup
 from .files import Stamps as Stamps
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
+from .files import make_held_folder as make_held_folder
 from .files import replace_file as replace_file
 from .format import COMMIT_FILE as COMMIT_FILE
 from .format import GOP_IMAGES as GOP_IMAGES
@@ -72,5 +73,6 @@ from .validity import interpolated_actions as interpolated_actions
 from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions
 from .validity import measured_taxels as measured_taxels
+from .writer import DOWNLOADS as DOWNLOADS
 from .writer import ContentDigest as ContentDigest
 from .writer import EpisodeWriter as EpisodeWriter

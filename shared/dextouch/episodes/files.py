@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from dextouch.data_folder import is_system_file
+from dextouch.episodes.format import COMMIT_FILE
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError, StorageFullError
 
 _SYNC_THREADS = 16
@@ -28,6 +29,8 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
 MAX_METADATA_BYTES = 1 << 24
+# Earlier releases wrote larger records of long takes.
+MAX_COMMIT_BYTES = 1 << 28
 
 
 @contextmanager
@@ -325,10 +328,11 @@ class LocalGroup:
                 return None
             try:
                 size = path.stat().st_size
-                if size > MAX_METADATA_BYTES:
+                most = MAX_COMMIT_BYTES if name == COMMIT_FILE else MAX_METADATA_BYTES
+                if size > most:
                     raise CorruptDataError(
-                        f"{self.item_id}: {name} holds {size} bytes, expected at most "
-                        f"{MAX_METADATA_BYTES}"
+                        f"{self.item_id}: {name} holds {size} bytes, expected at most {most}",
+                        too_large=size,
                     )
                 return path.read_bytes()
             except FileNotFoundError:

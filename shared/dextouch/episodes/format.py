@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import cache
 from typing import Annotated, Any, Final, Generic, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
@@ -132,10 +133,16 @@ def kind_of(attributes: Attributes) -> Kind:
     return "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
 
 
+@cache
+def _metadata_model(model: type[M]) -> type[_GroupMetadata[M]]:
+    # Pydantic forgets such classes, and making one takes longer than reading an item.
+    return _GroupMetadata[model]  # type: ignore[valid-type]
+
+
 def group_attributes(metadata: bytes, model: type[M]) -> M:
     """Inverse of `group_metadata`; raises MALFORMED."""
     # One pass over the text: most of it is calibration, 60 kB an item.
-    return _GroupMetadata[model].model_validate_json(metadata).attributes.dextouch  # type: ignore[valid-type]
+    return _metadata_model(model).model_validate_json(metadata).attributes.dextouch
 
 
 def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:

@@ -7,7 +7,6 @@ they overwrite anything.
 """
 
 import builtins
-import hashlib
 import shutil
 import threading
 import uuid
@@ -234,15 +233,7 @@ class ObjectStorage:
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         """Whether an id is committed."""
-        return self._commit_facts(kind, item_id) is not None
-
-    def revision(self, kind: Kind, item_id: str) -> int:
-        """A 63-bit hash of the commit record's entity tag and modification time."""
-        facts = self._commit_facts(kind, item_id)
-        if facts is None:
-            raise self._missing(kind, item_id)
-        text = f"{facts.etag} {facts.modified.isoformat()}"
-        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}") is not None
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         """Size of a committed group in the bucket."""
@@ -371,9 +362,6 @@ class ObjectStorage:
                     f"{self._address}: work folder {self.root} belongs to another address; "
                     "give each its own"
                 )
-
-    def _commit_facts(self, kind: Kind, item_id: str) -> ObjectFacts | None:
-        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}")
 
     def _missing(self, kind: Kind, item_id: str) -> NotFoundError:
         return NotFoundError(f"{kind} {item_id!r}: not in the store {self._address}")

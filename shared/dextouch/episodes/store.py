@@ -135,22 +135,15 @@ class EpisodeStore:
             raise
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
-        """The raw files of a committed group, for inspection and repair; raises as `revision`."""
+        """The raw files of a committed group, for inspection and repair; raises as `num_bytes`."""
         return self._storage.group(*_check(kind, item_id))
 
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Whether an id is committed."""
         return self._storage.exists(*_check(kind, item_id))
 
-    def revision(self, item_id: str, *, kind: Kind = "episode") -> int:
-        """A number that changes when an id is deleted and written again.
-
-        Raises NotFoundError without the id.
-        """
-        return self._storage.revision(*_check(kind, item_id))
-
     def num_bytes(self, item_id: str, *, kind: Kind = "episode") -> int:
-        """Size of a committed group; raises as `revision`."""
+        """Size of a committed group; raises NotFoundError without the id."""
         return self._storage.num_bytes(*_check(kind, item_id))
 
     def list(self, *, kind: Kind = "episode") -> list[str]:
@@ -360,14 +353,6 @@ class _LocalStorage:
     def exists(self, kind: Kind, item_id: str) -> bool:
         with disk_errors(f"look at {kind} {item_id}"):
             return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
-
-    def revision(self, kind: Kind, item_id: str) -> int:
-        with disk_errors(f"look at {kind} {item_id}"):
-            folder = self.group(kind, item_id).folder
-            try:
-                return (folder / COMMIT_FILE).stat().st_mtime_ns
-            except FileNotFoundError as error:
-                raise self._missing(kind, item_id) from error
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         return folder_bytes(self.group(kind, item_id).folder)

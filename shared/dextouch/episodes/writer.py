@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from dextouch.episodes.files import (
+    MAX_METADATA_BYTES,
     GroupFiles,
     copy_files,
     disk_errors,
@@ -82,6 +83,8 @@ from dextouch.streams import (
 )
 
 STAGING = ".staging"
+# Folders of running downloads, each with the ids of its items.
+DOWNLOADS = ".downloads"
 
 
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
@@ -90,10 +93,19 @@ def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
 
 
 def sweep_stages(root: Path) -> int:
-    """Remove abandoned stages, which killed writers have left, and return their number."""
+    """Remove abandoned stages and downloads, which a kill has left, and return their number."""
+    return _sweep(root / STAGING) + sweep_downloads(root)
+
+
+def sweep_downloads(root: Path) -> int:
+    """Remove abandoned downloads, and return their number."""
+    return _sweep(root / DOWNLOADS)
+
+
+def _sweep(parent: Path) -> int:
     removed = 0
-    for stage in unheld_folders(root / STAGING):
-        shutil.rmtree(stage)
+    for folder in unheld_folders(parent):
+        shutil.rmtree(folder)
         removed += 1
     return removed
 
@@ -103,7 +115,7 @@ def commit_stage(
 ) -> None:
     """Write metadata and commit record of finished arrays and rename the stage to its target.
 
-    Raises ConflictError if the target exists.
+    Raises ConflictError if the target exists, StorageError if it could not be read again.
     """
     group = group_metadata(json_ready(attributes), entries)
     record = CommitRecord(
@@ -112,6 +124,13 @@ def commit_stage(
         attributes_sha256=sha256_hex(group),
         arrays=dict(entries),
     )
+    commit = encoded_record(record)
+    if max(len(group), len(commit)) > MAX_METADATA_BYTES:
+        raise StorageError(
+            f"{record.kind} {record.id!r}: {METADATA_FILE} and {COMMIT_FILE} hold {len(group)} and "
+            f"{len(commit)} bytes, expected at most {MAX_METADATA_BYTES} each; "
+            "record it in parts, or with fewer streams"
+        )
     with disk_errors(f"commit {record.id}"):
         for name, entry in entries.items():
             write_file(stage / name / METADATA_FILE, array_metadata(entry), sync=False)
@@ -120,8 +139,27 @@ def commit_stage(
         shards = [stage / name / shard_path(len(entry.shape)) for name, entry in entries.items()]
         metadata = [stage / name / METADATA_FILE for name in entries]
         sync_files([*shards, *metadata, stage / METADATA_FILE])
-        write_file(stage / COMMIT_FILE, encode_commit(record)[0])
+        write_file(stage / COMMIT_FILE, commit)
     _publish(stage, target)
+
+
+def encoded_record(record: CommitRecord) -> bytes:
+    """Bytes of a commit record.
+
+    Where it would be too large, as of takes of many hours, without checksums of the longest arrays.
+    Their sha256 stays, by which a verification still finds exchanged files.
+    """
+    data, arrays = encode_commit(record)[0], dict(record.arrays)
+    size = len(data)
+    for name in sorted(arrays, key=lambda name: -len(arrays[name].crc32c or "")):
+        crcs = arrays[name].crc32c
+        if size <= MAX_METADATA_BYTES or not crcs:
+            break
+        arrays[name] = arrays[name].model_copy(update={"crc32c": None})
+        size -= len(crcs) - len("null")
+    if arrays == record.arrays:
+        return data
+    return encode_commit(record.model_copy(update={"arrays": arrays}))[0]
 
 
 def _publish(stage: Path, target: Path) -> None:

@@ -72,15 +72,15 @@ def listed(recordings, episodes):
         {n: one.having(findings=found.get((n, one.item.kind), ())) for n, one in entries.items()}
         for entries in (theirs, ours)
     )
-    takes = {f"{name}/recording": _take(one, theirs) for name, one in ours.items()}
+    takes = {f"{name},recording": _take(one, theirs) for name, one in ours.items()}
     takes |= {
-        f"{name}/episode": one
+        f"{name},episode": one
         for name, one in theirs.items()
         if one.item.origin == "imagined" or not one.item.recordings
     }
     return {
-        "recording": {f"{name}/recording": one for name, one in ours.items()},
-        "episode": {f"{name}/episode": one for name, one in theirs.items()},
+        "recording": {f"{name},recording": one for name, one in ours.items()},
+        "episode": {f"{name},episode": one for name, one in theirs.items()},
         "take": takes,
     }
 

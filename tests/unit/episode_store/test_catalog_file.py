@@ -92,7 +92,7 @@ def test_a_lost_file_loses_nothing(store, how):
     put_item(store, "episode", "d")
     assert ids(Catalog(store)) == ids(running) == ["a", "b", "c", "d"]
     (path,) = databases(store)
-    assert path.name.startswith("v1-")
+    assert path.name.startswith(f"v{catalog_file.VERSION}-")
     assert not catalog_file.check_file(path)
 
 

@@ -3,6 +3,9 @@
 import asyncio
 import io
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import zipfile
 from datetime import UTC, datetime
@@ -15,6 +18,7 @@ pytest.importorskip("mcap", reason="mcap is not installed: pip install '.[export
 
 from dextouch.bridges.mcap import import_mcap
 from dextouch.episodes import EpisodeStore
+from dextouch.episodes.care import DeletionRequest, delete_for_good, unfinished_folders
 from dextouch.installation import install_command
 from dextouch.schemas import Review
 from services.episode_store import downloads
@@ -24,21 +28,22 @@ from tests.unit.episode_store.episodes import write_episode, write_recording
 
 
 @pytest.fixture(autouse=True)
-def scratch(tmp_path, monkeypatch):
-    """Where downloads are made; it must be empty after each."""
+def scratch(settings, tmp_path, monkeypatch):
+    """Where downloads are made; it must be empty after each, like that of temporary files."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    folder = Path(settings.store_url) / ".downloads"
     yield folder
-    assert list(folder.iterdir()) == []
+    assert [*folder.glob("*"), *Path(tempfile.tempdir).iterdir()] == []
 
 
 @pytest.fixture
 def store(settings):
     store = EpisodeStore(settings.store_url)
-    write_episode(store, "one")
-    write_episode(store, "two")
-    write_recording(store, "one")
+    write_episode(store, "one", operator="ada")
+    write_episode(store, "two", operator="bob")
+    write_recording(store, "one", operator="ada")
     return store
 
 
@@ -192,3 +197,50 @@ async def test_a_failure_on_the_way_cuts_the_connection(settings, store, capsys)
         assert all(message.get("more_body", True) for message in sent)
     assert "download_failed" in (told := capsys.readouterr().out)
     assert "tactile_left" in told
+
+
+KILLED = """
+import asyncio, os, sys
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.care import DeletionRequest, delete_for_good, unfinished_folders
+from services.episode_store.downloads import DownloadItems, Downloads
+from services.episode_store.settings import EpisodeStoreSettings
+store = EpisodeStore(sys.argv[1])
+wanted = DownloadItems.model_validate({"items": [{"kind": "episode", "id": "one"}]})
+response = Downloads(store, EpisodeStoreSettings(store_url=sys.argv[1])).begin(wanted)
+async def first():
+    await anext(response.body_iterator)
+    os.kill(os.getpid(), 9)
+asyncio.run(first())
+"""
+
+
+@pytest.mark.parametrize("how", ["start", "deletion"])
+def test_a_killed_download_is_swept(store, scratch, tmp_path, how):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    subprocess.run([sys.executable, "-c", KILLED, str(store.root)], env=environment, check=False)
+    (left,) = scratch.iterdir()
+    assert {path.name for path in left.iterdir()} == {"item.mcap", "items.json"}
+    assert ("download", left) in unfinished_folders(store.root)
+    if how == "start":
+        assert store.sweep() == 1
+    else:
+        # A running one names its items, so that the receipt says what is left.
+        held = downloads._Folder(store.root, [store.open("two")])
+        receipts = [
+            delete_for_good(store.root, DeletionRequest(operator=name), tmp_path / f"{name}.json")
+            for name in ("ada", "bob")
+        ]
+        held.remove()
+        assert [receipt.complete for receipt in receipts] == [True, False]
+        assert receipts[1].remaining[0].where == f".downloads/{held.path.name}/items.json"
+
+
+async def test_a_disk_that_refuses_costs_no_place(connect, store, monkeypatch):
+    client = connect(max_downloads=1)
+    with monkeypatch.context() as broken:
+        broken.setattr(downloads, "make_held_folder", lambda path: os.open(path, os.O_RDONLY))
+        for _ in range(2):
+            answer = await client.post("/v1/downloads", json=items("one"))
+            assert "begin a download" in answer.json()["detail"]
+    assert (await client.post("/v1/downloads", json=items("one"))).status_code == 200

@@ -15,20 +15,24 @@ from dextouch.episodes.files import disk_errors
 CATALOG_FOLDER: Final = ".catalog"
 Search = Callable[[str], list[str]]
 _BUSY_S: Final = 10.0
+_JOURNALS: Final = ("-wal", "-shm", "-journal")
 
 
 def remove_catalog(path: Path) -> None:
     """Remove a database with its journals; processes that have it open do not notice."""
-    for suffix in ("", "-wal", "-shm", "-journal"):
+    for suffix in ("", *_JOURNALS):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def erase_from_catalog(root: Path, search: Search) -> None:
     """Delete the rows in which a search finds something, from the free pages and journals, too.
 
-    What is not a catalog of this release, is damaged or stays locked is removed.
+    What is not a catalog of this release, is damaged or stays locked is removed, and so are other
+    files there, such as the journal of a catalog that is gone.
     """
     with disk_errors("erase from the catalog"):
+        for path in _other_files(root):
+            path.unlink(missing_ok=True)
         for path in _databases(root):
             try:
                 _erase(path, search)
@@ -53,6 +57,8 @@ def _erase(path: Path, search: Search) -> None:
 def search_catalog(root: Path, search: Search) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Tables in which a search finds something, with what it finds."""
     with disk_errors("search the catalog"):
+        for path in _other_files(root):
+            yield f"{CATALOG_FOLDER}/{path.name} is of no catalog; remove it, and repeat", ()
         for path in _databases(root):
             where = f"{CATALOG_FOLDER}/{path.name}"
             try:
@@ -82,3 +88,14 @@ def _named(values: Iterable[object], search: Search) -> set[str]:
 
 def _databases(root: Path) -> list[Path]:
     return sorted((root / CATALOG_FOLDER).glob("*.sqlite"))
+
+
+def _other_files(root: Path) -> list[Path]:
+    """Files in the folder that are neither a database nor one of its journals."""
+    folder, found = root / CATALOG_FOLDER, []
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        base, dash, _ = path.name.rpartition("-")
+        owner = base if dash and path.name.removeprefix(base) in _JOURNALS else path.name
+        if path.is_file() and not (owner.endswith(".sqlite") and (folder / owner).is_file()):
+            found.append(path)
+    return found

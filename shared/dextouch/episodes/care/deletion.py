@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ValidationError
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.catalog_erasure import erase_from_catalog, search_catalog
 from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, take_start
-from dextouch.episodes.files import disk_errors, replace_file, try_lock
+from dextouch.episodes.files import MAX_METADATA_BYTES, disk_errors, replace_file, try_lock
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
 from dextouch.episodes.spool_log import RECORDING_FILE
 from dextouch.episodes.trash import (
@@ -31,7 +31,7 @@ from dextouch.episodes.trash import (
     put_into_trash,
     remove_for_good,
 )
-from dextouch.episodes.writer import STAGING
+from dextouch.episodes.writer import DOWNLOADS, STAGING, sweep_downloads
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
 from dextouch.frozen_model import FrozenModel
@@ -52,7 +52,6 @@ PLACES: dict[str, str] = {
     STAGING: "",
     TRASH: "",
 }
-MAX_BYTES = 16 << 20
 # Files with attributes, and the keys under which they lie.
 _ATTRIBUTES = {METADATA_FILE: ("attributes", ATTRIBUTES_KEY), RECORDING_FILE: ()}
 _SAMPLES = ".log"
@@ -146,7 +145,8 @@ def small_files(folder: Path) -> Iterator[Path]:
         yield folder
     with disk_errors(f"look through {folder.name}"):
         for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-            if path.suffix != _SAMPLES and path.is_file() and path.stat().st_size <= MAX_BYTES:
+            is_small = path.is_file() and path.stat().st_size <= MAX_METADATA_BYTES
+            if path.suffix != _SAMPLES and is_small:
                 yield path
 
 
@@ -429,6 +429,8 @@ def delete_for_good(
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
     wanted = IdentifierSearch(words)
     erase_from_catalog(root, wanted.in_column)
+    with disk_errors("remove downloads"):
+        sweep_downloads(root)
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
@@ -517,6 +519,9 @@ def _search(
         with disk_errors(f"search {checkpoints}"):
             paths = [p for p in checkpoints.rglob("*") if p.suffix in {".safetensors", ".json"}]
             files += [(str(path), path) for path in sorted(paths) if path.is_file()]
+    with disk_errors(f"list {DOWNLOADS}"):
+        lists = sorted((root / DOWNLOADS).glob("*/items.json"))
+    files += [(path.relative_to(root).as_posix(), path) for path in lists]
     others = ((f"{INTENTS}/{p.name}", p) for p in small_files(root / INTENTS) if p != skip)
     found += _references(wanted, [*files, *others])
     found += [Reference(*named) for named in search_catalog(root, wanted.in_column)]

@@ -51,7 +51,7 @@ from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
 from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
-from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage
+from dextouch.episodes.writer import DOWNLOADS, STAGING, EpisodeWriter, new_stage
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -226,9 +226,9 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
     return ItemReport("upload", folder.name, len(names), num_bytes, tuple(findings), busy)
 
 
-def inspect_stage(folder: Path) -> ItemReport:
-    """Say whether a stage is that of a running writer; a sweep removes it otherwise."""
-    return ItemReport("stage", folder.name, busy=is_held(folder))
+def inspect_stage(folder: Path, kind: str = "stage") -> ItemReport:
+    """Say whether a stage or download is a running one; a sweep removes it otherwise."""
+    return ItemReport(kind, folder.name, busy=is_held(folder))
 
 
 def is_held(folder: Path) -> bool:
@@ -241,8 +241,8 @@ def is_held(folder: Path) -> bool:
 
 
 def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
-    """Kind and folder of every upload and stage below a store's folder."""
-    for kind, name in (("upload", UPLOADS), ("stage", STAGING)):
+    """Kind and folder of every upload, stage and download below a store's folder."""
+    for kind, name in (("upload", UPLOADS), ("stage", STAGING), ("download", DOWNLOADS)):
         folder = root / name
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
@@ -430,7 +430,10 @@ def _commit_of(files: LocalGroup, kind: Kind) -> tuple[CommitRecord, str] | None
     try:
         data = files.get(COMMIT_FILE)
         return None if data is None else decode_commit(data, what=what)
-    except CorruptDataError:
+    except CorruptDataError as error:
+        if "too_large" in error.details:
+            # It may be whole: a salvage would only be a copy.
+            raise
         return None
 
 
