@@ -41,14 +41,15 @@ class ForeignStream:
 
     `source` is its name there (topic, feature, entity). `blocks` are its samples with `t_ns` as
     t_host_ns, in order. `as_numbers` says why samples with a meaning of their own (points, a custom
-    message) are kept as plain numbers, and `notes` what was converted; both go to the report.
+    message) are kept as plain numbers, and `notes`, read after the blocks, what was converted; both
+    go to the report.
     """
 
     descriptor: StreamDescriptor
     source: str
     blocks: Iterable[Block] = ()
     as_numbers: str = ""
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -326,7 +327,7 @@ class _Counter:
         self.report = ImportedStream(
             about.name, stream.source, about.kind, about.unit, about.shape, about.frame
         )
-        self.report.notes = stream.notes
+        self._notes = stream.notes
 
     def append(self, block: Block) -> None:
         if not len(block):
@@ -357,6 +358,7 @@ class _Counter:
     def result(self) -> ImportedStream:
         """The counts, with duration and rate."""
         one = self.report
+        one.notes = tuple(self._notes)
         one.duration_s = (
             (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if one.num_samples else 0.0
         )
