@@ -5,14 +5,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import compress, islice
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Int64
 from pydantic import ValidationError
 
 from dextouch.bridges.exporting import BLOCK_IMAGES, Block
-from dextouch.bridges.foreign import ForeignStream, Refused
+from dextouch.bridges.foreign import ForeignStream, ImageUnit, Refused
 from dextouch.bridges.foreign_images import compressed_form, decode_png
 from dextouch.bridges.lerobot.source import (
     EpisodeEntry,
@@ -34,7 +34,6 @@ from dextouch.streams import (
     encoded_values,
 )
 
-ImageUnit = Literal["h264", "jpeg", "rgb8"]
 # What counts frames; the times of a stream and the recording's id say it.
 COUNTERS: Final = ("timestamp", "frame_index", "episode_index", "index")
 TASK_INDEX: Final = "task_index"

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from dextouch.bridges.foreign import (
     MAX_ID,
     ForeignStream,
+    ImageUnit,
     ImportedStream,
     ImportReport,
     Refused,
@@ -23,7 +24,6 @@ from dextouch.bridges.lerobot.feature_streams import (
     COUNTERS,
     TASK_INDEX,
     Frames,
-    ImageUnit,
     camera_stream,
     feature_streams,
 )

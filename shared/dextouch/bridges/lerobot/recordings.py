@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from dextouch.bridges.foreign import (
     MAX_ID,
     ForeignStream,
     ImportAttributes,
+    ImportChoices,
     ImportReport,
     Refused,
     file_sha256,
@@ -24,7 +25,6 @@ from dextouch.bridges.lerobot.feature_streams import (
     COUNTERS,
     TASK_INDEX,
     Frames,
-    ImageUnit,
     feature_streams,
     text_stream,
 )
@@ -41,24 +41,18 @@ MAX_FPS = 1000
 
 
 @dataclass(frozen=True)
-class ImportOptions:
+class ImportOptions(ImportChoices):
     """Options of an import: information that the dataset itself lacks.
 
     `mapping`: our name → the dataset's feature, for features under other names: `action`, `state`,
     `tactile` and cameras (`camera_head`, `camera_wrist_left`, …); of recordings the name of any
-    stream. `id_prefix`: put before every id (needed when ids exist already); `images`: the unit
-    that images are stored in, None for the one nearest to what they are. Only for datasets of other
-    origin: `K_head` in pixels, `domain`, `task` and `instruction` (without them the dataset's own
-    text), and `fps`, the rate instead of that and the timestamps of the dataset.
+    stream. `images`: None for the unit nearest to what they are. Only for datasets of other origin:
+    `domain`, `task`, `instruction`, `K_head` in pixels, and `fps`, the rate instead of that and the
+    timestamps of the dataset.
     """
 
-    mapping: Mapping[str, str] = field(default_factory=dict)
-    id_prefix: str = ""
-    images: ImageUnit | None = None
-    K_head: Matrix | None = None
     domain: Domain = "robot"
-    task: str | None = None
-    instruction: str = ""
+    K_head: Matrix | None = None
     fps: float | None = None
 
 
