@@ -270,6 +270,8 @@ def _import(options: argparse.Namespace) -> Report:
         )
         result = import_dataset(path, store, options=chosen)
         print(*result.lines(), sep="\n")
+        for name, reason in result.failed.items():
+            print(f"{path}: {name}: not imported: {reason}", file=sys.stderr)
         return about | result.as_json()
     found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
     files = [file for file in found if file == path or not is_system_file(file.name)]

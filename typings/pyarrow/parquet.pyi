@@ -7,6 +7,16 @@ from pyarrow import RecordBatch, Schema, Table
 class ColumnChunkMetaData:
     path_in_schema: str
     total_uncompressed_size: int
+    physical_type: str
+    num_values: int
+    encodings: tuple[str, ...]
+
+class ColumnSchema:
+    length: int
+
+class ParquetSchema:
+    def column(self, i: int) -> ColumnSchema: ...
+    def to_arrow_schema(self) -> Schema: ...
 
 class RowGroupMetaData:
     total_byte_size: int
@@ -17,14 +27,20 @@ class RowGroupMetaData:
 class FileMetaData:
     num_rows: int
     num_row_groups: int
+    schema: ParquetSchema
     def row_group(self, i: int) -> RowGroupMetaData: ...
 
 class ParquetFile:
     metadata: FileMetaData
     num_row_groups: int
     schema_arrow: Schema
-    def __init__(self, source: Path, *, memory_map: bool = ...) -> None: ...
+    def __init__(
+        self, source: Path, *, memory_map: bool = ..., read_dictionary: list[str] = ...
+    ) -> None: ...
     def read(self, columns: list[str] | None = ..., use_threads: bool = ...) -> Table: ...
+    def read_row_group(
+        self, i: int, columns: list[str] | None = ..., use_threads: bool = ...
+    ) -> Table: ...
     def iter_batches(
         self,
         batch_size: int = ...,
@@ -47,4 +63,5 @@ class ParquetWriter:
     def close(self) -> None: ...
 
 def write_table(table: Table, where: Path) -> None: ...
+def read_metadata(where: Path) -> FileMetaData: ...
 def read_schema(where: Path) -> Schema: ...

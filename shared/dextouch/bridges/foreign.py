@@ -19,10 +19,11 @@ from dextouch import __version__
 from dextouch.bridges.exporting import Block
 from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from dextouch.schemas import ImportedFile, RecordingAttributes, first_problems
+from dextouch.schemas import Domain, ImportedFile, RecordingAttributes, first_problems
 from dextouch.streams import NO_DEVICE_TIME, StreamDescriptor
 from dextouch.tactile.layout import TactileLayout
 
+ImageUnit = Literal["h264", "jpeg", "rgb8"]
 MAX_NAME: Final = 64
 MAX_ID: Final = 128
 # Suffixes of the arrays beside a stream's values, which no other stream may be called.
@@ -41,14 +42,15 @@ class ForeignStream:
 
     `source` is its name there (topic, feature, entity). `blocks` are its samples with `t_ns` as
     t_host_ns, in order. `as_numbers` says why samples with a meaning of their own (points, a custom
-    message) are kept as plain numbers, and `notes` what was converted; both go to the report.
+    message) are kept as plain numbers, and `notes`, read after the blocks, what was converted; both
+    go to the report.
     """
 
     descriptor: StreamDescriptor
     source: str
     blocks: Iterable[Block] = ()
     as_numbers: str = ""
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -125,21 +127,33 @@ class ImportReport:
 
 
 @dataclass(frozen=True)
-class ImportAttributes:
-    """What a file of another tool does not say about the take.
+class ImportChoices:
+    """What is chosen for an import of any format.
 
-    `mapping` has sources by stream name and overrides the rule of `stream_names`; `images` is the
-    unit of video that must be decoded; `layout` that of the taxels of mapped tactile streams,
-    None of `dextouch_v1`.
+    `mapping` has sources by stream name and overrides the rule of `stream_names`; `id_prefix` is
+    put before every id, needed when ids exist already. Without `task`, `instruction` or `images`
+    (the unit of images) they are what the files say.
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
     id_prefix: str = ""
-    task: str = "imported"
+    task: str | None = None
     instruction: str = ""
-    domain: str = "human"
+    domain: Domain = "human"
+    images: ImageUnit | None = None
+
+
+@dataclass(frozen=True)
+class ImportAttributes(ImportChoices):
+    """What a file of another tool does not say about the take.
+
+    `images` is the unit of video that must be decoded; `layout` that of the taxels of mapped
+    tactile streams, None of `dextouch_v1`.
+    """
+
+    task: str = "imported"
+    images: ImageUnit = "h264"
     station: str = "imported"
-    images: Literal["h264", "jpeg", "rgb8"] = "h264"
     layout: TactileLayout | None = None
 
 
@@ -326,7 +340,7 @@ class _Counter:
         self.report = ImportedStream(
             about.name, stream.source, about.kind, about.unit, about.shape, about.frame
         )
-        self.report.notes = stream.notes
+        self._notes = stream.notes
 
     def append(self, block: Block) -> None:
         if not len(block):
@@ -357,6 +371,7 @@ class _Counter:
     def result(self) -> ImportedStream:
         """The counts, with duration and rate."""
         one = self.report
+        one.notes = tuple(self._notes)
         one.duration_s = (
             (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if one.num_samples else 0.0
         )

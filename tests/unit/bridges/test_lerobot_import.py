@@ -261,7 +261,12 @@ def test_features_without_a_role_are_streams_of_the_episode(store, other, folder
     mapping = {"camera_head": "observation.images.top", "amps": "observation.current"}
     result = import_dataset(folder, other, options=ImportOptions(mapping=mapping))
     assert result.kind == "episode"
-    assert {"observation.current": "amps", "note": "note"}.items() <= result.kept.items()
+    named = {(one.source, one.stream) for one in result.reports[0].imported}
+    assert {("observation.current", "amps"), ("note", "note"), ("action", "action")} <= named
+    assert {one.num_samples for one in result.reports[0].imported} == {17}
+    assert import_dataset(folder, other, options=ImportOptions(mapping=mapping)).present == (
+        result.ids
+    )
     back = other.open(result.ids[1])
     np.testing.assert_array_equal(back.read("amps").values.ravel(), numbers[17:])
     np.testing.assert_array_equal(back.stamps_ns("amps"), back.stamps_ns("action"))

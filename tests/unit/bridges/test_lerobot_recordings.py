@@ -2,20 +2,26 @@
 
 import hashlib
 import json
+import re
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dextouch.bridges.lerobot import ImportOptions, import_dataset
+from dextouch.bridges.lerobot import (
+    ImportOptions,
+    feature_streams,
+    import_dataset,
+    import_lerobot,
+    source,
+)
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
     InvalidInputError,
     LimitExceededError,
-    NotFoundError,
     UnknownNameError,
 )
 from tests.unit.bridges.foreign_lerobot import (
@@ -30,6 +36,8 @@ from tests.unit.bridges.foreign_lerobot import (
 from tests.unit.bridges.lerobot_edits import DATA, INFO, edit_column, edit_json, set_item
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
+_TEXT = pa.dictionary(pa.int32(), pa.string())
+DICTIONARY_LISTS = pa.list_(pa.struct([("role", _TEXT), ("content", _TEXT)]))
 WRITERS = {"v3.0": "write_v3", "v2.1": "write_v21"}
 
 
@@ -119,8 +127,8 @@ def test_images_without_a_column_are_found_in_their_folder(store, tmp_path):
     got = values(store.recording(ids[1]), "observation_images_wrist")
     np.testing.assert_array_equal(got, np.stack(made.images(WRIST, 1)))
     path.unlink()
-    with pytest.raises(NotFoundError, match=r"episode 1: image 8 of 'observation.images.wrist'"):
-        import_dataset(folder, store, options=ImportOptions(id_prefix="again-"))
+    result = import_dataset(folder, store, options=ImportOptions(id_prefix="again-"))
+    assert "episode 1: image 8 of 'observation.images.wrist'" in result.failed["episode 1"]
 
 
 def test_depth_images_of_16_bits_are_exact_and_depth_video_is_refused(store, tmp_path):
@@ -179,8 +187,9 @@ def test_times_are_those_of_the_timestamps_or_of_a_given_rate(store, tmp_path):
     assert fast.streams["action"].nominal_rate_hz == 20
     assert len(fast.images("observation_images_top")) == LENGTHS[0]
     edit_column(folder, DATA, "timestamp", set_item(2, 0.05))
-    with pytest.raises(CorruptDataError, match=r"does not rise.*--fps"):
-        import_dataset(folder, store, options=ImportOptions(id_prefix="back-"))
+    result = import_dataset(folder, store, options=ImportOptions(id_prefix="back-"))
+    assert result.ids == ["back-arm-000001"]
+    assert re.search(r"does not rise.*--fps", result.failed["episode 0"])
 
 
 def test_options_name_streams_camera_matrix_task_and_domain(store, tmp_path):
@@ -201,6 +210,7 @@ def test_options_name_streams_camera_matrix_task_and_domain(store, tmp_path):
     assert (about.task, about.instruction, about.domain) == ("cubes", TASKS[0], "human")
     assert about.calibration["K_head"] == K
     assert result.ids[0] == "x-arm-000000"
+    edit_column(folder, DATA, "observation.count", set_item(0, 99))
     with pytest.raises(ConflictError, match="--id-prefix"):
         import_dataset(folder, store, options=options)
     for mapping, error in (
@@ -272,9 +282,103 @@ def test_what_contradicts_the_rows_is_refused_and_leaves_nothing(store, tmp_path
     folder = arm().write_v21(tmp_path / "short")
     path = folder / "meta/episodes.jsonl"
     path.write_text(path.read_text().replace('"length": 12', '"length": 11'))
-    with pytest.raises(CorruptDataError, match="got 12 frames, expected 11"):
-        import_dataset(folder, store)
     assert store.list(kind="recording") == []
+    result = import_dataset(folder, store)
+    assert "got 12 frames, expected 11" in result.failed["episode 0"]
+    assert result.ids == ["short-000001"] == store.list(kind="recording")
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_one_bad_episode_does_not_stop_the_others_and_can_be_made_good(store, tmp_path, version):
+    _, folder = written(tmp_path, version)
+    name = DATA if version == "v3.0" else "data/chunk-000/episode_000000.parquet"
+    sound = (folder / name).read_bytes()
+    edit_column(folder, name, "frame_index", set_item(3, 7))
+    result = import_dataset(folder, store)
+    assert result.ids == ["arm-000001"] == store.list(kind="recording")
+    assert list(result.failed) == ["episode 0"]
+    assert "frame_index" in result.failed["episode 0"]
+    with pytest.raises(CorruptDataError, match="frame_index"):
+        import_lerobot(folder, store)
+    (folder / name).write_bytes(sound)
+    result = import_dataset(folder, store)
+    # In v3 the episodes share a file, which is now another one.
+    kept = [] if version == "v3.0" else ["arm-000001"]
+    assert (result.ids, result.present) == (["arm-000000"], kept)
+    assert list(result.failed) == ([] if kept else ["episode 1"])
+    again = import_dataset(folder, store)
+    assert (again.ids, again.present[0]) == ([], "arm-000000")
+    assert json.loads(json.dumps(again.as_json()))["failed"] == again.failed
+
+
+def test_texts_and_numbers_that_swell_are_refused_before_they_do(store, tmp_path, monkeypatch):
+    """Dictionaries and runs make a file small, and padding makes a stream large."""
+    made = arm(cameras={})
+    made.values["subtask"] = [["x" * 60_000] * n for n in LENGTHS]
+    folder = made.write_v3(tmp_path / "repeated")
+    assert (folder / DATA).stat().st_size < 100_000
+    monkeypatch.setattr(source, "MAX_TABLE_BYTES", 1_000_000)
+    with pytest.raises(LimitExceededError, match="21 rows that need 12"):
+        import_dataset(folder, store)
+    monkeypatch.setattr(source, "MAX_TABLE_BYTES", 1 << 30)
+    monkeypatch.setattr(feature_streams, "MAX_TEXTS_BYTES", 600_000)
+    result = import_dataset(folder, store)
+    assert "60000 bytes, to which 12 would be padded" in result.reports[0].refused[0].reason
+    assert texts(store.recording(result.ids[1]), "subtask") == ["x" * 60_000] * 9
+    made.values["observation.force"] = [np.zeros((n, 2, 9_000)).tolist() for n in LENGTHS]
+    made.values["subtask"] = [[""] * n for n in LENGTHS]
+    made.features["observation.force"]["shape"] = [2, 9_000]
+    folder = made.write_v3(tmp_path / "zeros")
+    assert (folder / DATA).stat().st_size < 100_000
+    monkeypatch.setattr(source, "MAX_TABLE_BYTES", 1_000_000)
+    with pytest.raises(LimitExceededError, match="21 rows that need 15"):
+        import_dataset(folder, store)
+
+
+def test_lists_of_repeated_texts_count_and_zeros_at_an_end_are_said(store, tmp_path):
+    _, folder = written(tmp_path, cameras={})
+    table = pq.read_table(folder / DATA)
+    said = [[{"role": "user", "content": "a" * 50}], None, []] * 7
+    ends = ["a\0", "b\0c", None] * 7
+    place = table.column_names.index("subtask")
+    table = table.set_column(place, "subtask", pa.array(ends)).append_column("said", [said])
+    pq.write_table(table, folder / DATA)
+    edit_json(folder, INFO, lambda i: i["features"].update(said={"dtype": "language", "shape": []}))
+    assert source._repeated_bytes(table["said"].cast(DICTIONARY_LISTS)) == 7 * (4 + 50)
+    result = import_dataset(folder, store)
+    recording = store.recording(result.ids[0])
+    assert [json.loads(text or "null") for text in texts(recording, "said")] == said[:12]
+    notes = {one.stream: one.notes for one in result.reports[0].imported}
+    assert notes["subtask"] == ("4 texts end in zeros, which look like the padding",)
+    assert notes["said"] == ()
+    pq.write_table(
+        table, folder / DATA, use_dictionary=False, column_encoding={"subtask": "DELTA_BYTE_ARRAY"}
+    )
+    with pytest.raises(InvalidInputError, match="DELTA_BYTE_ARRAY"):
+        import_dataset(folder, store, options=ImportOptions(id_prefix="delta-"))
+
+
+def test_images_that_are_not_stored_as_they_were_are_said(store, tmp_path):
+    def notes(options, **changes):
+        folder = arm(**changes).write_v21(tmp_path / f"{options.id_prefix}set")
+        report = import_dataset(folder, store, options=options).reports[0]
+        return {
+            one.stream.removeprefix("observation_images_"): one.notes for one in report.imported
+        }
+
+    def jpeg(**more):
+        return {"cameras": {WRIST: ("image", ".jpg"), TOP: ("video",)}, **more}
+
+    plain = notes(ImportOptions(id_prefix="a-"))
+    assert (plain["top"], plain["wrist"]) == (("decoded, encoded as h264",), ("PNG decoded",))
+    asked = notes(ImportOptions(id_prefix="b-", images="jpeg"))
+    assert (asked["top"], asked["wrist"]) == (
+        ("decoded, encoded as jpeg",),
+        ("PNG decoded, encoded as jpeg",),
+    )
+    groups = {"g": "8", "bf": "0", "keyint_min": "8", "sc_threshold": "0"}
+    same = notes(ImportOptions(id_prefix="c-"), **jpeg(video_options=groups))
+    assert (same["top"], same["wrist"]) == ((), ())
 
 
 def test_what_no_stream_can_hold_is_refused_with_the_reason(store, tmp_path):
@@ -316,15 +420,13 @@ def test_image_files_stay_in_the_folder_and_are_bounded(store, tmp_path, monkeyp
         values[0] = {"bytes": None, "path": "../secret.png"}
 
     edit_column(folder, DATA, WRIST, lead_out)
-    with pytest.raises(CorruptDataError, match="leads out"):
-        import_dataset(folder, store)
+    result = import_dataset(folder, store)
+    assert "leads out" in result.failed["episode 0"]
     _, folder = arm(), arm().write_v3(tmp_path / "large")
-    from dextouch.bridges.lerobot import source
-
     monkeypatch.setattr(source, "MAX_IMAGE_BYTES", 64)
     with pytest.raises(LimitExceededError, match="64 bytes"):
         import_dataset(folder, store)
-    assert store.list(kind="recording") == []
+    assert store.list(kind="recording") == result.ids == ["arm-000001"]
 
 
 def test_video_of_x264_with_b_frames_and_no_entry_at_an_episode_comes_in(store, tmp_path):

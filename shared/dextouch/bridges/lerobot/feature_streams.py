@@ -1,18 +1,18 @@
 """Features of a LeRobot dataset as streams of one episode: numbers, text, images and video."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import compress, islice
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Int64
 from pydantic import ValidationError
 
 from dextouch.bridges.exporting import BLOCK_IMAGES, Block
-from dextouch.bridges.foreign import ForeignStream, Refused
+from dextouch.bridges.foreign import ForeignStream, ImageUnit, Refused
 from dextouch.bridges.foreign_images import compressed_form, decode_png
 from dextouch.bridges.lerobot.source import (
     EpisodeEntry,
@@ -34,13 +34,14 @@ from dextouch.streams import (
     encoded_values,
 )
 
-ImageUnit = Literal["h264", "jpeg", "rgb8"]
 # What counts frames; the times of a stream and the recording's id say it.
 COUNTERS: Final = ("timestamp", "frame_index", "episode_index", "index")
 TASK_INDEX: Final = "task_index"
 UNKNOWN_UNIT: Final = "unknown"
 TEXT_UNIT: Final = "utf8"
 MAX_TEXT_BYTES: Final = 1 << 16
+# Of all texts of an episode, padded to the longest.
+MAX_TEXTS_BYTES: Final = 1 << 30
 TEXT_TYPES: Final = ("string", "large_string", "language")
 _ROWS_AT_ONCE = 1024
 # Types of columns and those of streams, which hold all of their values; uint64 is checked.
@@ -123,7 +124,7 @@ def _number_stream(frames: Frames, key: str, name: str) -> ForeignStream | str:
     if got not in _STORED:
         return f"holds {got}, expected numbers of {', '.join(_STORED)}"
     stored = _STORED[got]
-    values = values.reshape(len(values), *(values.shape[1:] or (1,))).astype(stored)
+    values = values.reshape(len(values), *(values.shape[1:] or (1,))).astype(stored, copy=False)
     is_state = key.startswith(("action", "observation.state"))
     notes: tuple[str, ...] = () if got == stored else (f"{got} as {stored}",)
     descriptor = _descriptor(
@@ -152,10 +153,23 @@ def text_stream(
     width = max(1, *map(len, texts)) if texts else 1
     if width > MAX_TEXT_BYTES:
         return f"holds a text of {width} bytes, expected at most {MAX_TEXT_BYTES}"
+    if width * len(texts) > MAX_TEXTS_BYTES:
+        return (
+            f"holds a text of {width} bytes, to which {len(texts)} would be padded; expected at "
+            f"most {MAX_TEXTS_BYTES} bytes in all"
+        )
     descriptor = _descriptor(frames, name, "scalar", shape=(width,), dtype="uint8", unit=TEXT_UNIT)
-    padded = np.array(texts, dtype=f"S{width}").view(np.uint8).reshape(len(texts), width)
-    blocks = _blocks(frames.t_ns, padded)
-    return ForeignStream(descriptor, key, blocks, "text as UTF-8, padded with zeros")
+
+    def blocks() -> Iterator[Block]:
+        for start in range(0, len(texts), _ROWS_AT_ONCE):
+            some = texts[start : start + _ROWS_AT_ONCE]
+            padded = np.array(some, dtype=f"S{width}").view(np.uint8).reshape(len(some), width)
+            yield _block(frames.t_ns[start : start + len(some)], padded)
+
+    hidden = sum(one.endswith(b"\0") for one in texts)
+    notes = (f"{hidden} texts end in zeros, which look like the padding",) if hidden else ()
+    about = "text as UTF-8, padded with zeros"
+    return ForeignStream(descriptor, key, blocks(), about, notes)
 
 
 def camera_stream(
@@ -184,19 +198,11 @@ def camera_stream(
         if units and all(is_keyframe(u) == (k % GOP_IMAGES == 0) for k, u in enumerate(units)):
             yield _block(stamps_ns, encoded_values(units))
         else:
+            notes.append(converted_note("", stored))
             yield from _image_blocks(read_images(span), stamps_ns, fresh)
 
-    return ForeignStream(descriptor, key, _Once(blocks))
-
-
-@dataclass(frozen=True)
-class _Once:
-    """Blocks that are made when they are asked for."""
-
-    make: Callable[[], Iterator[Block]]
-
-    def __iter__(self) -> Iterator[Block]:
-        return self.make()
+    notes: list[str] = []
+    return ForeignStream(descriptor, key, blocks(), notes=notes)
 
 
 def _image_blocks(
@@ -235,18 +241,17 @@ def _image_stream(
 
     def blocks() -> Iterator[Block]:
         encoded = _same_form(read(), (form, dtype, shape), where)
-        decoded = (_decode(data, form, shape, dtype) for data in encoded)
-        yield from _image_blocks(encoded if keeps else decoded, stamps_ns, fresh)
+        decode = decode_jpeg if form == JPEG_UNIT else partial(decode_png, shape=shape, dtype=dtype)
+        yield from _image_blocks(encoded if keeps else map(decode, encoded), stamps_ns, fresh)
 
-    return ForeignStream(descriptor, key, _Once(blocks))
+    notes = () if keeps else (converted_note("PNG" if form != JPEG_UNIT else "JPEG", stored),)
+    return ForeignStream(descriptor, key, blocks(), notes=notes)
 
 
-def _decode(data: bytes, form: str, shape: tuple[int, ...], dtype: str) -> np.ndarray:
-    return (
-        decode_jpeg(data, size_px=shape[:2])
-        if form == JPEG_UNIT
-        else decode_png(data, shape, dtype)
-    )
+def converted_note(what: str, stored: str) -> str:
+    """What is said of images that are not stored as they were."""
+    encoded = f", encoded as {stored}" if stored in ENCODED_UNITS else ""
+    return f"{what} decoded{encoded}".strip()
 
 
 def _same_form(

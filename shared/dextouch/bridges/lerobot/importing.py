@@ -1,7 +1,7 @@
 """Import of LeRobot datasets: those with our actions as episodes, all others as recordings."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,10 @@ from jaxtyping import Bool, Float32, Int64
 from pydantic import ValidationError
 
 from dextouch.bridges.foreign import (
+    MAX_ID,
     ForeignStream,
+    ImageUnit,
+    ImportedStream,
     ImportReport,
     Refused,
     file_sha256,
@@ -21,7 +24,6 @@ from dextouch.bridges.lerobot.feature_streams import (
     COUNTERS,
     TASK_INDEX,
     Frames,
-    ImageUnit,
     camera_stream,
     feature_streams,
 )
@@ -29,11 +31,24 @@ from dextouch.bridges.lerobot.layout import WORLD
 from dextouch.bridges.lerobot.recordings import (
     ImportOptions,
     dataset_contradictions,
-    import_recordings,
+    dataset_id,
+    recordings_importer,
 )
-from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
+from dextouch.bridges.lerobot.source import (
+    DatasetInfo,
+    EpisodeEntry,
+    FeatureInfo,
+    LeRobotFolder,
+    whole_text,
+)
 from dextouch.episodes import EpisodeStore, Kind
-from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    UnknownNameError,
+)
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import (
     MAX_INSTRUCTION,
@@ -42,10 +57,9 @@ from dextouch.schemas import (
     StoredAnchor,
     first_problems,
 )
-from dextouch.streams import StreamDescriptor, StreamKind
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor, StreamKind
 from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout
 
-HEAD = "camera_head"
 TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 _CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
 # Usual feature of a role, and the shape of its rows; -1 is the number of taxels.
@@ -70,17 +84,15 @@ DEFAULTS = ImportOptions()
 class DatasetImport:
     """Result of an import: what was written under which ids, and what was not.
 
-    `reports` are those of recordings, one each; of episodes of other origin, `kept` are the streams
-    of images and of features without a role, and `refused` what no stream could be made of.
-    `contradictions` are those between the dataset's description and its files.
+    `reports` has one for each id; those of our own exports list no streams. `present` are the ids
+    of what the store had from the same files, and `failed` the errors of the other episodes.
     """
 
     kind: Kind
     ids: list[str] = field(default_factory=list)
+    present: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
     reports: list[ImportReport] = field(default_factory=list)
-    kept: dict[str, str] = field(default_factory=dict)
-    refused: list[Refused] = field(default_factory=list)
-    contradictions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def as_json(self) -> dict[str, object]:
@@ -97,23 +109,26 @@ class DatasetImport:
         told: set[str] = set()
         for report in self.reports:
             head, *rest = report.lines()
-            yield head
+            yield head if report.imported else report.recording_id
             about = ("  refused", "  contradiction")
             fresh = [one for one in rest if not told or one.startswith(about)]
             yield from (one for one in fresh if one not in told)
             told.update(rest)
-        if not self.reports:
-            yield from self.ids
-            yield from (f"  {name}  <- {key}" for key, name in self.kept.items())
-            yield from (f"  refused {one.source}: {one.reason}" for one in self.refused)
-            yield from (f"  contradiction: {one}" for one in self.contradictions)
+        if self.present:
+            yield f"{len(self.present)} episodes of these files are in the store already"
 
 
 def import_lerobot(
     folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
 ) -> list[str]:
-    """Write every episode of a dataset into the store and return the ids; see `import_dataset`."""
-    return import_dataset(folder, store, options=options).ids
+    """Write every episode of a dataset into the store and return the ids, as `import_dataset`.
+
+    Raises also if some episodes fail, when the others are written: the first error.
+    """
+    result, error = _import(folder, store, options)
+    if error is not None:
+        raise error
+    return result.ids
 
 
 def import_dataset(
@@ -123,9 +138,11 @@ def import_dataset(
 
     Our own exports become episodes, and so do datasets with a 67-D action and a head camera.
     Everything else becomes recordings, with a stream for each feature. Each appears complete or not
-    at all; after an error, earlier ones remain. Nothing outside the folder is read.
+    at all; one that fails is listed in `failed` and the next one is tried. Those that the store has
+    from the same files are skipped, so that an import can be repeated. Nothing outside the folder
+    is read.
 
-    Raises:
+    Raises, if no episode can be imported, what the first one of them raised:
         NotFoundError: a file is missing.
         UnknownNameError: a mapping of an unknown name, or to a feature that the dataset lacks.
         InvalidInputError: another version of the format, or options that do not fit.
@@ -133,14 +150,29 @@ def import_dataset(
         LimitExceededError: larger than the limits of this reader.
         ConflictError: an id exists already.
     """
+    result, error = _import(folder, store, options)
+    if error is not None and not (result.ids or result.present):
+        raise error
+    return result
+
+
+def _import(
+    folder: Path, store: EpisodeStore, options: ImportOptions
+) -> tuple[DatasetImport, DexTouchError | None]:
+    """What came in, and the first error of an episode."""
     source = LeRobotFolder(folder)
     first = source.sidecar(source.episodes[0]) if source.episodes else None
     features, missing = _map_features(source.info, options.mapping, _tactile_layout(first))
     if first is None and missing:
         result = DatasetImport("recording", notes=[f"imported as recordings: {'; '.join(missing)}"])
-        result.reports = import_recordings(source, store, options)
-        result.ids = [report.recording_id for report in result.reports]
-        return result
+        write = recordings_importer(source, store, options)
+
+        def import_one(entry: EpisodeEntry) -> None:
+            report = write(entry)
+            (result.ids if report.imported else result.present).append(report.recording_id)
+            result.reports += [report] if report.imported else []
+
+        return result, _import_each(source, import_one, result)
     if missing:
         raise InvalidInputError(f"{folder}: an export of DexTouch that is changed: {missing}")
     if options.fps is not None:
@@ -150,10 +182,30 @@ def import_dataset(
         if is_taken and name not in {*_ROLES, *features}:
             raise UnknownNameError(f"name of feature {key!r} (--map)", name, [*_ROLES, "camera_…"])
     result = DatasetImport("episode")
-    result.contradictions = dataset_contradictions(source)
+    about = dataset_contradictions(source)
+
+    def import_episode(entry: EpisodeEntry) -> None:
+        report = _import_episode(source, store, entry, features, options, result)
+        if report is not None:
+            report.contradictions += about
+            result.ids.append(report.recording_id)
+            result.reports.append(report)
+
+    return result, _import_each(source, import_episode, result)
+
+
+def _import_each(
+    source: LeRobotFolder, import_one: Callable[[EpisodeEntry], None], result: DatasetImport
+) -> DexTouchError | None:
+    """Try every episode once; returns the first error."""
+    first = None
     for entry in source.episodes:
-        _import_episode(source, store, entry, features, options, result)
-    return result
+        try:
+            import_one(entry)
+        except DexTouchError as error:
+            result.failed[f"episode {entry.index}"] = error.message
+            first = first or error
+    return first
 
 
 def _import_episode(
@@ -163,13 +215,13 @@ def _import_episode(
     features: Mapping[str, str],
     options: ImportOptions,
     result: DatasetImport,
-) -> None:
+) -> ImportReport | None:
     sidecar = source.sidecar(entry)
     content, anchor = _content(source, entry, features, sidecar, options.images)
+    refused: list[Refused] = []
     if sidecar is None:
         changes = _foreign_attributes(source, entry, anchor, options)
-        result.refused = _add_others(content, source, entry, features, options)
-        result.kept |= {one.source: one.descriptor.name for one in content.others}
+        refused = _add_others(content, source, entry, features, options)
     else:
         changes = _known_attributes(source, anchor, sidecar, options)
     try:
@@ -179,12 +231,20 @@ def _import_episode(
             f"import from LeRobot: the options make no episode ({first_problems(error)})"
         ) from error
     if store.exists(attributes.episode_id):
+        if store.open(attributes.episode_id).attributes.lineage == attributes.lineage:
+            result.present.append(attributes.episode_id)
+            return None
         raise ConflictError(
             f"episode {attributes.episode_id!r} exists already; give another "
             "id_prefix (`dextouch import --id-prefix`)"
         )
-    _store(store, attributes, content)
-    result.ids.append(attributes.episode_id)
+    report = ImportReport(attributes.episode_id, whole_text(source.folder.name), refused=refused)
+    report.imported = _store(store, attributes, content, features)
+    if sidecar is not None:
+        told = [f"{one.source}: {note}" for one in report.imported for note in one.notes]
+        result.notes += [note for note in told if note not in result.notes]
+        report.imported = []
+    return report
 
 
 def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
@@ -213,8 +273,11 @@ def _map_features(
             said = f"{name!r} is {_describe(got)}, expected float32 {[*shape]}" if got else ""
             problems.append(f"{ours!r}: {said or f'no feature {name!r}'}")
     cameras = _cameras(info, names)
-    if HEAD not in cameras:
-        problems.append(f"{HEAD!r}: no feature {layout.IMAGES + HEAD!r} (--map {HEAD}=FEATURE)")
+    if HEAD_CAMERA not in cameras:
+        problems.append(
+            f"{HEAD_CAMERA!r}: no feature {layout.IMAGES + HEAD_CAMERA!r} "
+            f"(--map {HEAD_CAMERA}=FEATURE)"
+        )
     problems += [
         f"{ours!r}: {name!r} is {_describe(info.features[name])}, expected images [h, w, 3]"
         for ours, name in cameras.items()
@@ -324,8 +387,14 @@ def _add_others(
     return refused
 
 
-def _store(store: EpisodeStore, attributes: EpisodeAttributes, content: _Content) -> None:
+def _store(
+    store: EpisodeStore,
+    attributes: EpisodeAttributes,
+    content: _Content,
+    features: Mapping[str, str],
+) -> list[ImportedStream]:
     """Write an episode into the store, atomically."""
+    told = []
     with store.writer(attributes=attributes) as writer:
 
         def add(name: str, **properties: object) -> None:
@@ -336,12 +405,31 @@ def _store(store: EpisodeStore, attributes: EpisodeAttributes, content: _Content
             more = {}
             if kind == "tactile" and content.tactile_layout != DEXTOUCH_V1:
                 more["layout"] = content.tactile_layout
-            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit, **more)
-            writer.append(name, values=values[keep], t_ref_ns=content.t_ref_ns[keep])
+            t_ns, shape, role = content.t_ref_ns[keep], values.shape[1:], name.partition("_")[0]
+            add(name, kind=kind, shape=shape, dtype=str(values.dtype), unit=unit, **more)
+            writer.append(name, values=values[keep], t_ref_ns=t_ns)
+            one = ImportedStream(name, features[role], kind, unit, shape, None)
+            told.append(_timed(one, [t_ns]))
         for stream in content.others:
-            writer.add_stream(stream.descriptor)
+            about, stamps = stream.descriptor, []
+            writer.add_stream(about)
             for block in stream.blocks:
-                writer.append(stream.descriptor.name, values=block.values, t_ref_ns=block.t_ns)
+                writer.append(about.name, values=block.values, t_ref_ns=block.t_ns)
+                stamps.append(block.t_ns)
+            one = ImportedStream(
+                about.name, stream.source, about.kind, about.unit, about.shape, about.frame
+            )
+            one.notes = tuple(stream.notes)
+            told.append(_timed(one, stamps))
+    return told
+
+
+def _timed(stream: ImportedStream, stamps_ns: Sequence[np.ndarray]) -> ImportedStream:
+    t_ns = np.concatenate(stamps_ns)
+    stream.num_samples = len(t_ns)
+    stream.duration_s = float(np.ptp(t_ns)) / 1e9
+    stream.rate_hz = (len(t_ns) - 1) / stream.duration_s if stream.duration_s else 0.0
+    return stream
 
 
 def _columns(
@@ -429,11 +517,12 @@ def _foreign_attributes(
     anchor: AnchorPoses | None,
     options: ImportOptions,
 ) -> dict[str, object]:
-    name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
+    name = whole_text(source.folder.resolve().name)
     digest = file_sha256(source.data_file(entry))
     came_from = f"lerobot:{name}/episode-{entry.index:06d}"
     return {
-        "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
+        "episode_id": options.id_prefix
+        + dataset_id(source, entry, MAX_ID - len(options.id_prefix)),
         "task": (options.task or entry.task or "unknown")[:128],
         "instruction": (options.instruction or entry.task)[:MAX_INSTRUCTION],
         "domain": options.domain,

@@ -1,15 +1,17 @@
 """Import of the episodes of any LeRobot dataset as recordings, with the streams that it has."""
 
 import hashlib
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dextouch.bridges.foreign import (
+    MAX_ID,
     ForeignStream,
     ImportAttributes,
+    ImportChoices,
     ImportReport,
     Refused,
     file_sha256,
@@ -23,7 +25,6 @@ from dextouch.bridges.lerobot.feature_streams import (
     COUNTERS,
     TASK_INDEX,
     Frames,
-    ImageUnit,
     feature_streams,
     text_stream,
 )
@@ -40,31 +41,28 @@ MAX_FPS = 1000
 
 
 @dataclass(frozen=True)
-class ImportOptions:
+class ImportOptions(ImportChoices):
     """Options of an import: information that the dataset itself lacks.
 
     `mapping`: our name → the dataset's feature, for features under other names: `action`, `state`,
     `tactile` and cameras (`camera_head`, `camera_wrist_left`, …); of recordings the name of any
-    stream. `id_prefix`: put before every id (needed when ids exist already); `images`: the unit
-    that images are stored in, None for the one nearest to what they are. Only for datasets of other
-    origin: `K_head` in pixels, `domain`, `task` and `instruction` (without them the dataset's own
-    text), and `fps`, the rate instead of that and the timestamps of the dataset.
+    stream. `images`: None for the unit nearest to what they are. Only for datasets of other origin:
+    `domain`, `task`, `instruction`, `K_head` in pixels, and `fps`, the rate instead of that and the
+    timestamps of the dataset.
     """
 
-    mapping: Mapping[str, str] = field(default_factory=dict)
-    id_prefix: str = ""
-    images: ImageUnit | None = None
-    K_head: Matrix | None = None
     domain: Domain = "robot"
-    task: str | None = None
-    instruction: str = ""
+    K_head: Matrix | None = None
     fps: float | None = None
 
 
-def import_recordings(
+def recordings_importer(
     source: LeRobotFolder, store: EpisodeStore, options: ImportOptions
-) -> list[ImportReport]:
-    """Write every episode of a dataset as a recording; raises as `import_lerobot`."""
+) -> Callable[[EpisodeEntry], ImportReport]:
+    """What writes an episode of a dataset as a recording; raises as `import_lerobot`.
+
+    Its report lists nothing as imported if the store has that recording of the same files already.
+    """
     names = _names(source, options.mapping)
     if options.fps is not None and not 0 < options.fps <= MAX_FPS:
         raise InvalidInputError(f"fps: got {options.fps}, expected above 0 and at most {MAX_FPS}")
@@ -76,13 +74,25 @@ def import_recordings(
         )
     about = dataset_contradictions(source)
     digests: dict[Path, str] = {}
-    reports = []
-    for entry in source.episodes:
+
+    def write(entry: EpisodeEntry) -> ImportReport:
         attributes = _attributes(source, entry, options, digests)
+        if _is_present(store, attributes):
+            return ImportReport(attributes.recording_id, source.folder.name)
         report = _import_one(source, store, entry, names, options, attributes)
         report.contradictions[:0] = about
-        reports.append(report)
-    return reports
+        return report
+
+    return write
+
+
+def _is_present(store: EpisodeStore, attributes: RecordingAttributes) -> bool:
+    """Whether the store has the recording, of files with the same content."""
+    name, source = attributes.recording_id, attributes.imported_from
+    if not store.exists(name, kind="recording"):
+        return False
+    known = store.recording(name).attributes.imported_from
+    return known is not None and source is not None and known.sha256 == source.sha256
 
 
 def _names(source: LeRobotFolder, mapping: Mapping[str, str]) -> dict[str, str]:
@@ -231,6 +241,12 @@ def _files(source: LeRobotFolder, entry: EpisodeEntry) -> list[Path]:
     return [path for path in dict.fromkeys(files) if path.is_file()]
 
 
+def dataset_id(source: LeRobotFolder, entry: EpisodeEntry, length: int = MAX_ID) -> str:
+    """Id of an episode: that of a recording of the folder, and its number."""
+    number, plain = f"-{entry.index:06d}", source.folder.resolve().name.replace(".", "-")
+    return recording_id_of(Path(plain))[: max(1, length - len(number))] + number
+
+
 def _attributes(
     source: LeRobotFolder, entry: EpisodeEntry, options: ImportOptions, digests: dict[Path, str]
 ) -> RecordingAttributes:
@@ -256,11 +272,10 @@ def _attributes(
         calibration={} if options.K_head is None else {"K_head": np.array(options.K_head)},
         sha256=hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest(),
     )
-    number, plain = f"-{entry.index:06d}", root.name.replace(".", "-")
+    name = dataset_id(source, entry, MAX_ID - len(options.id_prefix))
     return attributes.model_copy(
         update={
-            "recording_id": recording_id_of(Path(plain), options.id_prefix)[: 128 - len(number)]
-            + number,
+            "recording_id": recording_id_of(Path(name), options.id_prefix),
             "lineage": tuple(
                 LineageEntry(
                     kind="recording", id=whole_text(f"lerobot:{root.name}/{name}"), sha256=digest

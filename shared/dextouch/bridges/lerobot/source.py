@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -23,12 +24,15 @@ MAX_INFO_BYTES: Final = 1 << 24
 MAX_SIDECAR_BYTES: Final = 1 << 22
 MAX_EPISODES: Final = 1_000_000
 MAX_EPISODE_FRAMES: Final = 1_000_000
-MAX_TABLE_BYTES: Final = 1 << 31
+# Of the decoded values of one file, and what a text takes beside its bytes.
+MAX_TABLE_BYTES: Final = 1 << 30
+TEXT_OVERHEAD_BYTES: Final = 64
 MAX_TABLE_ROWS: Final = 20_000_000
 MAX_LINES_BYTES: Final = 1 << 28
 # Bytes of one encoded image.
 MAX_IMAGE_BYTES: Final = 1 << 26
-_IMAGES_AT_ONCE = 32
+_IMAGES_AT_ONCE = 8
+_PHYSICAL_BYTES = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 8, "FLOAT": 4, "DOUBLE": 8}
 _INDICES = ("chunk_index", "file_index")
 # Where the images of a feature are that the table has no column of; the first is that of v3.
 _IMAGE_PATHS = (
@@ -460,30 +464,77 @@ def _read_table(
     if not path.is_file():
         raise NotFoundError(f"{path}: is missing from the dataset")
     try:
-        with pq.ParquetFile(path, memory_map=True) as file:
-            present = file.schema_arrow.names
-            asked = present if columns is None else columns
-            wanted = [c for c in asked if c in present and c not in leave_out]
-            groups = [file.metadata.row_group(g) for g in range(file.metadata.num_row_groups)]
-            parts = (g.column(c) for g in groups for c in range(g.num_columns))
-            # Columns of lists and structures have a path that goes on after their name.
-            starts = tuple(f"{column}." for column in wanted)
-            size = sum(
-                part.total_uncompressed_size
-                for part in parts
-                if f"{part.path_in_schema}.".startswith(starts)
-            )
-            rows = file.metadata.num_rows
-            if size > MAX_TABLE_BYTES or rows > MAX_TABLE_ROWS:
-                raise LimitExceededError(
-                    f"{path}: got {rows} rows in {size} bytes, expected at most {MAX_TABLE_ROWS} "
-                    f"rows in {MAX_TABLE_BYTES} bytes; split the dataset into smaller files"
-                )
-            return file.read(columns=wanted, use_threads=False)
+        metadata = pq.read_metadata(path)
+        present = metadata.schema.to_arrow_schema()
+        asked = present.names if columns is None else columns
+        wanted = [c for c in asked if c in present.names and c not in leave_out]
+        size, texts = _table_size(path, metadata, wanted)
+        # Repeated texts stay one, whatever their number.
+        with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
+            _check_size(path, metadata.num_rows, size)
+            tables = []
+            for number in range(metadata.num_row_groups):
+                table = file.read_row_group(number, columns=wanted, use_threads=False)
+                size += sum(_repeated_bytes(column) for column in table.columns)
+                _check_size(path, metadata.num_rows, size)
+                tables.append(table)
+            if not tables:
+                return file.read(columns=wanted)
+            return pa.concat_tables(tables)
     except (pa.ArrowException, OSError) as error:
         raise CorruptDataError(
             f"{path}: is not a complete parquet file ({error}); copy the dataset again"
         ) from error
+
+
+def _table_size(
+    path: Path, metadata: pq.FileMetaData, wanted: Sequence[str]
+) -> tuple[int, list[str]]:
+    """Bytes of the decoded columns, without repeated texts, and the paths of their texts."""
+    # Columns of lists and structures have a path that goes on after their name.
+    starts = tuple(f"{column}." for column in wanted)
+    size, texts = 0, set()
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for index in range(group.num_columns):
+            part = group.column(index)
+            if not f"{part.path_in_schema}.".startswith(starts):
+                continue
+            width = _PHYSICAL_BYTES.get(part.physical_type, metadata.schema.column(index).length)
+            if width:
+                size += part.num_values * width
+                continue
+            texts.add(part.path_in_schema)
+            # What a text without a dictionary has in the file is what it has in memory.
+            size += part.total_uncompressed_size + part.num_values * TEXT_OVERHEAD_BYTES
+            if "DELTA_BYTE_ARRAY" in part.encodings:
+                raise InvalidInputError(
+                    f"{path}: column {part.path_in_schema!r} is encoded as DELTA_BYTE_ARRAY; "
+                    "expected texts with or without a dictionary"
+                )
+    return size, sorted(texts)
+
+
+def _check_size(path: Path, rows: int, size: int) -> None:
+    if size > MAX_TABLE_BYTES or rows > MAX_TABLE_ROWS:
+        raise LimitExceededError(
+            f"{path}: got {rows} rows that need {size} bytes, expected at most {MAX_TABLE_ROWS} "
+            f"rows in {MAX_TABLE_BYTES} bytes; split the dataset into smaller files"
+        )
+
+
+def _repeated_bytes(column: object) -> int:
+    """Bytes of the texts in an array, each counted as often as it occurs."""
+    array: Any = column
+    parts = getattr(array, "chunks", None)
+    if parts is None and hasattr(array, "dictionary"):
+        counts = np.bincount(array.indices.drop_null().to_numpy(), minlength=len(array.dictionary))
+        lengths = pc.binary_length(array.dictionary).fill_null(0).to_numpy(zero_copy_only=False)
+        return int(counts.astype(np.int64) @ lengths.astype(np.int64))
+    if parts is None and hasattr(array, "flatten"):
+        # Of lists their values, of structures one array for each field.
+        flat = array.flatten()
+        parts = flat if isinstance(flat, list) else [flat]
+    return sum(_repeated_bytes(part) for part in parts or ())
 
 
 def _table_rows(table: pa.Table, path: Path) -> list[dict[str, Any]]:
