@@ -142,21 +142,13 @@ class _Readings:
             try:
                 plain = decode(message.data)
                 if schema in CALIBRATIONS:
-                    self._note_camera(channel.topic, plain)
+                    if self._survey is not None:
+                        self._survey.note_camera(channel.topic, camera_model(plain))
                     return
                 reading = replace(reading, items=tuple(items_of(schema, plain)))
             except DexTouchError as error:
                 reason = error.message
         yield replace(reading, reason=reason) if reason else reading
-
-    def _note_camera(self, topic: str, plain: Plain) -> None:
-        if self._survey is not None:
-            model = camera_model(plain)
-            first, count = self._survey.cameras.get(topic, (model, 0))
-            self._survey.cameras[topic] = (first, count + 1)
-            if first != model:
-                reason = "calibration that differs from the first one, which is used"
-                self._survey.refuse(topic, "calibration", reason)
 
 
 def _decoder_of(encoding: str, schema: "Schema | None") -> Decoder | str:

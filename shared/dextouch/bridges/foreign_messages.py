@@ -8,6 +8,7 @@ other message becomes a vector of the numbers in it, each with its path as a nam
 import base64
 import binascii
 import math
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -23,7 +24,7 @@ from dextouch.bridges.foreign_images import (
     raw_form,
 )
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
-from dextouch.streams import NO_DEVICE_TIME, StreamKind
+from dextouch.streams import JPEG_UNIT, NO_DEVICE_TIME, StreamKind
 
 MAX_POINTS: Final = 1 << 18
 MAX_POINT_FIELDS: Final = 64
@@ -237,26 +238,50 @@ def _pose_item(message: Plain, pose: list[float], frame: str | None, *, key: str
     return _array_item(message, form, np.array(pose), key=key)
 
 
+def encoded_image(data: bytes) -> tuple[Form, Callable[[], np.ndarray | bytes]]:
+    """Form and decoder of a JPEG, which is kept, or a PNG."""
+    unit, dtype, shape, data = compressed_form(data)
+    form = Form("image", unit, dtype, shape)
+    if unit == JPEG_UNIT:
+        return form, lambda: data
+    return replace(form, notes=("PNG decoded",)), partial(decode_png, data, shape, dtype)
+
+
+def raw_image(
+    encoding: str, size_px: tuple[int, int], step: int, data: bytes, *, big_endian: bool = False
+) -> tuple[Form, Callable[[], np.ndarray]]:
+    """Form and decoder of raw pixels, with rows of `step` bytes."""
+    unit, dtype, shape = raw_form(encoding, *size_px, step, data)
+    form = Form("image", unit, dtype, shape)
+    if dtype == "float32":
+        form = replace(form, kind="scalar", as_numbers=f"pixels {encoding}")
+    return form, partial(decode_raw, encoding, shape, step, data, big_endian=big_endian)
+
+
 def _compressed_image(message: Plain) -> list[Item]:
-    unit, dtype, shape, data = compressed_form(_bytes(message["data"]))
-    form = Form("image", unit, dtype, shape, _frame(message))
-    if unit == "jpeg":
-        return [_item(message, form, lambda: data)]
-    form = replace(form, notes=("PNG decoded",))
-    return [_item(message, form, partial(decode_png, data, shape, dtype))]
+    data = _bytes(message["data"])
+    form, decode = encoded_image(data)
+    if _text(message.get("format")).startswith("32FC1") and form.unit == "mono16":
+        # compressed_depth_image_transport has quantised inverse depths, by two numbers before them.
+        a, b = struct.unpack_from("<ff", data, 4)
+        form = replace(form, kind="scalar", unit="m", dtype="float32", as_numbers="pixels 32FC1")
+        decode = partial(_depths_m, decode, a, b)
+    return [_item(message, replace(form, frame=_frame(message)), decode)]
+
+
+def _depths_m(decode: Callable[[], np.ndarray], a: float, b: float) -> np.ndarray:
+    """Depths of quantised inverse ones, which are 0 where there is none."""
+    inverse = decode().astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(inverse > 0, a / (inverse - b), np.nan).astype(np.float32)
 
 
 def _raw_image(message: Plain) -> list[Item]:
     encoding, data = _text(message.get("encoding")), _bytes(message["data"])
     size_px, step = (int(message["height"]), int(message["width"])), int(message["step"])
-    unit, dtype, shape = raw_form(encoding, *size_px, step, data)
-    form = Form("image", unit, dtype, shape, _frame(message))
-    if dtype == "float32":
-        form = replace(form, kind="scalar", as_numbers=f"pixels {encoding}")
-    decode = partial(
-        decode_raw, encoding, shape, step, data, big_endian=bool(message.get("is_bigendian"))
-    )
-    return [_item(message, form, decode)]
+    big_endian = bool(message.get("is_bigendian"))
+    form, decode = raw_image(encoding, size_px, step, data, big_endian=big_endian)
+    return [_item(message, replace(form, frame=_frame(message)), decode)]
 
 
 def _video(message: Plain) -> list[Item]:

@@ -420,6 +420,14 @@ class Survey:
             except DexTouchError as error:
                 self.refuse(reading.source, reading.schema, error.message)
 
+    def note_camera(self, source: str, model: CameraModel) -> None:
+        """Count a calibration; the first of a source is used."""
+        first, count = self.cameras.get(source, (model, 0))
+        self.cameras[source] = (first, count + 1)
+        if first != model:
+            reason = "calibration that differs from the first one, which is used"
+            self.refuse(source, "calibration", reason)
+
     def refuse(self, source: str, schema: str, reason: str) -> None:
         """Count a record without samples; past a number of reasons those of a source are one."""
         key = (source, schema, reason)
