@@ -20,7 +20,12 @@ from dextouch.episodes import (
 )
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import first_problems
-from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
+from services.pipelines.parsers import (
+    JOINT_FORMATS,
+    check_format_options,
+    export_parser,
+    import_parser,
+)
 
 if TYPE_CHECKING:
     from dextouch.bridges.foreign import ImportReport
@@ -170,16 +175,11 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
+    check_format_options(export_parser(), options, form)
     if form in JOINT_FORMATS and options.kind == "recording":
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
-    if options.append and form != "lerobot":
-        raise InvalidInputError(
-            f"--append: a file of {form!r} cannot grow; only lerobot data sets can"
-        )
-    if options.layout is not None and form != "mcap":
-        raise InvalidInputError(f"--layout is for format mcap, got {form!r}")
     ids = _ids(store, options)
     damaged: DamagedImages = {}
     report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
@@ -211,7 +211,10 @@ def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
         if len(ids) > 1:
             raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
         paths = {ids[0]: to}
-    taken = [path for path in (*paths.values(), options.layout) if path and path.exists()]
+    layout = _layout_path(options) if form == "mcap" else None
+    if layout in paths.values():
+        raise InvalidInputError(f"--layout {layout}: is one of the exported files; name another")
+    taken = [path for path in (*paths.values(), layout) if path and path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
     return paths
@@ -254,6 +257,7 @@ def _import(options: argparse.Namespace) -> Report:
     from dextouch.bridges.foreign import find_format
 
     form = options.format or find_format(path)
+    check_format_options(import_parser(), options, form)
     about = {"format": form, "store": options.store}
     if form == "lerobot":
         from dextouch.bridges.lerobot import ImportOptions, import_dataset

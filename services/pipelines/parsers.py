@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers, positive
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
+from dextouch.errors import InvalidInputError
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
 from services.twin.names import (
     DEFAULT_MIX,
@@ -27,6 +28,19 @@ from services.world_model.shipped_checkpoints import default_checkpoint
 
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
+# Options of `dextouch export` and `dextouch import` that other formats would ignore.
+_FORMATS_OF = {
+    "append": ("lerobot",),
+    "fps": ("lerobot",),
+    "jpeg_quality": ("mcap",),
+    "k_head": ("lerobot",),
+    "layout": ("mcap",),
+    "license": ("lerobot",),
+    "repo_id": ("lerobot",),
+    "timeline": ("rrd",),
+    "touch_images": ("mcap",),
+    "touch_samples": ("lerobot",),
+}
 _TRAINING_DATA = """\
 Record twin episodes for training and testing networks.
 
@@ -116,7 +130,8 @@ formats:
   umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
            (cannot be imported)
   mcap     one file per episode or recording, every sample; opens in Foxglove
-  rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
+  rrd      one file per episode or recording, every sample; opens in Rerun
+           (imported as a recording of what it shows)
 
 examples:
   dextouch export --format mcap stand-bottle-0003 --to take.mcap
@@ -448,6 +463,20 @@ def export_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def check_format_options(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, form: str
+) -> None:
+    """Raise InvalidInputError for an option that a format of the parser's command has no use of."""
+    is_import = "path" in vars(options)
+    for name, forms in _FORMATS_OF.items():
+        used = (*forms, "rrd") if is_import and name == "layout" else forms
+        given = getattr(options, name, None)
+        if name in vars(options) and given != parser.get_default(name) and form not in used:
+            flag = "--" + name.replace("_", "-")
+            flag = "--no-touch-images" if name == "touch_images" else flag
+            raise InvalidInputError(f"{flag} is for format {' or '.join(used)}, got {form!r}")
+
+
 class _Mapping(argparse.Action):
     """Collects NAME=SOURCE; a name that comes twice is refused."""
 
@@ -487,7 +516,7 @@ def import_parser() -> argparse.ArgumentParser:
     add("--instruction", default="", metavar="TEXT", help="the task's sentence")
     domain = "who acts (default: lerobot robot, others human)"
     add("--domain", choices=("human", "robot"), help=domain)
-    matrix = "lerobot: camera matrix of camera_head, in pixels"
+    matrix = "lerobot: matrix of camera_head in pixels, CX and CY as OpenCV has them plus 0.5"
     add("--k-head", type=_camera_matrix, metavar="FX,FY,CX,CY", help=matrix)
     rate = "lerobot: frames per second instead of the data set's times"
     add("--fps", type=float, metavar="HZ", help=rate)

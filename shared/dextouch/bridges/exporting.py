@@ -30,6 +30,9 @@ from dextouch.tactile import colour
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 BLOCK_IMAGES: Final = 32
+# Fields of our MCAP messages beside those of their public schemas.
+T_DEVICE: Final = "dextouch_t_device_ns"
+SEQUENCE: Final = "dextouch_sequence"
 Reader = EpisodeReader | RecordingReader
 BLOCK_SECONDS: Final = 1.0
 # Of the system call renameat2 (Linux): paths from the working folder; exchange both.

@@ -8,7 +8,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, Literal
 
@@ -31,6 +31,7 @@ _STAMP_SUFFIXES: Final = ("_t_host_ns", "_t_device_ns", "_sequence")
 # First bytes of the formats of single files.
 MAGIC: Final = {"mcap": b"\x89MCAP0\r\n", "rrd": b"RRF"}
 _NS_PER_S: Final = 1_000_000_000
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 # Host times before are those of a clock that counts from its start, not from 1970.
 _EARLIEST_NS: Final = int(datetime(2000, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
 _LATEST_NS: Final = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
@@ -102,9 +103,8 @@ class ImportReport:
         return asdict(self)
 
     def lines(self) -> Iterator[str]:
-        """The report for a terminal, one line each; names in files may hold control characters."""
-        for line in self._lines():
-            yield "".join(one if one.isprintable() else "\ufffd" for one in line)
+        """The report for a terminal, one line each."""
+        return map(printable, self._lines())
 
     def _lines(self) -> Iterator[str]:
         yield f"{self.recording_id}  {self.file}"
@@ -124,6 +124,11 @@ class ImportReport:
             about = f" ({no.schema})" if no.schema else ""
             yield f"  refused {no.source}{about}, {no.num_samples} samples: {no.reason}"
         yield from (f"  contradiction: {one}" for one in self.contradictions)
+
+
+def printable(line: str) -> str:
+    """A line for a terminal; names in files may hold control characters."""
+    return "".join(one if one.isprintable() else "\ufffd" for one in line)
 
 
 @dataclass(frozen=True)
@@ -165,9 +170,11 @@ def find_format(path: Path) -> str:
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return "lerobot"
-        for form in MAGIC:
-            if any(path.glob(f"*.{form}")):
-                return form
+        forms = [form for form in MAGIC if any(path.glob(f"*.{form}"))]
+        if len(forms) == 1:
+            return forms[0]
+        if forms:
+            raise InvalidInputError(f"{path}: holds files of {forms}; choose one with --format")
         found = "a folder without meta/info.json, .mcap or .rrd files"
     else:
         with disk_errors(f"read {path}"), path.open("rb") as file:
@@ -263,7 +270,9 @@ def new_attributes(
     )
     started = None
     if first_ns is not None and _EARLIEST_NS <= first_ns < _LATEST_NS:
-        started = datetime.fromtimestamp(first_ns // _NS_PER_S, tz=UTC)
+        # To the microsecond, and the host time that this is exactly.
+        first_ns -= first_ns % 1000
+        started = _EPOCH + timedelta(microseconds=first_ns // 1000)
     matrices = {k: np.atleast_2d(v).tolist() for k, v in (calibration or {}).items()}
     try:
         return RecordingAttributes.model_validate(

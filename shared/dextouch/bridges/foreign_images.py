@@ -1,16 +1,14 @@
-"""Images in files of other tools: JPEG kept, PNG and raw pixels to arrays, video decoded.
+"""Images in files of other tools: JPEG kept, PNG and raw pixels to arrays.
 
 Sizes are read from headers and checked before anything is decoded.
 """
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import av
 import numpy as np
-from av.video.frame import VideoFrame
-from av.video.reformatter import VideoReformatter
 
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
 from dextouch.images import jpeg_size
@@ -155,78 +153,3 @@ def check_codec(codec: str) -> None:
         raise InvalidInputError(
             f"video format {codec!r}; expected one of {', '.join(VIDEO_CODECS)}"
         )
-
-
-class VideoDecoder:
-    """Decoder of one camera's video, packet by packet; a packet is one image, without B-frames."""
-
-    def __init__(self, codec: str) -> None:
-        self._context: Any = av.CodecContext.create(VIDEO_CODECS[codec], "r")
-        self._context.thread_count = 1
-        # Without low_delay: images come in the order in which they are shown.
-        self._context.options = {"max_pixels": str(MAX_PIXELS)}
-        self._reformatter = VideoReformatter()
-        self._sent = 0
-
-    def decode(self, data: bytes | None) -> Iterator[tuple[int, VideoFrame]]:
-        """Images that a packet completes, with the number of their packet; None ends the video.
-
-        Raises CorruptDataError if a packet cannot be decoded.
-        """
-        packet = None
-        if data is not None:
-            packet = av.Packet(data)
-            packet.pts = packet.dts = self._sent
-            self._sent += 1
-        try:
-            for frame in self._context.decode(packet):
-                if frame.pts is not None and not frame.is_corrupt:
-                    yield frame.pts, frame
-        except (av.FFmpegError, ValueError) as error:
-            raise CorruptDataError(f"video packet cannot be decoded ({error})") from error
-
-    def is_delayed(self) -> bool:
-        """Whether images wait for later packets, as B-frames need it."""
-        return bool(self._context.has_b_frames)
-
-    def to_rgb(self, frame: VideoFrame) -> np.ndarray:
-        """Pixels of a decoded image, uint8 [h, w, 3]."""
-        frame = self._reformatter.reformat(frame, format="rgb24", interpolation="BICUBIC")
-        plane = frame.planes[0]
-        rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
-        pixels = rows[: frame.height, : 3 * frame.width]
-        return np.ascontiguousarray(pixels).reshape(frame.height, frame.width, 3)
-
-
-def check_order(codec: str, packets: Sequence[bytes]) -> bool:
-    """Whether the first packets of a video are 4:2:0 and need no later ones.
-
-    Raises InvalidInputError for images that are shown in another order than they are sent.
-    """
-    decoder, numbers, is_plain = VideoDecoder(codec), [-1], True
-    try:
-        for data in (*packets, None):
-            for number, frame in decoder.decode(data):
-                numbers.append(number)
-                is_plain = is_plain and frame.format.name in {"yuv420p", "yuvj420p"}
-    except CorruptDataError:
-        is_plain = False
-    if numbers != sorted(numbers):
-        raise InvalidInputError(
-            "video with B-frames, whose images are shown in another order than they are sent; "
-            "encode it without them"
-        )
-    return is_plain and not decoder.is_delayed()
-
-
-def video_size(codec: str, packet: bytes) -> tuple[int, int] | None:
-    """Height and width of the image in a packet; None if it does not begin a video."""
-    decoder = VideoDecoder(codec)
-    try:
-        for data in (packet, None):
-            for _, frame in decoder.decode(data):
-                check_pixels(frame.height, frame.width)
-                return frame.height, frame.width
-    except CorruptDataError:
-        return None
-    return None

@@ -21,6 +21,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
+from dextouch.bridges.exporting import SEQUENCE
 from dextouch.bridges.foreign import ImportAttributes, ImportReport
 from dextouch.bridges.foreign_messages import (
     CALIBRATIONS,
@@ -37,6 +38,8 @@ from dextouch.errors import CorruptDataError, DexTouchError, InvalidInputError, 
 MAX_MESSAGE_BYTES: Final = 1 << 26
 MAX_SCHEMA_BYTES: Final = 1 << 20
 MAX_CHANNELS: Final = 4096
+# Of a message in JSON.
+MAX_JSON_VALUES: Final = 1 << 20
 _MAX_NS: Final = (1 << 63) - 1
 _OF_EXPORTS: Final = (ABOUT, ATTRIBUTES_FILE)
 # What parsers of schemas raise for those that are not valid.
@@ -69,14 +72,20 @@ def import_any_mcap(path: Path, store: EpisodeStore, about: ImportAttributes) ->
         LimitExceededError: larger than the limits of this reader.
         ConflictError: the id is in the store already.
     """
+    decoders: dict[tuple[str, int], Decoder | str] = {}
     try:
         return import_readings(
-            path, store, about, lambda survey: _Readings(path, survey).run(), form="mcap"
+            path, store, about, lambda survey: _Readings(path, survey, decoders).run(), form="mcap"
         )
     except OwnExportError:
-        if about.mapping:
+        # The prefix is of what has no id of its own.
+        plain = ImportAttributes(id_prefix=about.id_prefix)
+        flags = {"mapping": "map"}
+        given = [flags.get(n, n) for n, v in vars(plain).items() if getattr(about, n) != v]
+        if given:
             raise InvalidInputError(
-                f"{path}: is an export of DexTouch, whose streams have their names; leave --map out"
+                f"{path}: is an export of DexTouch, which comes back as it was; leave "
+                f"{', '.join(f'--{name}' for name in given)} out"
             ) from None
     return ImportReport(import_mcap(path, store), path.name)
 
@@ -84,10 +93,15 @@ def import_any_mcap(path: Path, store: EpisodeStore, about: ImportAttributes) ->
 class _Readings:
     """One pass over a file; the first one has a survey, for what is no sample."""
 
-    def __init__(self, path: Path, survey: Survey | None) -> None:
+    def __init__(
+        self, path: Path, survey: Survey | None, decoders: dict[tuple[str, int], Decoder | str]
+    ) -> None:
         self._path, self._survey = path, survey
+        # By encoding and schema, each made for the first message of both passes.
+        self._decoders = decoders
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, tuple[Channel, str, Decoder | str]] = {}
+        # With the name of the schema, and why the channel is not read.
+        self._channels: dict[int, tuple[Channel, str, str]] = {}
         self._schema_of: dict[str, str] = {}
 
     def run(self) -> Iterator[Reading]:
@@ -101,7 +115,7 @@ class _Readings:
                     )
                 yield from self._read(record)
             elif isinstance(record, Schema):
-                self._schemas[record.id] = record
+                self._schemas.setdefault(record.id, record)
             elif isinstance(record, Channel):
                 self._add_channel(record)
             elif isinstance(record, Attachment | Metadata) and record.name in _OF_EXPORTS:
@@ -120,18 +134,16 @@ class _Readings:
             )
         schema = self._schemas.get(channel.schema_id)
         name = "" if schema is None else schema_name(schema.name[:256])
-        decoder = _decoder_of(channel.message_encoding, schema)
         known = self._schema_of.setdefault(channel.topic, name)
-        if known != name:
-            decoder = f"the topic has messages of {known!r}, too; give them a topic of their own"
-        self._channels[channel.id] = (channel, name, decoder)
+        other = f"the topic has messages of {known!r}, too; give them a topic of their own"
+        self._channels[channel.id] = (channel, name, "" if known == name else other)
         if self._survey is not None:
             self._survey.known.setdefault(channel.topic, name)
 
     def _read(self, message: Message) -> Iterator[Reading]:
-        channel, schema, decode = self._channels[message.channel_id]
+        channel, schema, reason = self._channels[message.channel_id]
+        decode = reason or self._decoder(channel)
         reading = Reading(channel.topic, schema, message.log_time, sequence=message.sequence or -1)
-        reason = ""
         if isinstance(decode, str):
             reason = decode
         elif len(message.data) > MAX_MESSAGE_BYTES:
@@ -142,21 +154,22 @@ class _Readings:
             try:
                 plain = decode(message.data)
                 if schema in CALIBRATIONS:
-                    self._note_camera(channel.topic, plain)
+                    if self._survey is not None:
+                        self._survey.note_camera(channel.topic, camera_model(plain))
                     return
-                reading = replace(reading, items=tuple(items_of(schema, plain)))
+                # Of an export of ours without its attachments; 0 in those of episodes.
+                number = int(plain.get(SEQUENCE) or reading.sequence)
+                reading = replace(reading, items=tuple(items_of(schema, plain)), sequence=number)
             except DexTouchError as error:
                 reason = error.message
         yield replace(reading, reason=reason) if reason else reading
 
-    def _note_camera(self, topic: str, plain: Plain) -> None:
-        if self._survey is not None:
-            model = camera_model(plain)
-            first, count = self._survey.cameras.get(topic, (model, 0))
-            self._survey.cameras[topic] = (first, count + 1)
-            if first != model:
-                reason = "calibration that differs from the first one, which is used"
-                self._survey.refuse(topic, "calibration", reason)
+    def _decoder(self, channel: Channel) -> Decoder | str:
+        key = (channel.message_encoding, channel.schema_id)
+        if key not in self._decoders:
+            schema = self._schemas.get(channel.schema_id)
+            self._decoders[key] = _decoder_of(channel.message_encoding, schema)
+        return self._decoders[key]
 
 
 def _decoder_of(encoding: str, schema: "Schema | None") -> Decoder | str:
@@ -181,6 +194,9 @@ def _decoder_of(encoding: str, schema: "Schema | None") -> Decoder | str:
 
 
 def _from_json(data: bytes) -> Plain:
+    # Base64 has none of these; an empty object takes 20 times its two bytes.
+    if sum(map(data.count, (b",", b"{", b"["))) > MAX_JSON_VALUES:
+        raise LimitExceededError(f"message of more than {MAX_JSON_VALUES} values")
     try:
         plain = json.loads(data)
     except (ValueError, RecursionError) as error:

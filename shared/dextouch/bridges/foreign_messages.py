@@ -8,6 +8,7 @@ other message becomes a vector of the numbers in it, each with its path as a nam
 import base64
 import binascii
 import math
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -15,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
 from dextouch.bridges.foreign_images import (
     check_codec,
     compressed_form,
@@ -23,7 +25,7 @@ from dextouch.bridges.foreign_images import (
     raw_form,
 )
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
-from dextouch.streams import NO_DEVICE_TIME, StreamKind
+from dextouch.streams import JPEG_UNIT, NO_DEVICE_TIME, StreamKind
 
 MAX_POINTS: Final = 1 << 18
 MAX_POINT_FIELDS: Final = 64
@@ -33,6 +35,11 @@ VIDEO_UNIT: Final = "video "
 POSE_UNIT: Final = "pose_m_wxyz"
 NUMBERS_UNIT: Final = "numbers"
 CALIBRATIONS: Final = frozenset({"foxglove.CameraCalibration", "sensor_msgs/CameraInfo"})
+MAX_DEPTH: Final = 64
+# Between the key of a sample and the sorted names of its joints.
+GROUP: Final = "\0"
+# Whole numbers up to this are exact as float64.
+_MAX_EXACT: Final = 1 << 53
 _NS_PER_S: Final = 1_000_000_000
 _MAX_NS: Final = (1 << 63) - 1
 # Types of a point's fields by number: foxglove.PackedElementField and sensor_msgs/PointField.
@@ -110,6 +117,8 @@ class CameraModel:
     size_px: tuple[int, int]
     K: tuple[float, ...]
     distortion: tuple[float, ...]
+    # Of rectified images; None where the calibration has none.
+    K_rectified: tuple[float, ...] | None = None
 
 
 def schema_name(name: str) -> str:
@@ -132,8 +141,10 @@ def items_of(schema: str, message: Plain) -> list[Item]:
         if package == "std_msgs" and short.endswith("MultiArray"):
             return [_multi_array(short.removesuffix("MultiArray"), message)]
         if schema.startswith("dextouch.") and "shape" in message:
-            return [_our_array(message)]
-        return [_flat(message)]
+            return [_our_array(schema, message)]
+        ours = {T_DEVICE, SEQUENCE} & message.keys()
+        item = _flat({name: value for name, value in message.items() if name not in ours})
+        return [replace(item, t_device_ns=_stamp_ns(message)) if ours else item]
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise CorruptDataError(
             f"not a valid {schema or 'message'} ({type(error).__name__}: {error})"
@@ -152,15 +163,22 @@ def camera_model(message: Plain) -> CameraModel:
     try:
         K = _numbers(message.get("K", message.get("k"))).astype(np.float64).ravel()
         D = _numbers(message.get("D", message.get("d", []))).astype(np.float64).ravel()
+        P = _numbers(message.get("P", message.get("p", []))).astype(np.float64).ravel()
         size_px = int(message["height"]), int(message["width"])
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptDataError(f"not a valid calibration ({error})") from error
     if K.shape != (9,) or D.size > 5 or not (np.isfinite(K).all() and K[0] > 0 and K[4] > 0):
         raise CorruptDataError(f"calibration with K of {K.size} and D of {D.size} numbers: {K}")
-    K[2] += 0.5
-    K[5] += 0.5
+    rectified = None
+    if P.shape == (12,) and np.isfinite(P).all() and P[0] > 0 and P[5] > 0:
+        rectified = _from_corner(P.reshape(3, 4)[:, :3])
+    distortion = tuple([*D.tolist(), *[0.0] * 5][:5])
     frame = _frame(message) or ""
-    return CameraModel(frame, size_px, tuple(K.tolist()), tuple([*D.tolist(), *[0.0] * 5][:5]))
+    return CameraModel(frame, size_px, _from_corner(K.reshape(3, 3)), distortion, rectified)
+
+
+def _from_corner(K: np.ndarray) -> tuple[float, ...]:
+    return tuple((K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])).ravel().tolist())
 
 
 def _text(value: object) -> str:
@@ -201,12 +219,22 @@ def _frame(message: Plain) -> str | None:
     return _text(frame) or None
 
 
+def _stamp_path(message: Plain) -> str:
+    """Where the message has its own time; empty if nowhere."""
+    header = message.get("header")
+    if isinstance(header, Mapping) and isinstance(header.get("stamp"), Mapping):
+        return "header.stamp."
+    return "timestamp." if isinstance(message.get("timestamp"), Mapping) else ""
+
+
 def _stamp_ns(message: Plain) -> int:
     """The message's own time; NO_DEVICE_TIME without one, and for 0, which means the same."""
-    header = message.get("header")
-    stamp = header.get("stamp") if isinstance(header, Mapping) else message.get("timestamp")
-    if not isinstance(stamp, Mapping):
+    path = _stamp_path(message)
+    if T_DEVICE in message:
+        return max(0, int(message[T_DEVICE])) or NO_DEVICE_TIME
+    if not path:
         return NO_DEVICE_TIME
+    stamp = message["header"]["stamp"] if path == "header.stamp." else message["timestamp"]
     seconds = stamp.get("sec", stamp.get("seconds", 0))
     nanos = stamp.get("nsec", stamp.get("nanosec", stamp.get("nanos", 0)))
     t_ns = int(seconds) * _NS_PER_S + int(nanos)
@@ -237,26 +265,50 @@ def _pose_item(message: Plain, pose: list[float], frame: str | None, *, key: str
     return _array_item(message, form, np.array(pose), key=key)
 
 
+def encoded_image(data: bytes) -> tuple[Form, Callable[[], np.ndarray | bytes]]:
+    """Form and decoder of a JPEG, which is kept, or a PNG."""
+    unit, dtype, shape, data = compressed_form(data)
+    form = Form("image", unit, dtype, shape)
+    if unit == JPEG_UNIT:
+        return form, lambda: data
+    return replace(form, notes=("PNG decoded",)), partial(decode_png, data, shape, dtype)
+
+
+def raw_image(
+    encoding: str, size_px: tuple[int, int], step: int, data: bytes, *, big_endian: bool = False
+) -> tuple[Form, Callable[[], np.ndarray]]:
+    """Form and decoder of raw pixels, with rows of `step` bytes."""
+    unit, dtype, shape = raw_form(encoding, *size_px, step, data)
+    form = Form("image", unit, dtype, shape)
+    if dtype == "float32":
+        form = replace(form, kind="scalar", as_numbers=f"pixels {encoding}")
+    return form, partial(decode_raw, encoding, shape, step, data, big_endian=big_endian)
+
+
 def _compressed_image(message: Plain) -> list[Item]:
-    unit, dtype, shape, data = compressed_form(_bytes(message["data"]))
-    form = Form("image", unit, dtype, shape, _frame(message))
-    if unit == "jpeg":
-        return [_item(message, form, lambda: data)]
-    form = replace(form, notes=("PNG decoded",))
-    return [_item(message, form, partial(decode_png, data, shape, dtype))]
+    data = _bytes(message["data"])
+    form, decode = encoded_image(data)
+    if _text(message.get("format")).startswith("32FC1") and form.unit == "mono16":
+        # compressed_depth_image_transport has quantised inverse depths, by two numbers before them.
+        a, b = struct.unpack_from("<ff", data, 4)
+        form = replace(form, kind="scalar", unit="m", dtype="float32", as_numbers="pixels 32FC1")
+        decode = partial(_depths_m, decode, a, b)
+    return [_item(message, replace(form, frame=_frame(message)), decode)]
+
+
+def _depths_m(decode: Callable[[], np.ndarray], a: float, b: float) -> np.ndarray:
+    """Depths of quantised inverse ones, which are 0 where there is none."""
+    inverse = decode().astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(inverse > 0, a / (inverse - b), np.nan).astype(np.float32)
 
 
 def _raw_image(message: Plain) -> list[Item]:
     encoding, data = _text(message.get("encoding")), _bytes(message["data"])
     size_px, step = (int(message["height"]), int(message["width"])), int(message["step"])
-    unit, dtype, shape = raw_form(encoding, *size_px, step, data)
-    form = Form("image", unit, dtype, shape, _frame(message))
-    if dtype == "float32":
-        form = replace(form, kind="scalar", as_numbers=f"pixels {encoding}")
-    decode = partial(
-        decode_raw, encoding, shape, step, data, big_endian=bool(message.get("is_bigendian"))
-    )
-    return [_item(message, form, decode)]
+    big_endian = bool(message.get("is_bigendian"))
+    form, decode = raw_image(encoding, size_px, step, data, big_endian=big_endian)
+    return [_item(message, replace(form, frame=_frame(message)), decode)]
 
 
 def _video(message: Plain) -> list[Item]:
@@ -388,7 +440,8 @@ def _joints(
         if names and len(names) != len(values):
             raise CorruptDataError(f"{len(names)} names for {len(values)} joints")
         form = Form("robot_state", unit, "float64", values.shape, _frame(message), names)
-        items.append(_array_item(message, form, values, key=key))
+        group = GROUP + GROUP.join(sorted(names)) if names else ""
+        items.append(_array_item(message, form, values, key=key + group))
     if not items:
         raise InvalidInputError("message without a joint")
     return items
@@ -405,21 +458,20 @@ def _multi_array(element: str, message: Plain) -> Item:
     return _array(message, values, shape, dtype)
 
 
-def _our_array(message: Plain) -> Item:
+def _our_array(schema: str, message: Plain) -> Item:
     """An array of DexTouch in a file that is no export of ours any more."""
+    dtype = schema.removeprefix("dextouch.").removesuffix("Array").lower()
+    if dtype not in {"float32", "float64", "int64", "uint16", "uint8"}:
+        raise InvalidInputError(f"array {schema!r}, which this release does not know")
     values = _numbers(message["values"])
-    item = _array(message, values, tuple(int(n) for n in message["shape"]), None)
-    t_device_ns = int(message.get("dextouch_t_device_ns", NO_DEVICE_TIME))
-    return replace(item, t_device_ns=max(NO_DEVICE_TIME, t_device_ns))
+    return _array(message, values, tuple(int(n) for n in message["shape"]), dtype)
 
 
-def _array(message: Plain, values: np.ndarray, shape: tuple[int, ...], dtype: str | None) -> Item:
+def _array(message: Plain, values: np.ndarray, shape: tuple[int, ...], dtype: str) -> Item:
     if not values.size or values.size > MAX_POINTS or math.prod(shape) != values.size:
         raise InvalidInputError(
             f"array of {values.size} numbers and shape {list(shape)}, expected 1 … {MAX_POINTS}"
         )
-    if dtype is None:
-        dtype = values.dtype.name if values.dtype.name in {"float32", "int64"} else "float64"
     form = Form("scalar", NUMBERS_UNIT, dtype, shape, _frame(message))
     return _array_item(message, form, values)
 
@@ -429,18 +481,25 @@ def _flat(message: Plain) -> Item:
     paths: list[tuple[str, int]] = []
     numbers: list[np.ndarray] = []
     skipped: list[str] = []
+    rounded: list[str] = []
     size = 0
+    used = _stamp_path(message)
     for path, value in _leaves(message, ""):
+        if used and path.startswith(used):
+            continue
         if isinstance(value, np.ndarray):
             paths.append((path, value.size if value.ndim else -1))
             numbers.append(value.ravel().astype(np.float64))
             size += value.size
-        elif value not in {None, ""} and path != "frame_id":
+            if value.dtype.kind in "iu" and value.size and _is_rounded(value):
+                rounded.append(path)
+        elif value not in {None, ""} and path not in {"frame_id", "header.frame_id"}:
             skipped.append(path)
         if size > MAX_NUMBERS or len(skipped) > MAX_NUMBERS:
             raise LimitExceededError(f"message of more than {MAX_NUMBERS} values")
     if not size:
         raise InvalidInputError("message without a number")
+    said = {"left out, not numbers": skipped, "above 2^53, rounded": rounded}
     form = Form(
         "scalar",
         NUMBERS_UNIT,
@@ -449,9 +508,13 @@ def _flat(message: Plain) -> Item:
         _frame(message),
         _names(tuple(paths)),
         as_numbers="no schema that this release knows",
-        notes=(f"left out, not numbers: {', '.join(skipped[:8])}",) if skipped else (),
+        notes=tuple(f"{what}: {', '.join(which[:8])}" for what, which in said.items() if which),
     )
     return _array_item(message, form, np.concatenate(numbers))
+
+
+def _is_rounded(values: np.ndarray) -> bool:
+    return int(values.max()) > _MAX_EXACT or int(values.min()) < -_MAX_EXACT
 
 
 @lru_cache(maxsize=64)
@@ -464,21 +527,23 @@ def _names(paths: tuple[tuple[str, int], ...]) -> tuple[str, ...]:
     )
 
 
-def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:
-    """Path and value of all in a message but its own time; numbers and lists of them as arrays."""
+def _leaves(value: object, path: str, depth: int = 0) -> Iterator[tuple[str, object]]:
+    """Path and value of all in a message; numbers and lists of them as arrays."""
+    if depth > MAX_DEPTH:
+        raise LimitExceededError(f"message nested more than {MAX_DEPTH} deep")
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            if path or name not in {"header", "timestamp"}:
-                yield from _leaves(inner, f"{path}.{name}" if path else str(name))
+            yield from _leaves(inner, f"{path}.{name}" if path else str(name), depth + 1)
     elif isinstance(value, bool | int | float | np.ndarray):
         array = np.asarray(value)
         yield path, array if array.dtype.kind in "biuf" and array.ndim < 2 else "array"
     elif isinstance(value, list | tuple):
         if value and all(isinstance(one, bool | int | float) for one in value):
-            yield path, np.array(value, dtype=np.float64)
+            is_whole = all(isinstance(one, int) and -(2**63) <= one < 2**63 for one in value)
+            yield path, np.array(value, dtype=np.int64 if is_whole else np.float64)
             return
         for index, inner in enumerate(value[: MAX_NUMBERS + 1]):
-            yield from _leaves(inner, f"{path}[{index}]")
+            yield from _leaves(inner, f"{path}[{index}]", depth + 1)
     else:
         yield path, value
 

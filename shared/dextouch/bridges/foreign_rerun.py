@@ -1,9 +1,11 @@
 """Import of Rerun `.rrd` files, read by rerun-sdk: what one timeline holds becomes a recording."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,15 +15,7 @@ import pyarrow.types as arrow_types
 from rerun.chunk import Chunk, RrdReader
 
 from dextouch.bridges.foreign import ImportAttributes, ImportReport
-from dextouch.bridges.foreign_images import (
-    RAW,
-    check_codec,
-    check_pixels,
-    compressed_form,
-    decode_png,
-    decode_raw,
-    raw_form,
-)
+from dextouch.bridges.foreign_images import RAW, check_codec, check_pixels
 from dextouch.bridges.foreign_messages import (
     MAX_POINTS,
     NUMBERS_UNIT,
@@ -30,12 +24,20 @@ from dextouch.bridges.foreign_messages import (
     CameraModel,
     Form,
     Item,
+    encoded_image,
+    raw_image,
 )
 from dextouch.bridges.foreign_streams import Reading, Survey, import_readings
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import CorruptDataError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.errors import (
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+)
 from dextouch.geometry import pose_from_transform
-from dextouch.streams import JPEG_UNIT, NO_DEVICE_TIME
+from dextouch.streams import NO_DEVICE_TIME
 
 # Timelines that Rerun adds to every call, used only where a file has no other with times.
 _OF_LOGGING: Final = ("log_time", "log_tick")
@@ -60,7 +62,37 @@ _VIDEO_CODECS: Final = {
     0x61763031: "av1",
 }
 _CHILD_FROM_PARENT: Final = 2
+_ROW_ID: Final = "rerun.controls.RowId"
+# Values that are remembered of entities whose rows leave some out.
+MAX_LATEST: Final = 4_000_000
+# Components that count until they are set again, and those of the samples that they complete.
+_COMPLETED_OF: Final[Mapping[str, tuple[str, ...]]] = {
+    archetype: tuple(f"{archetype}:{name}" for name in names.split())
+    for archetype, names in {
+        "Transform3D": "translation quaternion mat3x3 rotation_axis_angle scale relation",
+        "Image": "format",
+        "DepthImage": "format meter",
+        "VideoStream": "codec",
+        "Pinhole": "image_from_camera resolution camera_xyz",
+    }.items()
+}
+_COMPLETED: Final = frozenset(name for names in _COMPLETED_OF.values() for name in names)
+_COMPLETING: Final = frozenset({"Image:buffer", "DepthImage:buffer", "VideoStream:sample"})
+# What is read of each archetype; the rest is noted.
+_READ: Final[Mapping[str, frozenset[str]]] = {
+    "Points3D": frozenset({"Points3D:positions"}),
+    "EncodedImage": frozenset({"EncodedImage:blob", "EncodedImage:media_type"}),
+} | {
+    archetype: _COMPLETING | {*names, f"{archetype}:is_keyframe"}
+    for archetype, names in _COMPLETED_OF.items()
+}
+_USED_STATIC: Final = frozenset(
+    {"Image:format", "DepthImage:format", "VideoStream:codec"}
+    | {"Pinhole:image_from_camera", "Pinhole:resolution"}
+)
 Row = Mapping[str, Any]
+# Components without the memory of their chunk (`_plain`).
+Known = Mapping[str, Any]
 
 
 def import_rrd(
@@ -68,6 +100,7 @@ def import_rrd(
 ) -> ImportReport:
     """Import the first recording of a file, with the times of a timeline as host times.
 
+    Components that a row leaves out have their newest value, in order of time.
     Without a name the timeline is the only one with times beside Rerun's own, or else `log_time`.
     What is static or not on the timeline is in the report.
 
@@ -86,8 +119,10 @@ def import_rrd(
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:
+    reader, first = _opened(path)[0], None
     try:
-        yield from _opened(path)[0].stream()
+        first = next(iter(reader.recordings()), None)
+        yield from reader.stream(store=first)
     except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
         raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
@@ -96,7 +131,10 @@ def _opened(path: Path) -> tuple[RrdReader, list[str]]:
     """The reader of a file, and its warnings: of a file without a footer, which may be cut."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        return RrdReader(path), [str(one.message) for one in said]
+        try:
+            return RrdReader(path), [str(one.message) for one in said]
+        except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
+            raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
 
 def _timeline(path: Path, name: str | None) -> str:
@@ -125,40 +163,50 @@ class _Rows:
 
     def __init__(self, path: Path, timeline: str, survey: Survey | None) -> None:
         self._path, self._timeline, self._survey = path, timeline, survey
-        # Newest value of each component by entity, static ones included: rows may leave them out.
-        self._last: dict[str, dict[str, Any]] = {}
+        self._latest = _Latest()
 
     def run(self) -> Iterator[Reading]:
-        """Iterate over the rows, static ones first."""
-        if self._survey is not None:
-            for reason in _opened(self._path)[1]:
-                self._survey.refuse(self._path.name, "file", reason)
+        """Iterate over the rows."""
+        self._note_file()
         for chunk in _chunks(self._path):
             if chunk.is_static:
-                self._remember(chunk)
+                self._latest.add_static(chunk)
+                self._note_static(chunk)
+            elif self._timeline in chunk.timeline_names:
+                self._latest.find_gaps(chunk)
+        for entity, known in self._latest.static.items():
+            if (model := _pinhole(known)) is not None:
+                self._note_camera(entity, model)
+        if self._latest.has_gaps():
+            self._latest.add_all(_chunks(self._path), self._timeline)
         for chunk in _chunks(self._path):
             if not chunk.is_static:
                 yield from self._rows(chunk)
 
-    def _remember(self, chunk: Chunk) -> None:
-        batch = chunk.to_record_batch()
-        known = self._last.setdefault(chunk.entity_path, {})
-        for name in _components(batch):
-            for value in batch.column(name):
-                if value.is_valid:
-                    known[name] = value
+    def _note_file(self) -> None:
+        if self._survey is not None:
+            reader, said = _opened(self._path)
+            for reason in said:
+                self._survey.refuse(self._path.name, "file", reason)
+            names = [one.recording_id[:256] for one in reader.recordings()]
+            for other in names[1:]:
+                reason = f"one of several recordings; only the first, {names[0]!r}, is imported"
+                self._survey.refuse(other, "recording", reason)
+
+    def _note_static(self, chunk: Chunk) -> None:
         if self._survey is None or chunk.entity_path.startswith("/__"):
             return
-        if (model := _pinhole(known)) is not None:
-            self._survey.cameras[chunk.entity_path] = (model, 1)
-        else:
-            names = ", ".join(sorted(_components(batch)))[:200]
-            reason = f"static ({names}), so without a time"
+        names = sorted({*_components(chunk.to_record_batch())} - _USED_STATIC)
+        if names:
+            reason = f"static ({', '.join(names)[:200]}), so without a time"
             self._survey.refuse(chunk.entity_path, "static", reason)
+
+    def _note_camera(self, entity: str, model: CameraModel) -> None:
+        if self._survey is not None:
+            self._survey.note_camera(entity, model)
 
     def _rows(self, chunk: Chunk) -> Iterator[Reading]:
         entity, batch = chunk.entity_path, chunk.to_record_batch()
-        known = self._last.setdefault(entity, {})
         names = _components(batch)
         readers = {_archetype(name) for name in names}
         schema = ", ".join(sorted(readers))
@@ -167,28 +215,150 @@ class _Rows:
                 yield Reading(entity, schema, 0, reason=f"not on the timeline {self._timeline!r}")
             return
         times = batch.column(self._timeline).cast("int64")
+        ids = batch.column(_ROW_ID)
         columns = {name: batch.column(name) for name in names}
         for index in range(batch.num_rows):
             row = {name: column[index] for name, column in columns.items()}
-            known.update({name: value for name, value in row.items() if value.is_valid})
             t_ns = times[index].as_py()
             if t_ns is None:
                 yield Reading(entity, schema, 0, reason="row without a time")
                 continue
+            at = _moment(t_ns, ids[index].as_py())
             for archetype in readers:
-                yield self._read(entity, archetype, t_ns, row)
+                part = {n: v for n, v in row.items() if v.is_valid and _archetype(n) == archetype}
+                if part:
+                    known = self._latest.at(entity, archetype, at, part)
+                    yield self._read(entity, archetype, t_ns, part, known)
 
-    def _read(self, entity: str, archetype: str, t_ns: int, row: Row) -> Reading:
-        reader = _READERS.get(archetype, partial(_numbers, archetype))
+    def _read(self, entity: str, archetype: str, t_ns: int, row: Row, known: Known) -> Reading:
+        reader = _READERS.get(archetype, _numbers)
         frame = entity.rsplit("/", 1)[0].strip("/") or None
         try:
-            items = tuple(reader(row, self._last[entity], frame))
+            if archetype == "Pinhole":
+                return self._pinhole(entity, t_ns, known)
+            items = tuple(_with_left_out(one, row) for one in reader(row, known, frame))
         except DexTouchError as error:
             return Reading(entity, archetype, t_ns, reason=error.message)
         except (ValueError, TypeError, KeyError, pa.ArrowException) as error:
             reason = f"not a valid {archetype} ({type(error).__name__}: {error})"
             return Reading(entity, archetype, t_ns, reason=reason)
         return Reading(entity, archetype, t_ns, items=items)
+
+    def _pinhole(self, entity: str, t_ns: int, known: Known) -> Reading:
+        model = _pinhole(known)
+        if model is None:
+            raise InvalidInputError("pinhole without a matrix and a resolution")
+        self._note_camera(entity, model)
+        left_out = "" if "Pinhole:camera_xyz" not in known else "left out: camera_xyz"
+        return Reading(entity, "Pinhole", t_ns, reason=left_out)
+
+
+class _Latest:
+    """Newest values of the components that rows may leave out, by time and then by row id.
+
+    The chunks of a file are in no order of time. Only entities with rows that leave some out
+    (`find_gaps`) are kept in memory.
+    """
+
+    def __init__(self) -> None:
+        self.static: dict[str, dict[str, Any]] = {}
+        self._patterns: dict[tuple[str, str], set[frozenset[str]]] = {}
+        self._history: dict[tuple[str, str], list[tuple[int, Any]]] = {}
+        self._moments: dict[tuple[str, str], list[int]] = {}
+        self._num_values = 0
+
+    def add_static(self, chunk: Chunk) -> None:
+        """Remember what counts at all times."""
+        known = self.static.setdefault(chunk.entity_path, {})
+        batch = chunk.to_record_batch()
+        for name in _components(batch):
+            for value in batch.column(name) if name in _COMPLETED else ():
+                if value.is_valid:
+                    known[name] = _plain(value)
+
+    def find_gaps(self, chunk: Chunk) -> None:
+        """Note which components the rows of a chunk have."""
+        batch = chunk.to_record_batch()
+        by_archetype: dict[str, list[str]] = {}
+        for name in _components(batch):
+            if name in _COMPLETED or name in _COMPLETING:
+                by_archetype.setdefault(_archetype(name), []).append(name)
+        for archetype, names in by_archetype.items():
+            valid = np.stack(
+                [batch.column(n).is_valid().to_numpy(zero_copy_only=False) for n in names], axis=-1
+            )
+            found = self._patterns.setdefault((chunk.entity_path, archetype), set())
+            for row in np.unique(valid, axis=0) if len(found) < 2 else ():
+                if row.any():
+                    found.add(frozenset(n for n, has in zip(names, row, strict=True) if has))
+
+    def has_gaps(self) -> bool:
+        """Whether a row leaves out what another row of its entity has."""
+        return any(len(found) > 1 for found in self._patterns.values())
+
+    def add_all(self, chunks: Iterable[Chunk], timeline: str) -> None:
+        """Remember the values of entities with gaps, in order of time."""
+        for chunk in chunks:
+            if not chunk.is_static and timeline in chunk.timeline_names:
+                self._add(chunk, timeline)
+        for key, found in self._history.items():
+            found.sort(key=itemgetter(0))
+            self._moments[key] = [moment for moment, _ in found]
+
+    def _add(self, chunk: Chunk, timeline: str) -> None:
+        entity, batch = chunk.entity_path, chunk.to_record_batch()
+        times, ids = batch.column(timeline).cast("int64"), batch.column(_ROW_ID)
+        for name in _components(batch):
+            if name not in _COMPLETED or len(self._patterns[entity, _archetype(name)]) < 2:
+                continue
+            found = self._history.setdefault((entity, name), [])
+            for t_ns, number, value in zip(times, ids, batch.column(name), strict=True):
+                if value.is_valid and t_ns.is_valid:
+                    found.append((_moment(t_ns.as_py(), number.as_py()), _plain(value)))
+                    self._num_values += 1
+            if self._num_values > MAX_LATEST:
+                raise LimitExceededError(
+                    f"more than {MAX_LATEST} values of entities whose rows leave some out"
+                )
+
+    def at(self, entity: str, archetype: str, moment: int, row: Row) -> Known:
+        """Values of an archetype in a row, and the newest of those that it leaves out."""
+        known = self.static.get(entity, {})
+        found = {n: v for n, v in known.items() if _archetype(n) == archetype}
+        for name in _COMPLETED_OF.get(archetype, ()):
+            if name in row:
+                found[name] = _plain(row[name])
+            elif moments := self._moments.get((entity, name)):
+                index = bisect_right(moments, moment)
+                if index:
+                    found[name] = self._history[entity, name][index - 1][1]
+        return found
+
+
+def _moment(t_ns: int, row_id: bytes) -> int:
+    """A number that orders rows by time, and those of one time by their ids."""
+    return (t_ns << 128) + int.from_bytes(row_id, "big")
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - of pyarrow
+    """A component without the memory of its chunk: numbers, or the dictionary of a structure."""
+    if len(value) and arrow_types.is_struct(value.values.type):
+        return value[0].as_py()
+    return _flat(value)[:16].astype(np.float64)
+
+
+def _with_left_out(item: Item, row: Row) -> Item:
+    """A sample with a note of its archetype's components that are not read."""
+    archetype = next(iter(map(_archetype, row)))
+    if archetype not in _READ:
+        return item
+    names = [
+        n.partition(":")[2] for n, value in row.items() if n not in _READ[archetype] and len(value)
+    ]
+    if not names:
+        return item
+    notes = (*item.form.notes, f"left out: {', '.join(sorted(names))[:200]}")
+    return replace(item, form=replace(item.form, notes=notes))
 
 
 def _components(batch: Any) -> list[str]:  # noqa: ANN401 - of pyarrow
@@ -201,7 +371,7 @@ def _archetype(component: str) -> str:
     return component.partition(":")[0]
 
 
-def _item(form: Form, decode: Callable[[], Any], key: str = "") -> Item:
+def _item(form: Form, decode: Callable[[], Any], key: str) -> Item:
     return Item(key, form, NO_DEVICE_TIME, decode)
 
 
@@ -213,15 +383,13 @@ def _flat(value: Any) -> np.ndarray:  # noqa: ANN401 - of pyarrow
     return np.asarray(array.to_numpy(zero_copy_only=False))
 
 
-def _part(known: Mapping[str, Any], name: str, size: int) -> np.ndarray | None:
+def _part(known: Known, name: str, size: int) -> np.ndarray | None:
     """Numbers of a component that has one instance; None if it has none."""
     value = known.get(name)
-    if value is None or not value.is_valid or len(value) == 0:
-        return None
-    return _flat(value)[:size].astype(np.float64)
+    return None if value is None or not len(value) else np.asarray(value)[:size]
 
 
-def _transform(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
+def _transform(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     """The pose of the entity in its parent; Rerun has matrices by column and xyzw quaternions."""
     relation = _part(known, "Transform3D:relation", 1)
     if relation is not None and int(relation[0]) == _CHILD_FROM_PARENT:
@@ -231,7 +399,7 @@ def _transform(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
     q_xyzw = _part(known, "Transform3D:quaternion", 4)
     matrix = _part(known, "Transform3D:mat3x3", 9)
     for name in ("rotation_axis_angle", "scale"):
-        if (value := known.get(f"Transform3D:{name}")) is not None and len(value):
+        if len(known.get(f"Transform3D:{name}", ())):
             raise InvalidInputError(f"transform with {name}; expected a quaternion or a matrix")
     if q_xyzw is not None:
         pose[3:] = q_xyzw[[3, 0, 1, 2]]
@@ -241,13 +409,15 @@ def _transform(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
         pose = pose_from_transform(T)
     if t is not None:
         pose[:3] = t
-    if t is not None or q_xyzw is not None or matrix is not None:
-        yield _item(Form("pose", POSE_UNIT, "float64", (7,), frame), pose.copy)
+    has_part = any(name in row for name in _COMPLETED_OF["Transform3D"])
+    if has_part and not (t is None and q_xyzw is None and matrix is None):
+        form = Form("pose", POSE_UNIT, "float64", (7,), frame)
+        yield _item(form, pose.copy, "Transform3D")
 
 
-def _points(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
+def _points(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     value = row.get("Points3D:positions")
-    if value is None or not value.is_valid:
+    if value is None:
         return
     points = _flat(value).reshape(-1, 3).astype("<f4")
     if not 1 <= len(points) <= MAX_POINTS:
@@ -256,79 +426,66 @@ def _points(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
         "scalar", NUMBERS_UNIT, "float32", points.shape, frame, ("x", "y", "z"),
         is_padded=True, as_numbers="points",
     )  # fmt: skip
-    yield _item(form, points.copy)
+    yield _item(form, points.copy, "Points3D")
 
 
-def _image(archetype: str, row: Row, known: Row, frame: str | None) -> Iterator[Item]:
-    value, form = row.get(f"{archetype}:buffer"), known.get(f"{archetype}:format")
-    if value is None or not value.is_valid or not len(value):
+def _image(archetype: str, row: Row, known: Known, frame: str | None) -> Iterator[Item]:
+    value, about = row.get(f"{archetype}:buffer"), known.get(f"{archetype}:format")
+    if value is None or not len(value):
         return
-    if form is None or not len(form):
+    if not about:
         raise InvalidInputError("image without a format")
-    about = form[0].as_py()
     if about["pixel_format"]:
         raise InvalidInputError(f"pixel format {about['pixel_format']}; expected RGB or gray")
     encoding = _ENCODINGS.get((about["color_model"] or 0, about["channel_datatype"] or 0))
     if encoding is None:
         raise InvalidInputError(f"colour model and channels {about}; expected RGB or gray")
-    yield _raw_item(encoding, about["height"], about["width"], _flat(value).tobytes(), frame)
-
-
-def _raw_item(encoding: str, height: int, width: int, data: bytes, frame: str | None) -> Item:
     dtype, channels, _ = RAW[encoding]
-    step = width * channels * np.dtype(dtype).itemsize
-    unit, dtype, shape = raw_form(encoding, height, width, step, data)
-    form = Form("image", unit, dtype, shape, frame)
-    if dtype == "float32":
-        form = replace(form, kind="scalar", as_numbers=f"pixels {encoding}")
-    return _item(form, partial(decode_raw, encoding, shape, step, data, big_endian=False))
+    step = about["width"] * channels * np.dtype(dtype).itemsize
+    size_px = (about["height"], about["width"])
+    form, decode = raw_image(encoding, size_px, step, _flat(value).tobytes())
+    meter = _part(known, f"{archetype}:meter", 1)
+    notes = () if meter is None else (f"DepthImage.meter left out: {meter[0]:g} are one metre",)
+    yield _item(replace(form, frame=frame, notes=notes), decode, archetype)
 
 
-def _encoded_image(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
+def _encoded_image(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     value = row.get("EncodedImage:blob")
-    if value is None or not value.is_valid or not len(value):
-        return
-    unit, dtype, shape, data = compressed_form(_flat(value).tobytes())
-    if unit == JPEG_UNIT:
-        yield _item(Form("image", unit, dtype, shape, frame), lambda: data)
-    else:
-        form = Form("image", unit, dtype, shape, frame, notes=("PNG decoded",))
-        yield _item(form, partial(decode_png, data, shape, dtype))
+    if value is not None and len(value):
+        form, decode = encoded_image(_flat(value).tobytes())
+        yield _item(replace(form, frame=frame), decode, "EncodedImage")
 
 
-def _video(row: Row, known: Row, frame: str | None) -> Iterator[Item]:
+def _video(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     value, codec = row.get("VideoStream:sample"), _part(known, "VideoStream:codec", 1)
-    if value is None or not value.is_valid or not len(value):
+    if value is None or not len(value):
         return
     name = "unknown" if codec is None else _VIDEO_CODECS.get(int(codec[0]), str(int(codec[0])))
     check_codec(name)
     data = _flat(value).tobytes()
-    yield _item(Form("image", VIDEO_UNIT + name, "uint8", (), frame), lambda: data)
+    form = Form("image", VIDEO_UNIT + name, "uint8", (), frame)
+    yield _item(form, lambda: data, "VideoStream")
 
 
-def _numbers(archetype: str, row: Row, known: Row, frame: str | None) -> Iterator[Item]:
+def _numbers(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     """Numbers of Scalars and of components that no archetype of this reader has."""
-    is_read = False
     for name, value in row.items():
-        if _archetype(name) != archetype or not value.is_valid or not len(value):
+        if not len(value):
             continue
         if arrow_types.is_nested(value.values.type) or not (
             arrow_types.is_floating(value.values.type) or arrow_types.is_integer(value.values.type)
         ):
             raise InvalidInputError(f"component {name}, which this release does not read")
-        is_read = True
         numbers = _flat(value).astype("<f8")
         if len(numbers) > MAX_POINTS:
             raise InvalidInputError(f"{len(numbers)} numbers, expected at most {MAX_POINTS}")
-        said = "" if archetype == "Scalars" else f"component {name}"
+        is_scalars = _archetype(name) == "Scalars"
+        said = "" if is_scalars else f"component {name}"
         form = Form("scalar", NUMBERS_UNIT, "float64", numbers.shape, frame, as_numbers=said)
-        key = "" if archetype == "Scalars" else name.rsplit(":", 1)[-1]
-        yield _item(form, numbers.copy, key)
-    if not is_read:
-        return
+        yield _item(form, numbers.copy, "Scalars" if is_scalars else name)
 
 
-def _pinhole(known: Row) -> CameraModel | None:
+def _pinhole(known: Known) -> CameraModel | None:
     """A camera matrix, whose principal point Rerun counts as we do, from the image's corner."""
     K, size = _part(known, "Pinhole:image_from_camera", 9), _part(known, "Pinhole:resolution", 2)
     if K is None or size is None or K.size != 9:
@@ -339,7 +496,7 @@ def _pinhole(known: Row) -> CameraModel | None:
     return CameraModel("", (height_px, width_px), tuple(K.tolist()), (0.0,) * 5)
 
 
-_READERS: Final[Mapping[str, Callable[[Row, Row, str | None], Iterator[Item]]]] = {
+_READERS: Final[Mapping[str, Callable[[Row, Known, str | None], Iterator[Item]]]] = {
     "Transform3D": _transform,
     "Points3D": _points,
     "Image": partial(_image, "Image"),

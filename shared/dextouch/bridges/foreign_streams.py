@@ -5,10 +5,11 @@ writes. Readers of formats only say what samples a record has.
 """
 
 import math
+import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -25,9 +26,12 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import VideoDecoder, check_order, check_pixels, video_size
-from dextouch.bridges.foreign_messages import VIDEO_UNIT, CameraModel, Form, Item
-from dextouch.episodes import GOP_IMAGES, EpisodeStore, is_keyframe
+from dextouch.bridges.foreign_images import check_pixels
+from dextouch.bridges.foreign_messages import GROUP, VIDEO_UNIT, CameraModel, Form, Item
+from dextouch.bridges.foreign_video import Losses, Video, VideoDecoder
+from dextouch.episodes import (
+    EpisodeStore,
+)
 from dextouch.errors import (
     CorruptDataError,
     DexTouchError,
@@ -51,15 +55,16 @@ from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 MAX_SOURCES: Final = 1000
 MAX_SAMPLES: Final = 20_000_000
 MAX_FORMS: Final = 16
+MAX_GROUP_NAME: Final = 256
 # Samples out of order are held until the end of the file to sort them.
 MAX_HELD_BYTES: Final = 1 << 28
 MAX_PENDING_BYTES: Final = 1 << 22
 MAX_PENDING: Final = 4096
-# Packets of a video that are tried until one shows an image.
-MAX_TRIED: Final = 300
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 10_000.0
 _MAX_REASONS = 8
 _SIDES = ("left", "right")
+# Names of rectified images, as image_proc of ROS has them: image_rect, image_rect_color.
+_RECTIFIED: Final = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
 
 
 @dataclass(frozen=True)
@@ -140,40 +145,6 @@ def mapped_form(
     return made, convert, side
 
 
-@dataclass
-class _Video:
-    """What the first pass learns of a video."""
-
-    codec: str
-    size_px: tuple[int, int] | None = None
-    num_packets: int = 0
-    num_before: int = 0
-    in_groups: bool = True
-    first_packets: list[bytes] = field(default_factory=list)
-
-    def add(self, data: bytes) -> None:
-        if self.size_px is None and self.num_before < MAX_TRIED:
-            self.size_px = video_size(self.codec, data)
-        if self.size_px is None:
-            self.num_before += 1
-            return
-        begins = self.num_packets % GOP_IMAGES == 0
-        self.in_groups = self.in_groups and self.codec == "h264" and is_keyframe(data) == begins
-        if self.num_packets < 4 * GOP_IMAGES:
-            self.first_packets.append(data)
-        self.num_packets += 1
-
-    def is_kept(self) -> bool:
-        """Whether its packets are the store's already: closed groups of 8 images in 4:2:0.
-
-        Raises InvalidInputError for B-frames.
-        """
-        is_plain = check_order(self.codec, self.first_packets)
-        if not (is_plain and self.in_groups) or self.size_px is None or self.num_before:
-            return False
-        return self.size_px[0] % 2 == 0 == self.size_px[1] % 2
-
-
 class _Part:
     """One stream of a source, in both passes."""
 
@@ -184,11 +155,12 @@ class _Part:
         self.rises = self.is_ordered = True
         self.num_bytes = 0
         self.forms: list[tuple[Form, int]] = []
-        self.video: _Video | None = None
+        self.video: Video | None = None
         self.lost: Counter[str] = Counter()
         self.name, self.side = "", ""
         self._convert: Convert = np.asarray
         self._decoder: VideoDecoder | None = None
+        self._losses: Losses | None = None
         self._stamps: dict[int, tuple[int, int, int]] = {}
         self._num_packets = 0
         self._rows: list[tuple[int, int, int]] = []
@@ -202,6 +174,9 @@ class _Part:
         for index, (form, count) in enumerate(self.forms):
             if form.matches(item.form):
                 longest = form if form.shape[:1] >= item.form.shape[:1] else item.form
+                if form.notes != item.form.notes:
+                    notes = tuple(dict.fromkeys((*form.notes, *item.form.notes)))
+                    longest = replace(longest, notes=notes[:_MAX_REASONS])
                 self.forms[index] = (longest, count + 1)
                 break
         else:
@@ -217,7 +192,7 @@ class _Part:
             self._last_device_ns = item.t_device_ns
             self.num_device += 1
         if item.form.unit.startswith(VIDEO_UNIT):
-            self.video = self.video or _Video(item.form.unit.removeprefix(VIDEO_UNIT))
+            self.video = self.video or Video(item.form.unit.removeprefix(VIDEO_UNIT))
             data = item.decode()
             self.video.add(data if isinstance(data, bytes) else b"")
             self.num_bytes += len(data)
@@ -232,9 +207,12 @@ class _Part:
         """The stream; raises InvalidInputError or LimitExceededError if it cannot be one."""
         form = max(self.forms, key=lambda one: one[1])[0]
         self._source_form = form
+        if form.is_padded:
+            sample_bytes = math.prod(form.shape) * np.dtype(form.dtype).itemsize
+            self.num_bytes = len(self.times) * sample_bytes
         if not self.is_ordered and (self.video or self.num_bytes > MAX_HELD_BYTES):
             raise LimitExceededError(
-                "times go back, and there is too much to sort (or a video): sort the file by log "
+                "times go back, and there is too much to sort (or a video): sort the file by "
                 "time first"
             )
         if self.video is not None:
@@ -274,6 +252,7 @@ class _Part:
             unit = JPEG_UNIT if images == H264_UNIT and (height_px % 2 or width_px % 2) else images
             note = f"{video.codec} decoded" + ("" if unit == "rgb8" else f", encoded as {unit}")
             self._decoder = VideoDecoder(video.codec)
+            self._losses = Losses(video.codec, 1e9 / self._rate_hz())
         shape = (height_px, width_px, 3)
         return replace(form, unit=unit, shape=shape, notes=(*form.notes, note))
 
@@ -326,6 +305,8 @@ class _Part:
                 self._add(stamps, value)
         except DexTouchError as error:
             self._stamps.pop(self._num_packets - 1, None)
+            if self._losses is not None:
+                self._losses.lose()
             self.lose(error)
         if self.is_ordered and (
             self._pending_bytes >= MAX_PENDING_BYTES or len(self._rows) >= MAX_PENDING
@@ -338,11 +319,13 @@ class _Part:
         self.lost[reason] += 1
 
     def _decode_video(self, data: bytes | None, stamps: tuple[int, int, int] | None) -> None:
-        if self._decoder is None:
+        if self._decoder is None or self._losses is None:
             return
-        if stamps is not None:
+        if stamps is not None and data is not None:
             self._stamps[self._num_packets] = stamps
+            self._losses.add(data, stamps[0])
             self._num_packets += 1
+        num_corrupt = self._decoder.num_corrupt
         for number, frame in self._decoder.decode(data):
             known = self._stamps.pop(number, None)
             # Packets before that gave no image: before the first key frame, or damaged.
@@ -351,8 +334,12 @@ class _Part:
                 self.lost["packet without an image (before a key frame, or damaged)"] += 1
             if known is None or (frame.height, frame.width) != self.form.shape[:2]:
                 self.lost["image of another size, or shown in another order than sent"] += 1
+            elif not self._losses.is_right(number, is_keyframe=bool(frame.key_frame)):
+                self.lost["image after lost packets, before the next key frame"] += 1
             else:
                 self._add(known, self._decoder.to_rgb(frame))
+        if self._decoder.num_corrupt > num_corrupt:
+            self._losses.lose()
 
     def _add(self, stamps: tuple[int, int, int], value: np.ndarray | bytes) -> None:
         self._rows.append(stamps)
@@ -411,7 +398,8 @@ class Survey:
             self._num_samples += 1
             if self._num_samples > MAX_SAMPLES:
                 raise LimitExceededError(
-                    f"more than {MAX_SAMPLES} samples in one file; split it (`mcap filter`)"
+                    f"more than {MAX_SAMPLES} samples in one file; split it (`mcap filter`, "
+                    "`rerun rrd split`)"
                 )
             if self.first_ns is None or reading.t_ns < self.first_ns:
                 self.first_ns = reading.t_ns
@@ -419,6 +407,14 @@ class Survey:
                 self.parts[key].observe(reading.t_ns, item)
             except DexTouchError as error:
                 self.refuse(reading.source, reading.schema, error.message)
+
+    def note_camera(self, source: str, model: CameraModel) -> None:
+        """Count a calibration; the first of a source is used."""
+        first, count = self.cameras.get(source, (model, 0))
+        self.cameras[source] = (first, count + 1)
+        if first != model:
+            reason = "calibration that differs from the first one, which is used"
+            self.refuse(source, "calibration", reason)
 
     def refuse(self, source: str, schema: str, reason: str) -> None:
         """Count a record without samples; past a number of reasons those of a source are one."""
@@ -443,10 +439,29 @@ class Survey:
         return f"{count} samples of {len(self.parts)} streams were readable before"
 
 
+def _name_groups(parts: Iterable[_Part]) -> None:
+    """Keys of sources that several publish to, each with joints of its own (`GROUP`).
+
+    Each gets the first name that none of the others has.
+    """
+    groups: dict[str, set[str]] = {}
+    for part in parts:
+        groups.setdefault(part.source, set()).add(part.key.partition(GROUP)[2])
+    for part in parts:
+        part.key, _, group = part.key.partition(GROUP)
+        others = groups[part.source] - {group}
+        if others:
+            taken = {name for other in others for name in other.split(GROUP)}
+            own = [name for name in group.split(GROUP) if name not in taken]
+            name = own[0] if own else ",".join(group.split(GROUP))[:MAX_GROUP_NAME]
+            part.key = ":".join(filter(None, (name, part.key)))
+
+
 def _planned(
     survey: Survey, about: ImportAttributes, refused: list[Refused]
 ) -> dict[tuple[str, str], tuple[_Part, ForeignStream]]:
     """The streams by source and key; those of the mapping come first, up to the limit."""
+    _name_groups(survey.parts.values())
     several = Counter(source for source, _ in survey.parts)
     for part in survey.parts.values():
         if several[part.source] == 1:
@@ -488,8 +503,15 @@ def _calibration(
             refused.append(Refused(source, reason, "calibration", count))
         for stream in near:
             camera = stream.descriptor.name.removeprefix("camera_")
-            made[f"K_{camera}"] = np.array(model.K).reshape(3, 3)
-            made[f"distortion_{camera}"] = np.array(model.distortion)[None]
+            K, distortion = model.K, model.distortion
+            if _RECTIFIED.search(stream.source):
+                if model.K_rectified is None:
+                    reason = f"no P, and the images of {stream.source!r} are rectified"
+                    refused.append(Refused(source, reason, "calibration", count))
+                    continue
+                K, distortion = model.K_rectified, (0.0,) * 5
+            made[f"K_{camera}"] = np.array(K).reshape(3, 3)
+            made[f"distortion_{camera}"] = np.array(distortion)[None]
             made[f"image_size_{camera}_px"] = np.array([model.size_px[::-1]], dtype=np.float64)
     return made
 
@@ -498,11 +520,12 @@ def _seen_by(
     source: str, model: CameraModel, images: list[ForeignStream], calibrations: list[str]
 ) -> list[ForeignStream]:
     """Images in the calibration's frame; else at or below its name; else the ones beside it."""
+    folder = source.rpartition("/")[0]
     if in_frame := [one for one in images if model.frame and one.descriptor.frame == model.frame]:
-        return in_frame
+        beside = [one for one in in_frame if f"{one.source}/".startswith(f"{folder}/")]
+        return beside or in_frame
     if below := [one for one in images if f"{one.source}/".startswith(f"{source}/")]:
         return below
-    folder = source.rpartition("/")[0]
     if len(calibrations) > 1 and (
         not folder or sum(one.rpartition("/")[0] == folder for one in calibrations) > 1
     ):

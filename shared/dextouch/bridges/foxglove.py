@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dextouch.bridges.exporting import new_file, touch_side
-from dextouch.bridges.mcap_messages import ACTIONS, joint_names
+from dextouch.bridges.mcap_messages import ACTION, ACTIONS, MessageCodec, joint_names
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 
 LAYOUT_FILE: Final = "foxglove_layout.json"
@@ -87,7 +87,7 @@ def _curves(streams: Sequence[StreamDescriptor]) -> dict[str, list[tuple[str, st
     actions = [
         (f"{stream.name} {side} {axis}", f"/{stream.name}.wrist_{side}[{index}]")
         for stream in streams
-        if stream.name in ACTIONS[:1]
+        if stream.name in ACTIONS[:1] and MessageCodec(stream).message == ACTION
         for side in ("left", "right")
         for index, axis in enumerate("xyz")
     ]

@@ -15,8 +15,9 @@ import lz4.frame
 import numpy as np
 import zstandard
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
@@ -31,6 +32,7 @@ from dextouch.bridges.exporting import (
     touch_side,
     wall_offset_ns,
 )
+from dextouch.bridges.foreign import MAGIC
 from dextouch.bridges.mcap_messages import (
     CALIBRATION,
     MessageCodec,
@@ -57,7 +59,7 @@ from dextouch.errors import (
 )
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, first_problems, json_ready
-from dextouch.streams import ENCODED_UNITS, HEAD_CAMERA, StreamDescriptor, encoded_values
+from dextouch.streams import ENCODED_UNITS, StreamDescriptor, encoded_values
 
 PROFILE: Final = "dextouch"
 # Files of version 1 have joints and actions as arrays, and messages on the item's own clock.
@@ -73,7 +75,6 @@ _SEQUENCE_BITS = 0xFFFF_FFFF
 MAX_ATTRIBUTES_BYTES: Final = 1 << 24
 _BLOCK_BYTES: Final = 1 << 24
 MAX_RECORD_BYTES: Final = 1 << 28
-MAGIC: Final = b"\x89MCAP0\r\n"
 # Enough to watch. Chosen: 30 a second cost 16 % of the time of an export with small images.
 TOUCH_IMAGE_HZ: Final = 10
 TIME_OFFSET: Final = "time_offset_ns"
@@ -156,7 +157,7 @@ class _Export:
         self._write_about()
         channels = [self._open_pictures(s) if touch_images else None for s in self._sources]
         sources = [self._messages(*one) for one in enumerate(channels)]
-        num_messages = self._write_calibration()
+        num_messages = self._write_calibrations()
         for log_time, order, publish_time, sequence, data in heapq.merge(*sources):
             self._writer.add_message(
                 channel_id=self._channel_ids[order],
@@ -221,29 +222,32 @@ class _Export:
             metadata=metadata,
         )
 
-    def _write_calibration(self) -> int:
-        K = self._calibration().get("K_head")
-        camera = self._reader.streams.get(HEAD_CAMERA)
-        if K is None or camera is None or not self._counts[HEAD_CAMERA]:
-            return 0
-        first_ns = int(self._reader.stamps_ns(HEAD_CAMERA)[0])
-        height_px, width_px = camera.shape[:2]
-        distortion = self._calibration().get("distortion_head", np.zeros((1, 5)))
-        data = calibration_message(
-            np.array(K),
-            np.array(distortion, dtype=np.float64).ravel(),
-            t_ns=first_ns + self._offset_ns,
-            frame=camera.frame or HEAD_CAMERA,
-            shape_px=(height_px, width_px),
-        )
-        log_time = first_ns + self._offset_ns
-        self._writer.add_message(
-            channel_id=self._channel(f"/{HEAD_CAMERA}/calibration", CALIBRATION, {}),
-            log_time=log_time,
-            publish_time=log_time,
-            data=data,
-        )
-        return 1
+    def _write_calibrations(self) -> int:
+        """One message for each camera with a matrix and an image; returns their number."""
+        known, count = self._calibration(), 0
+        for stream in self._streams:
+            camera = stream.name.removeprefix("camera_")
+            K = known.get(f"K_{camera}")
+            if stream.kind != "image" or K is None or not self._counts[stream.name]:
+                continue
+            log_time = int(self._reader.stamps_ns(stream.name)[0]) + self._offset_ns
+            height_px, width_px = stream.shape[:2]
+            distortion = known.get(f"distortion_{camera}", np.zeros((1, 5)))
+            data = calibration_message(
+                np.array(K),
+                np.array(distortion, dtype=np.float64).ravel(),
+                t_ns=log_time,
+                frame=stream.frame or stream.name,
+                shape_px=(height_px, width_px),
+            )
+            self._writer.add_message(
+                channel_id=self._channel(f"/{stream.name}/calibration", CALIBRATION, {}),
+                log_time=log_time,
+                publish_time=log_time,
+                data=data,
+            )
+            count += 1
+        return count
 
     def _open_pictures(self, stream: StreamDescriptor) -> "_Pictures | None":
         """A channel for pictures of a tactile stream; None if it cannot be drawn."""
@@ -463,7 +467,7 @@ def records(path: Path) -> Iterator[McapRecord]:
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")
     with disk_errors(f"read {path}"), path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
+        if file.read(len(MAGIC["mcap"])) != MAGIC["mcap"]:
             raise InvalidInputError(f"{path}: is not an MCAP file (wrong magic bytes)")
         file.seek(0)
         try:
@@ -488,11 +492,24 @@ def _records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
     )
     for record in reader.records:
         if isinstance(record, Chunk):
-            for inner in breakup_chunk(_opened(record, path), validate_crc=True):
-                if isinstance(inner, _WANTED):
-                    yield inner
+            yield from _inside(_opened(record, path))
         elif isinstance(record, _WANTED):
             yield record
+
+
+def _inside(chunk: Chunk) -> Iterator[McapRecord]:
+    """Records of an unpacked chunk, one at a time: a list of them takes many times its bytes."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    while stream.count < size:
+        opcode, length = stream.read1(), stream.read8()
+        if opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            stream.read(length)
 
 
 def _opened(chunk: Chunk, path: Path) -> Chunk:

@@ -33,13 +33,12 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from jaxtyping import Shaped
 
+from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
 from dextouch.errors import CorruptDataError
 from dextouch.hands import actions as act
 from dextouch.hands.robot_hand import SIDES, RobotHand
 from dextouch.streams import StreamDescriptor
 
-T_DEVICE: Final = "dextouch_t_device_ns"
-SEQUENCE: Final = "dextouch_sequence"
 CALIBRATION: Final = "foxglove.CameraCalibration"
 COMPRESSED_IMAGE: Final = "foxglove.CompressedImage"
 COMPRESSED_VIDEO: Final = "foxglove.CompressedVideo"
@@ -280,10 +279,12 @@ def calibration_message(
 ) -> bytes:
     """A foxglove.CameraCalibration for unrectified images of height and width `shape_px`.
 
-    `K` is the camera matrix in pixels, 3×3; `distortion` is k1 k2 p1 p2 k3, zeros for a pinhole;
-    `t_ns` the start of its validity.
+    `K` is the camera matrix in pixels, 3×3, in our convention: Foxglove counts from the centre of
+    the first pixel, we from its corner, so the message has half a pixel less. `distortion` is k1
+    k2 p1 p2 k3, zeros for a pinhole; `t_ns` the start of its validity.
     """
-    K = np.asarray(K, dtype=np.float64)
+    K = np.array(K, dtype=np.float64)
+    K[:2, 2] -= 0.5
     message = _new_message(CALIBRATION)
     _set_time(message.timestamp, t_ns)
     message.frame_id, message.distortion_model = frame, "plumb_bob"

@@ -147,27 +147,41 @@ def _images(stream: rr.RecordingStream, entity: str, descriptor: StreamDescripto
                 sample=list(block.values), is_keyframe=[is_keyframe(unit) for unit in block.values]
             )
         }
-    if descriptor.dtype != "uint8" or descriptor.shape[2:] != (3,):
+    shape, dtype = descriptor.shape, descriptor.dtype
+    if dtype == "uint16" and len(shape) == 2:
+        _log_format(stream, entity, shape, rr.DepthImage)
+        if descriptor.unit == "mm":
+            stream.log(entity, rr.DepthImage.from_fields(meter=1000.0), static=True)
+        return lambda block: {entity: _pixels(block.values, rr.DepthImage)}
+    if dtype != "uint8" or (len(shape) != 2 and shape[2:] != (3,)):
         raise InvalidInputError(
-            f"{descriptor.name}: got images of {descriptor.dtype} {descriptor.shape}, "
-            "expected uint8 [h, w, 3] or JPEG or H.264"
+            f"{descriptor.name}: got images of {dtype} {shape}, expected uint8 [h, w, 3], "
+            "uint8 or uint16 [h, w], JPEG or H.264"
         )
-    _log_format(stream, entity, descriptor.shape)
+    _log_format(stream, entity, shape)
     return lambda block: {entity: _pixels(block.values)}
 
 
-def _log_format(stream: rr.RecordingStream, entity: str, shape: tuple[int, ...]) -> None:
+def _log_format(
+    stream: rr.RecordingStream,
+    entity: str,
+    shape: tuple[int, ...],
+    archetype: type[rr.Image | rr.DepthImage] = rr.Image,
+) -> None:
+    """The form of images: depths of 16 bits, RGB or gray of 8."""
+    is_depth = archetype is rr.DepthImage
     kind = ImageFormat(
         width=shape[1],
         height=shape[0],
-        color_model=rr.ColorModel.RGB,
-        channel_datatype=rr.ChannelDatatype.U8,
+        color_model=None if is_depth else rr.ColorModel.RGB if shape[2:] else rr.ColorModel.L,
+        channel_datatype=rr.ChannelDatatype.U16 if is_depth else rr.ChannelDatatype.U8,
     )
-    stream.log(entity, rr.Image.from_fields(format=kind), static=True)
+    stream.log(entity, archetype.from_fields(format=kind), static=True)
 
 
-def _pixels(images: np.ndarray) -> Any:  # noqa: ANN401 - the library does not export the type
-    return rr.Image.columns(buffer=np.ascontiguousarray(images).reshape(len(images), -1))
+def _pixels(images: np.ndarray, archetype: type[rr.Image | rr.DepthImage] = rr.Image) -> Any:  # noqa: ANN401 - the library does not export the type
+    pixels = np.ascontiguousarray(images).reshape(len(images), -1)
+    return archetype.columns(buffer=pixels.astype(pixels.dtype.newbyteorder("<")).view(np.uint8))
 
 
 def _touch(

@@ -20,6 +20,8 @@ from .format import kind_of as kind_of
 from .format import shard_path as shard_path
 from .format import stream_arrays as stream_arrays
 from .image_codecs import FULL_FORM as FULL_FORM
+from .image_codecs import MOST_STEPS as MOST_STEPS
+from .image_codecs import FrameNumbers as FrameNumbers
 from .image_codecs import GopEncoder as GopEncoder
 from .image_codecs import ImageForm as ImageForm
 from .image_codecs import VideoSettings as VideoSettings

@@ -412,6 +412,8 @@ START_CODE = b"\x00\x00\x01"
 SLICE, IDR_SLICE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS = 1, 5, 7, 8
 # Profiles whose parameter sets begin with the chroma format (7.3.2.1.1).
 _CHROMA_PROFILES = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
+# Times from one image to the next after which one is missing, where only they tell.
+MOST_STEPS = 2.5
 # More than enough for the fields of a slice header up to its frame number.
 _HEADER_BYTES = 32
 
@@ -494,6 +496,42 @@ def first_gap(access_units: Sequence[bytes]) -> int | None:
         if nal[0] & 0x60:
             last_reference = number
     return None
+
+
+class FrameNumbers:
+    """The numbers of a video's pictures, access unit by access unit (see `first_gap`)."""
+
+    def __init__(self) -> None:
+        self._parameters: _SequenceParameters | None = None
+        self._last_reference = 0
+        self._is_whole = True
+
+    def is_whole(self, access_unit: bytes, num_steps: float) -> bool:
+        """Whether no reference picture is missing since the last IDR picture.
+
+        `num_steps` is the time since the access unit before, in those from one image to the next:
+        numbers repeat, and some encoders skip them. Raises CorruptDataError without a readable
+        header; what follows is not whole then.
+        """
+        was_whole, self._is_whole = self._is_whole, False
+        if any(nal[0] & 0x1F == SEQUENCE_PARAMETERS for nal in nal_units(access_unit)):
+            self._parameters = _parameters(access_unit)
+        nal = _first_slice(access_unit)
+        is_first, parameters = nal[0] & 0x1F == IDR_SLICE, self._parameters
+        if parameters is None:
+            self._is_whole = was_whole
+            return was_whole
+        number, size = _frame_number(nal, parameters), 1 << parameters.number_bits
+        follows = parameters.may_skip_numbers or number == (self._last_reference + 1) % size
+        most = MOST_STEPS if parameters.may_skip_numbers else max(MOST_STEPS, size / 2)
+        if nal[0] & 0x60:
+            self._last_reference = number
+        self._is_whole = is_first or (was_whole and follows and num_steps < most)
+        return self._is_whole
+
+    def lose(self) -> None:
+        """Say that a picture could not be decoded."""
+        self._is_whole = False
 
 
 def _first_slice(access_unit: bytes) -> bytes:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch import __version__
-from dextouch.bridges.exporting import Block
+from dextouch.bridges.exporting import Block, wall_offset_ns
 from dextouch.bridges.foreign import (
     ForeignStream,
     ImportAttributes,
@@ -74,6 +74,15 @@ def test_samples_provenance_and_counts_arrive(tmp_path: Path) -> None:
         "refused /c (x)",
     ):
         assert part in said
+
+
+def test_the_start_is_exact_to_the_microsecond(tmp_path: Path) -> None:
+    first_ns = NOON_NS + 987_654_321
+    about = new_attributes(
+        source_file(tmp_path), ImportAttributes(), form="mcap", first_ns=first_ns
+    )
+    assert wall_offset_ns(about) == 0
+    assert about.started_t_host_ns == first_ns - 321
 
 
 def test_an_import_is_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import importlib
 import io
 import json
 import random
+import struct
 import tracemalloc
 from fractions import Fraction
 from pathlib import Path
@@ -13,14 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
-from dextouch.bridges import foreign_streams
+from dextouch.bridges import foreign_mcap, foreign_streams
 from dextouch.bridges.foreign import ImportAttributes
 from dextouch.bridges.foreign_mcap import import_any_mcap
 from dextouch.bridges.foreign_messages import items_of
-from dextouch.bridges.mcap import export_mcap
+from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,
@@ -29,7 +31,7 @@ from dextouch.errors import (
     InvalidInputError,
     LimitExceededError,
 )
-from tests.unit.bridges.takes import write_recording
+from tests.unit.bridges.takes import K_HEAD, write_episode, write_recording
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "ros2_rosbags.mcap"
 T0 = 1_700_000_000_000_000_000
@@ -328,6 +330,169 @@ def test_points_have_fields_of_all_types(schema, size, kind, names):
     assert item.form.names == tuple(numbers)
 
 
+def stripped(reader, store, folder, name):
+    """What becomes of an export of ours that another tool filtered."""
+    export_mcap(reader, folder / "whole.mcap", overwrite=True)
+    path, channels = folder / f"{name}.mcap", {}
+    writer = Writer(str(path))
+    writer.start()
+    with (folder / "whole.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "protobuf", number)
+            stamps = (message.publish_time, message.sequence)
+            writer.add_message(channels[channel.id], message.log_time, message.data, *stamps)
+    writer.finish()
+    import_any_mcap(path, store, ImportAttributes())
+    return store.recording(name)
+
+
+def test_a_stripped_export_of_ours_has_its_matrices_stamps_and_types(store, tmp_path):
+    episode, wrist = write_episode(store), ((50.0, 0.0, 31.25), (0.0, 50.0, 30.0), (0.0, 0.0, 1.0))
+    episode.attributes.calibration.update(K_wrist_left=wrist)
+    found = stripped(episode, store, tmp_path, "e")
+    for name, K in (("K_head", K_HEAD), ("K_wrist_left", wrist)):
+        np.testing.assert_allclose(found.attributes.calibration[name], K)
+    np.testing.assert_array_equal(found.values("action", 0, 21), episode.read("action").values)
+    assert found.streams["action"].names[9] == "wrist_right[0]"
+    assert found.stamps("action").sequence.tolist() == [-1] * 21
+
+    recording = write_recording(store)
+    found = stripped(recording, store, tmp_path, "r")
+    for name in ("tactile_left", "camera_head", "wrist_left"):
+        ours, theirs = recording.stamps(name), found.stamps(name)
+        expected = np.where(ours.t_device_ns > 0, ours.t_device_ns, -1)
+        assert theirs.t_device_ns.tolist() == expected.tolist()
+        assert theirs.sequence[1:].tolist() == ours.sequence[1:].tolist()
+        assert found.streams[name].dtype == recording.streams[name].dtype
+
+
+def json_file(path, messages):
+    """A file of JSON messages without a schema: topic, schema and message, a millisecond apart."""
+    recorder = Recorder(path)
+    for k, (topic, schema, message) in enumerate(messages):
+        if topic not in recorder.channels:
+            recorder.channel(topic, schema, "jsonschema" if schema else "", b"{}")
+        recorder.raw(topic, message, T0 + k * 10**6)
+    return recorder.done()
+
+
+def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
+    stamped = {"header": {"stamp": {"sec": 1, "nsec": 2}, "seq": 7}, "v": 1}
+    messages = [
+        ("/a", "", {"timestamp": 12345, "v": 1}),
+        ("/b", "", {"big": 0, "list": [1, 2]}),
+        ("/b", "", {"big": 2**60 + 1, "list": [1, 2**53 + 1]}),
+        ("/c", "", stamped),
+        ("/deep", "", b'{"a":' * 900 + b"1" + b"}" * 900),
+        ("/lists", "", b'{"a":' + b"[" * 900 + b"1" + b"]" * 900 + b"}"),
+        ("/empty", "", b'{"a":[' + b"{}," * (1 << 20) + b"{}]}"),
+    ]
+    report = import_any_mcap(json_file(tmp_path / "a.mcap", messages), store, ImportAttributes())
+    streams = store.recording("a").streams
+    assert (streams["a"].names, streams["c"].names) == (("timestamp", "v"), ("header.seq", "v"))
+    assert store.recording("a").stamps("c").t_device_ns.tolist() == [10**9 + 2]
+    notes = {one.source: one.notes for one in report.imported}
+    assert notes["/b"] == ("above 2^53, rounded: big, list",)
+    reasons = {one.source: one.reason for one in report.refused}
+    assert "more than 64 deep" in reasons["/deep"]
+    assert "more than 64 deep" in reasons["/lists"]
+    assert "more than 1048576 values" in reasons["/empty"]
+
+
+def test_rectified_images_have_the_matrix_of_their_projection(store, tmp_path):
+    size = {"width": 64, "height": 48, "frame_id": "cam"}
+    K, P = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1], [50, 0, 30.5, 0, 0, 50, 22.5, 0, 0, 0, 1, 0]
+    lens = {"distortion_model": "plumb_bob", "D": [0.1, 0, 0, 0, 0], "K": K} | size
+    data = base64.b64encode(encoded(PIXELS[0], "jpeg")).decode()
+    image = {"frame_id": "cam", "format": "jpeg", "data": data}
+    images = [(f"/cam/image_{n}", "foxglove.CompressedImage", image) for n in ("raw", "rect")]
+    for name, more in (("a", {"P": P}), ("b", {})):
+        messages = [("/cam/info", "foxglove.CameraCalibration", lens | more), *images]
+        path = json_file(tmp_path / f"{name}.mcap", messages)
+        report = import_any_mcap(path, store, ImportAttributes())
+        found = store.recording(name).attributes.calibration
+        assert found["K_cam_image_raw"] == ((60, 0, 32), (0, 60, 24), (0, 0, 1))
+        if more:
+            assert found["K_cam_image_rect"] == ((50, 0, 31), (0, 50, 23), (0, 0, 1))
+            assert not np.any(found["distortion_cam_image_rect"])
+        else:
+            assert "K_cam_image_rect" not in found
+            assert "no P" in report.refused[0].reason
+
+
+def test_quantised_inverse_depth_becomes_metres(store, tmp_path):
+    """As compressed_depth_image_transport has it: depth = a / (value − b)."""
+    values = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    data = struct.pack("<iff", 0, 100.0, 1.0) + encoded(values, "png")
+    message = {"format": "32FC1; compressedDepth png", "data": base64.b64encode(data).decode()}
+    path = json_file(tmp_path / "a.mcap", [("/depth", "sensor_msgs/CompressedImage", message)])
+    import_any_mcap(path, store, ImportAttributes())
+    found = store.recording("a").values("depth", 0, 1)[0]
+    assert np.isnan(found[0, 0])
+    np.testing.assert_allclose(found.ravel()[1:], 100 / (values.ravel()[1:] - 1.0), rtol=1e-6)
+
+
+def test_memory_of_the_whole_is_limited(store, tmp_path, monkeypatch):
+    def cloud(count):
+        fields = [{"name": "x", "offset": 0, "type": 7}]
+        data = base64.b64encode(bytes(4 * count)).decode()
+        return {"point_stride": 4, "fields": fields, "data": data}
+
+    recorder = Recorder(tmp_path / "a.mcap")
+    recorder.channel("/p", "foxglove.PointCloud", "jsonschema", b"{}")
+    for k, count in enumerate((1000, 1, 1, 1)):
+        recorder.raw("/p", cloud(count), T0 - k)
+    monkeypatch.setattr(foreign_streams, "MAX_HELD_BYTES", 15_000)
+    with pytest.raises(InvalidInputError, match="too much to sort"):
+        import_any_mcap(recorder.done(), store, ImportAttributes())
+    path = tmp_path / "b.mcap"
+    writer = Writer(str(path), chunk_size=1 << 28, compression=CompressionType.LZ4)
+    writer.start()
+    channel = writer.register_channel("/x", "json", 0)
+    for k in range(20_000):
+        writer.add_message(channel, k, b"1", k)
+    writer.finish()
+    # Of the 620 kB of messages not all are in memory as objects.
+    tracemalloc.start()
+    assert sum(1 for _ in records(path)) > 20_000
+    assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    tracemalloc.stop()
+
+
+def test_publishers_of_one_topic_have_streams_of_their_own(store, tmp_path):
+    def joints(*names):
+        parts = {"position": [len(name) for name in names], "velocity": [0.5] * len(names)}
+        return ("/joint_states", "sensor_msgs/JointState", {"name": list(names)} | parts)
+
+    arm, hand = joints("elbow", "wrist"), joints("thumb", "index", "wrist")
+    path = json_file(tmp_path / "a.mcap", [arm, hand, joints("wrist", "elbow"), arm])
+    report = import_any_mcap(path, store, ImportAttributes())
+    counts = {one.source: (one.num_samples, one.shape) for one in report.imported}
+    assert counts == {
+        "/joint_states:elbow": (3, (2,)),
+        "/joint_states:elbow:velocity": (3, (2,)),
+        "/joint_states:index": (1, (3,)),
+        "/joint_states:index:velocity": (1, (3,)),
+    }
+    assert store.recording("a").values("joint_states_elbow", 0, 3).tolist() == [[5, 5]] * 3
+
+
+def test_a_schema_is_read_once(store, tmp_path, monkeypatch):
+    read, count = foreign_mcap._decoder_of, []
+    monkeypatch.setattr(foreign_mcap, "_decoder_of", lambda *a: count.append(a) or read(*a))
+    messages = [(f"/{k}", "x", {"v": k}) for k in range(5)]
+    recorder = Recorder(tmp_path / "a.mcap")
+    number = recorder.writer.register_schema("x", "jsonschema", b"{}")
+    for topic, _, message in messages:
+        recorder.channels[topic] = recorder.writer.register_channel(topic, "json", number)
+        recorder.raw(topic, message, T0)
+    recorder.channels["/none"] = recorder.writer.register_channel("/none", "cdr", number)
+    report = import_any_mcap(recorder.done(), store, ImportAttributes())
+    assert (len(count), len(report.imported)) == (1, 5)
+
+
 @pytest.mark.parametrize(
     ("codec", "keyint", "note"),
     [
@@ -357,6 +522,28 @@ def test_video_is_kept_or_decoded(codec, keyint, note, store, tmp_path):
     np.testing.assert_allclose(level, [20 * (k % 10) for k in range(20)], atol=6)
     assert recording.stamps("video").t_device_ns[0] == T0 - first * STEP
     assert sum(one.num_samples for one in report.refused) == -first
+
+
+@pytest.mark.parametrize(
+    ("codec", "lost"),
+    [("libx264", {5}), ("libx264", {5, 6, 7}), ("libx264", set(range(8, 24))), ("libx265", {5, 6})],
+)
+def test_images_after_lost_packets_are_refused_until_a_key_frame(codec, lost, store, tmp_path):
+    """Sixteen images later frame_num is the one that was expected."""
+    recorder = Recorder(tmp_path / "video.mcap")
+    form = {"libx264": "h264", "libx265": "h265"}[codec]
+    for k, data in enumerate(video(60, keyint=30, codec=codec)):
+        if k not in lost:
+            recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format=form)
+    report = import_any_mcap(recorder.done(), store, ImportAttributes())
+    recording = store.recording("video")
+    good = [k for k in range(60) if k < min(lost) or k >= 30]
+    assert recording.stamps("video").t_device_ns.tolist() == [T0 + k * STEP for k in good]
+    level = recording.values("video", 0, len(good)).mean((1, 2, 3))
+    np.testing.assert_allclose(level, [20 * (k % 10) for k in good], atol=6)
+    (refused,) = report.refused
+    assert "key frame" in refused.reason
+    assert refused.num_samples == 60 - len(good) - len(lost)
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])

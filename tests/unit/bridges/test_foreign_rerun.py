@@ -3,6 +3,8 @@
 import contextlib
 import io
 import random
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from dextouch.errors import DexTouchError, InvalidInputError  # noqa: E402
 from tests.unit.bridges.takes import write_recording  # noqa: E402
 
 T0 = 1_700_000_000_000_000_000
+VIEW = rr.ViewCoordinates.RUB
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
@@ -114,6 +117,77 @@ def test_an_export_of_ours_comes_back_as_numbers(store, tmp_path):
     )
     ours = reader.values("wrist_left", 0, count)
     np.testing.assert_allclose(again.values(wrist, 0, count)[:, :3], ours[:, :3], rtol=1e-6)
+
+
+def saved(path, name="lab"):
+    stream = rr.RecordingStream("lab", recording_id=name)
+    stream.save(path)
+    return stream
+
+
+def at(stream, time_s):
+    stream.set_time("camera", timestamp=np.datetime64(T0 + int(time_s * 1e9), "ns"))
+
+
+def test_components_that_rows_leave_out_are_the_newest_in_time(store, tmp_path):
+    """Each part has a chunk of its own, later ones first in the file."""
+    stream = saved(tmp_path / "a.rrd")
+    for k in reversed(range(5)):
+        at(stream, k)
+        stream.log("hand", rr.Transform3D.from_fields(translation=[k, 0, 0]))
+        at(stream, k + 0.5)
+        turned = rr.Quaternion(xyzw=[0, 0, np.sin(k / 10), np.cos(k / 10)])
+        stream.log("hand", rr.Transform3D.from_fields(quaternion=turned))
+        at(stream, k + 0.7)
+        stream.log("hand", rr.Scalars([k]))
+        form = {"width": 2, "height": 3 + k // 3, "channel_datatype": "u8", "color_model": "l"}
+        stream.log("image", rr.Image.from_fields(format=rr.components.ImageFormat(**form)))
+        at(stream, k + 0.8)
+        pixels = np.full(2 * (3 + k // 3), k, np.uint8)
+        stream.log("image", rr.Image.from_fields(buffer=pixels))
+    stream.disconnect()
+    about = ImportAttributes(mapping={"wrist_left": "/hand:Transform3D", "x": "/hand:Scalars"})
+    report = import_rrd(tmp_path / "a.rrd", store, about)
+    recording = store.recording("a")
+    # Only rows with a part of the transform are poses.
+    assert recording.num_samples("wrist_left") == 10
+    poses = recording.values("wrist_left", 0, 10)
+    expected = [
+        [k, 0, 0, np.cos(j / 10), 0, 0, np.sin(j / 10)] for k in range(5) for j in (k - 1, k)
+    ]
+    expected[0][3:] = [1, 0, 0, 0]
+    np.testing.assert_allclose(poses, expected, atol=1e-6)
+    assert recording.values("x", 0, 5)[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert recording.values("image", 0, 3)[:, 2, 1].tolist() == [0, 1, 2]
+    assert [(one.source, one.num_samples) for one in report.refused] == [("/image", 2)]
+
+
+def test_what_is_left_out_is_said(store, tmp_path):
+    for name in ("first", "second"):
+        stream = saved(tmp_path / f"{name}.rrd", name)
+        for k in range(3):
+            at(stream, k)
+            stream.log("cam", rr.Pinhole(focal_length=50, width=6, height=4, camera_xyz=VIEW))
+            stream.log("cam", rr.Image(np.full((4, 6, 3), k, np.uint8)))
+            stream.log("deep", rr.DepthImage(np.full((4, 6), k, np.uint16), meter=1000.0))
+            stream.log("points", rr.Points3D([[0, 0, 1]], labels=["a"]))
+        stream.disconnect()
+    both = tmp_path / "both.rrd"
+    whole = [(tmp_path / f"{name}.rrd") for name in ("first", "second")]
+    subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "merge", *whole, "-o", both],
+        check=True,
+        capture_output=True,
+    )
+    report = import_rrd(both, store, ImportAttributes(mapping={"camera_head": "/cam"}))
+    K = store.recording("both").attributes.calibration["K_head"]
+    assert K == ((50, 0, 3), (0, 50, 2), (0, 0, 1))
+    notes = {one.source: one.notes for one in report.imported}
+    assert "1000 are one metre" in notes["/deep"][0]
+    assert notes["/points"] == ("left out: labels",)
+    reasons = {one.source: one.reason for one in report.refused}
+    assert reasons["/cam"] == "left out: camera_xyz"
+    assert "only the first, 'first', is imported" in reasons["second"]
 
 
 def test_damaged_files_give_our_errors(store, tmp_path):

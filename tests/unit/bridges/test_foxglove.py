@@ -53,6 +53,11 @@ def topics_of(path):
         return {channel.topic for channel in make_reader(file).get_summary().channels.values()}
 
 
+def test_actions_of_other_robots_have_no_plots_of_ours():
+    arm = descriptor("action", "robot_state", (7,), "float64", "rad", 30)
+    assert not [name for name in foxglove_layout([arm])["configById"] if name.startswith("Plot")]
+
+
 def test_every_topic_of_a_layout_is_in_the_file(tmp_path):
     store = EpisodeStore(tmp_path)
     for reader in (write_episode(store), write_recording(store)):

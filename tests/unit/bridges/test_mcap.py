@@ -219,9 +219,11 @@ def test_poses_carry_their_frames_and_the_camera_its_matrix(store, tmp_path):
     assert (head[0][1].parent_frame_id, head[0][1].child_frame_id) == ("world", "camera_head")
     assert found["/camera_head"][1][0][1].frame_id == "camera_head"
     calibration = found["/camera_head/calibration"][1][0][1]
-    assert list(calibration.K) == K_HEAD.ravel().tolist()
+    # Half a pixel less: Foxglove counts from the first pixel's centre, the store from its corner.
+    K = [60, 0, 31.5, 0, 61, 31, 0, 0, 1]
+    assert list(calibration.K) == K
     assert (calibration.height, calibration.width) == (64, 64)
-    assert list(calibration.P) == np.hstack([K_HEAD, np.zeros((3, 1))]).ravel().tolist()
+    assert list(calibration.P) == [*K[:3], 0, *K[3:6], 0, *K[6:], 0]
     assert list(calibration.D) == [0.0] * 5
     export_mcap(write_recording(store), tmp_path / "raw.mcap")
     lens = messages_of(tmp_path / "raw.mcap")["/camera_head/calibration"][1][0][1]

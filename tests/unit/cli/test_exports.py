@@ -141,6 +141,58 @@ def test_a_layout_for_foxglove_is_written_with_the_files(store, dextouch, tmp_pa
     assert "--layout is for format mcap" in dextouch(*words, "--force")[2]
 
 
+def test_a_layout_is_written_over_nothing(store, dextouch, tmp_path):
+    write_episode(store, num_steps=3)
+    words = ("export", "--format", "mcap", "stand-bottle-0003", "--to")
+    (tmp_path / "takes").mkdir()
+    beside = tmp_path / "takes" / "foxglove_layout.json"
+    beside.write_text("mine")
+    status, _, err = dextouch(*words, tmp_path / "takes")
+    assert status
+    assert "foxglove_layout.json: exists already" in err
+    assert [path.name for path in (tmp_path / "takes").iterdir()] == [beside.name]
+    both = tmp_path / "q.mcap"
+    status, _, err = dextouch(*words, both, "--layout", both, "--force")
+    assert status
+    assert "is one of the exported files" in err
+
+
+@pytest.mark.parametrize(
+    ("form", "flags", "right"),
+    [
+        ("mcap", ["--fps", "30"], "lerobot"),
+        ("rrd", ["--touch-samples"], "lerobot"),
+        ("umi", ["--license", "mit"], "lerobot"),
+        ("mcap", ["--repo-id", "a/b"], "lerobot"),
+        ("rrd", ["--jpeg-quality", "90"], "mcap"),
+        ("lerobot", ["--no-touch-images"], "mcap"),
+        ("import", ["--fps", "30"], "lerobot"),
+        ("import", ["--k-head", "1,1,1,1"], "lerobot"),
+        ("import", ["--timeline", "t"], "rrd"),
+        ("import", ["--task", "wipe"], "leave --task out"),
+    ],
+)
+def test_options_that_a_format_ignores_are_refused(form, flags, right, store, dextouch, tmp_path):
+    write_episode(store, num_steps=3)
+    path = tmp_path / "take.mcap"
+    if form == "import":
+        dextouch("export", "--format", "mcap", "--to", path)
+        status, _, err = dextouch("import", path, *flags, store="other")
+    else:
+        status, _, err = dextouch("export", "--format", form, "--to", tmp_path / "x", *flags)
+    assert status
+    assert flags[0] in err
+    assert right in err
+
+
+def test_a_folder_of_two_formats_needs_a_choice(dextouch, tmp_path):
+    for name in ("a.mcap", "b.rrd"):
+        (tmp_path / name).write_bytes(b"")
+    status, _, err = dextouch("import", tmp_path)
+    assert status
+    assert "choose one with --format" in err
+
+
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
     rejected = Review(verdict="rejected", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC))
     for name in ("take-0001", "take-0002"):
@@ -255,7 +307,7 @@ def test_lerobot_data_sets_grow_and_get_a_card(store, dextouch, tmp_path):
     words = ("export", "--format", "umi", "--append", "--to", tmp_path / "all.zip")
     status, _, err = dextouch(*words)
     assert status == main.EXIT_REFUSED
-    assert "only lerobot" in err
+    assert "--append is for format lerobot" in err
 
 
 def test_a_lerobot_data_set_of_another_robot_becomes_recordings(store, dextouch, tmp_path):

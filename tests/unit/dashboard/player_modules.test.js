@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import { test } from "node:test";
 
+import { exportCommand, itemsOfKind } from "./static/catalog/export_command.js";
 import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
 import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
 import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
@@ -178,4 +179,11 @@ test("commands can be pasted into a shell", () => {
   assert.equal(trimCommand("a", [15, 29], { outcome: "keep", keep: false }), "dextouch store trim a --steps 15 29 --outcome keep");
   const labels = { task: undefined, instruction: "it's $(up)", operator: "", outcome: "", keep: true };
   assert.equal(relabelCommand({ kind: "recording", id: "a" }, labels), `dextouch store relabel a --kind recording --instruction 'it'"'"'s $(up)' --keep`);
+});
+
+test("a selection without an item of the kind has no command to export", () => {
+  const ids = itemsOfKind([{ kind: "recording", id: "a" }], "episode").map(({ id }) => id);
+  assert.equal(exportCommand({ format: "mcap", kind: "episode", ids, filters: {} }), "");
+  assert.match(exportCommand({ format: "mcap", kind: "recording", ids: ["a"], filters: {} }), / a --to a.mcap$/);
+  assert.match(exportCommand({ format: "mcap", kind: "episode", ids: null, filters: { task: "wipe" } }), /--task=wipe/);
 });

@@ -78,8 +78,10 @@ export class ExportDialog {
     for (const option of kind.options) option.disabled = !kinds.includes(option.value);
     if (!kinds.includes(kind.value)) [kind.value] = kinds;
     const chosen = this.#chosen();
-    this.#command.show(exportCommand({ ...chosen, filters: this.#query.filters }));
-    this.#dialog.querySelector(".download").hidden = chosen.format !== "mcap";
+    const command = exportCommand({ ...chosen, filters: this.#query.filters });
+    this.#command.show(command);
+    this.#command.node.hidden = !command;
+    this.#dialog.querySelector(".download").hidden = chosen.format !== "mcap" || !command;
     const number = ++this.#asked;
     const note = this.#dialog.querySelector("[data-count]");
     try {

@@ -29,8 +29,10 @@ function filterWords(filters) {
   return FILTERS.filter((name) => values[name]).flatMap((name) => `--${flags[name] ?? name}=${values[name]}`);
 }
 
-// `ids` of the selection, null for all that match the filters.
+// `ids` of the selection, null for all that match the filters. Empty for a selection without an item
+// of the kind: a command without ids would export the whole store.
 export function exportCommand({ format, kind, ids, filters }) {
+  if (ids?.length === 0) return "";
   const words = ["dextouch", "export", "--format", format, ...(kind === "recording" ? ["--kind", kind] : [])];
   words.push(...(ids ?? filterWords(filters)), "--to", destination(format, ids));
   return words.map(quote).join(" ");
