@@ -54,6 +54,7 @@ from .common import problem_from_error as problem_from_error
 from .common import status_of as status_of
 from .episodes import ID_TAKEN as ID_TAKEN
 from .episodes import MAX_CAUSE as MAX_CAUSE
+from .episodes import MERGED as MERGED
 from .episodes import BatchReceipt as BatchReceipt
 from .episodes import CatalogHours as CatalogHours
 from .episodes import ClockReport as ClockReport

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ValidationError
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.catalog_erasure import erase_from_catalog, search_catalog
 from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, take_start
-from dextouch.episodes.files import disk_errors, replace_file, try_lock
+from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
 from dextouch.episodes.spool_log import RECORDING_FILE
 from dextouch.episodes.trash import (
@@ -35,7 +35,7 @@ from dextouch.episodes.writer import STAGING
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import OutstandingTakes
+from dextouch.schemas import MERGED, OutstandingTakes
 
 RECEIPT_VERSION = 1
 INTENTS = ".deletions"
@@ -71,7 +71,7 @@ class Facts:
     """Identity of one folder of a store, even a damaged or unfinished one.
 
     `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
-    its sources, and whether it is an edit of them; `authors` the pseudonyms in its review and
+    its sources, and the operations of edits; `authors` the pseudonyms in its review and
     notes; `readable` is false where nothing could be parsed. `started` is `take_start` of a
     recording.
     """
@@ -82,7 +82,7 @@ class Facts:
     item_id: str
     operator: str | None
     authors: frozenset[str]
-    lineage: tuple[tuple[str, str, str | None, bool], ...]
+    lineage: tuple[tuple[str, str, str | None, str], ...]
     sha256: str | None
     readable: bool
     station: str | None = None
@@ -111,7 +111,7 @@ def _facts(folder: Path, place: str) -> Facts:
             str(entry.get("kind")),
             str(entry.get("id")),
             _text(entry.get("sha256")),
-            bool(entry.get("operation")),
+            _text(entry.get("operation")) or "",
         )
         for entry in (entries if isinstance(entries, list) else [])
         if isinstance(entry, dict)
@@ -314,32 +314,74 @@ def plan_deletion(
     """
     waiting = all_facts(root)
     spreads = request.derived or request.operator is not None
-    names = {(victim.kind, victim.id) for victim in known if spreads}
-    hashes = {victim.sha256 for victim in known if spreads} - {None}
+    wanted = _Wanted(waiting)
+    for victim in known if spreads else ():
+        wanted.add(victim.kind, victim.id, victim.sha256)
     if spreads and request.recording is not None:
         # Derived data may outlive its source.
-        names.add(("recording", request.recording))
+        for sha256 in wanted.stored("recording", request.recording) or {None}:
+            wanted.add("recording", request.recording, sha256)
     found: list[Victim] = []
     grown = True
     while grown:
         grown = False
         for facts in list(waiting):
-            reason = _reason(facts, request) or _reason_of_kin(facts, request, names, hashes)
+            reason = _reason(facts, request) or _reason_of_kin(facts, request, wanted)
             if reason is None:
                 continue
             waiting.remove(facts)
             found.append(_victim(facts, reason))
             if spreads:
                 grown = True
-                # And earlier versions, left behind by a repair.
-                versions = [
-                    (k, i, h)
-                    for k, i, h, is_edit in facts.lineage
-                    if (is_edit and k == facts.kind) or _is_version(facts, k, i)
-                ]
-                names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
-                hashes |= {facts.sha256, *(h for _, _, h in versions)} - {None}
+                wanted.add(facts.kind, facts.item_id, facts.sha256)
+                # And earlier versions, left behind by a repair or an edit.
+                for kind, item_id, sha256, operation in facts.lineage:
+                    if kind == facts.kind and (operation or _is_version(facts, kind, item_id)):
+                        is_id = operation != MERGED and not wanted.is_other(kind, item_id, sha256)
+                        wanted.add(kind, item_id if is_id else None, sha256)
     return found
+
+
+class _Wanted:
+    """Items that a deletion has found, whose products go, too.
+
+    A hash names an item for certain. An id may since have become that of another item, or be that
+    of one in the store which this one was merged from.
+    """
+
+    def __init__(self, stored: Iterable[Facts]) -> None:
+        self._stored: dict[tuple[str, str], set[str]] = {}
+        for facts in stored:
+            if facts.sha256 is not None:
+                self._stored.setdefault((facts.kind, facts.item_id), set()).add(facts.sha256)
+        self.hashes: set[str] = set()
+        # Hashes by kind and id; none where those are not known.
+        self.names: dict[tuple[str, str], set[str]] = {}
+
+    def add(self, kind: str, item_id: str | None, sha256: str | None) -> None:
+        """Follow an item by its hash and its id, if these are known."""
+        known = {sha256} - {None}
+        self.hashes |= known
+        if item_id is not None:
+            self.names.setdefault((kind, item_id), set()).update(known)
+
+    def stored(self, kind: str, item_id: str) -> set[str]:
+        """Hashes of all items of an id."""
+        return self._stored.get((kind, item_id), set())
+
+    def is_other(self, kind: str, item_id: str, sha256: str | None) -> bool:
+        """Whether an id is, in the store, that of another item than the one of a hash."""
+        return sha256 is not None and bool(self.stored(kind, item_id) - {sha256})
+
+    def has(self, kind: str, item_id: str, sha256: str | None) -> bool:
+        """Whether a source is one of the items."""
+        if sha256 in self.hashes:
+            return True
+        hashes = self.names.get((kind, item_id))
+        if hashes is None or sha256 is None:
+            return hashes is not None
+        # The hash of the item is not known, and this is not the one of another stored item.
+        return not hashes and sha256 not in self.stored(kind, item_id)
 
 
 def _victim(facts: Facts, reason: str) -> Victim:
@@ -366,16 +408,15 @@ def _reason(facts: Facts, request: DeletionRequest) -> str | None:
     return "damaged, names the operator" if named else None
 
 
-def _reason_of_kin(
-    facts: Facts, request: DeletionRequest, names: set[tuple[str, str]], hashes: set[str | None]
-) -> str | None:
+def _reason_of_kin(facts: Facts, request: DeletionRequest, wanted: _Wanted) -> str | None:
     for kind, item_id, sha256, _ in facts.lineage:
-        if (kind, item_id) in names or (sha256 is not None and sha256 in hashes):
+        if wanted.has(kind, item_id, sha256):
             return f"made from {kind} {item_id}"
-    if facts.sha256 is not None and facts.sha256 in hashes:
+    if facts.sha256 in wanted.hashes:
         return "same content"
     # An id that was reused by another operator is a different item.
-    if (facts.kind, facts.item_id) in names and facts.operator in {None, request.operator}:
+    named = (facts.kind, facts.item_id) in wanted.names
+    if named and facts.operator in {None, request.operator}:
         return "same id"
     return None
 
@@ -476,16 +517,21 @@ def _remove_all(
         remember()
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
-            # The verdict and the notes stay.
-            for path in (facts.folder / name for name in SIGNED_FILES):
-                if request.operator in set(_authors(fields := _dict(path))):
-                    with disk_errors(f"remove the author of {path.name} of {facts.item_id}"):
-                        unsigned = _without_author(fields, request.operator)
-                        replace_file(path, json.dumps(unsigned).encode())
+            _unsign(facts, request.operator)
             reviewed.append(facts)
         if not any(went):
             break
     return reviewed
+
+
+def _unsign(facts: Facts, operator: str | None) -> None:
+    """Remove a name from a review and from notes, whose verdict and texts stay."""
+    what = f"remove the author of remarks on {facts.item_id}"
+    # Deleted meanwhile: the next round looks at what is left of it.
+    with disk_errors(what), suppress(FileNotFoundError), held_folder(facts.folder):
+        for path in (facts.folder / name for name in SIGNED_FILES):
+            if operator in set(_authors(fields := _dict(path))):
+                replace_file(path, json.dumps(_without_author(fields, operator)).encode())
 
 
 def _nothing(root: Path, request: DeletionRequest) -> str:
