@@ -34,6 +34,7 @@ from .catalog import TrashContents as TrashContents
 from .catalog import TrashedItem as TrashedItem
 from .catalog import TrimEpisode as TrimEpisode
 from .catalog import Verdict as Verdict
+from .catalog import superseded as superseded
 from .common import CLASS_OF_STATUS as CLASS_OF_STATUS
 from .common import ID_PATTERN as ID_PATTERN
 from .common import MAX_INSTRUCTION as MAX_INSTRUCTION

@@ -91,6 +91,10 @@ class LineageEntry(FrozenModel):
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
     operation: str = Field(default="", max_length=MAX_OPERATION, exclude_if=not_)
 
+    def is_of(self, sha256: str | None) -> bool:
+        """Whether an item of this kind and id is the source, by its hash, if both are known."""
+        return self.sha256 is None or sha256 in {None, self.sha256}
+
     @property
     def is_edit(self) -> bool:
         """Whether this source was edited, not merely copied under a new id."""

@@ -319,8 +319,8 @@ def plan_deletion(
         wanted.add(victim.kind, victim.id, victim.sha256)
     if spreads and request.recording is not None:
         # Derived data may outlive its source.
-        for sha256 in wanted.stored("recording", request.recording) or {None}:
-            wanted.add("recording", request.recording, sha256)
+        for one in wanted.stored("recording", request.recording) or [None]:
+            wanted.add("recording", request.recording, one)
     found: list[Victim] = []
     grown = True
     while grown:
@@ -335,10 +335,10 @@ def plan_deletion(
                 grown = True
                 wanted.add(facts.kind, facts.item_id, facts.sha256)
                 # And earlier versions, left behind by a repair or an edit.
-                for kind, item_id, sha256, operation in facts.lineage:
+                for kind, item_id, digest, operation in facts.lineage:
                     if kind == facts.kind and (operation or _is_version(facts, kind, item_id)):
-                        is_id = operation != MERGED and not wanted.is_other(kind, item_id, sha256)
-                        wanted.add(kind, item_id if is_id else None, sha256)
+                        is_id = operation != MERGED and not wanted.is_other(kind, item_id, digest)
+                        wanted.add(kind, item_id if is_id else None, digest)
     return found
 
 
@@ -360,7 +360,7 @@ class _Wanted:
 
     def add(self, kind: str, item_id: str | None, sha256: str | None) -> None:
         """Follow an item by its hash and its id, if these are known."""
-        known = {sha256} - {None}
+        known = set() if sha256 is None else {sha256}
         self.hashes |= known
         if item_id is not None:
             self.names.setdefault((kind, item_id), set()).update(known)
