@@ -101,7 +101,7 @@ def review_random(store, rng, kind, name):
     """A random review, or none."""
     verdict = [None, "accepted", "accepted", "rejected"][rng.integers(4)]
     review = verdict and Review(verdict=verdict, reviewer="ada", reviewed_at=NOON)
-    if rng.random() < 0.15:
+    if rng.random() < 0.4:
         # Of an edit, whose results are stored, or not any more.
         stored = rng.permutation(store.list(kind=kind))[:1] if rng.random() < 0.5 else ()
         review = Review(
