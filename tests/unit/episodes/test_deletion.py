@@ -378,7 +378,7 @@ def test_a_note_that_is_written_during_a_deletion_stays(filled, tmp_path, monkey
     """A deletion takes names off notes while nobody else changes them."""
     new = partial(NewNote, start_ns=0, stop_ns=10**9)
     add_note(filled, "b-take", new(text="mine", author=MINE), kind="recording")
-    real, threads = deletion._without_author, []
+    real, threads = deletion.without_author, []
 
     def slow(*args):
         if not threads:
@@ -390,7 +390,7 @@ def test_a_note_that_is_written_during_a_deletion_stays(filled, tmp_path, monkey
             threads[0].join(0.3)
         return real(*args)
 
-    monkeypatch.setattr(deletion, "_without_author", slow)
+    monkeypatch.setattr(deletion, "without_author", slow)
     delete_for_good(filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json")
     threads[0].join()
     notes = filled.notes("b-take", kind="recording").notes
