@@ -103,7 +103,7 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     matching = _matching(store, options.kind, wanted)
     found = matching
     if not options.with_rejected and options.review is None:
-        about = ((name, _open(store, options.kind, name).attributes) for name in matching)
+        about = ((name, store.open_item(options.kind, name).attributes) for name in matching)
         found = [name for name, attributes in about if not is_rejected(store, attributes)]
     num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
@@ -127,7 +127,7 @@ def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> 
     known = {item.id for item in catalog.items(every, limit=len(stored) + 1).items}
     for item_id in sorted({*stored} - known):
         # The catalog omits damaged items; this tells why.
-        _open(store, kind, item_id)
+        store.open_item(kind, item_id)
     named = {"after": "created_after", "before": "created_before"}
     try:
         query = ItemFilter.model_validate(
@@ -169,10 +169,6 @@ def _episodes(
             yield episode
 
 
-def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
-    return store.recording(item_id) if kind == "recording" else store.open(item_id)
-
-
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
     check_format_options(export_parser(), options, form)
@@ -194,7 +190,7 @@ def _export(options: argparse.Namespace) -> Report:
     files: list[dict[str, object]] = []
     exported: list[Attributes] = []
     for item_id in shown:
-        reader = _open(store, options.kind, item_id)
+        reader = store.open_item(options.kind, item_id)
         _note_damaged(reader, damaged)
         count = _export_one(reader, paths[item_id], options)
         files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})

@@ -80,10 +80,12 @@ _BODIES: Final = """SELECT i.row, i.kind, i.stands, i.is_compared, b.item, b.rev
   FROM item i JOIN body b USING (row) JOIN grp g ON g.number = i.grp
   WHERE i.row IN (SELECT value FROM json_each(?))"""
 _SOURCES: Final = """SELECT l.row, s.kind, s.id, b.consent, s.complete, b.incomplete_cause, b.review
-  FROM lineage l JOIN item s ON s.kind = l.kind AND s.id = l.source JOIN body b ON b.row = s.row
+  FROM lineage l JOIN item s ON s.kind = l.kind AND s.id = l.source
+    AND (l.sha256 IS NULL OR l.sha256 = s.sha256) JOIN body b ON b.row = s.row
   WHERE l.row IN (SELECT value FROM json_each(?)) ORDER BY l.row, l.position"""
 _PRODUCTS: Final = """SELECT i.row, p.id
   FROM item i CROSS JOIN lineage l ON l.kind = 'recording' AND l.source = i.id
+    AND (l.sha256 IS NULL OR l.sha256 = i.sha256)
   CROSS JOIN item p ON p.row = l.row AND p.kind = 'episode' AND p.origin <> 'imagined'
   WHERE i.kind = 'recording' AND i.row IN (SELECT value FROM json_each(?))
   ORDER BY p.id, l.position"""

@@ -58,7 +58,7 @@ CREATE TABLE body (
   row INTEGER PRIMARY KEY, summary TEXT NOT NULL, item TEXT NOT NULL, consent INTEGER,
   incomplete_cause TEXT NOT NULL, review TEXT, clicks TEXT);
 CREATE TABLE lineage (
-  row INTEGER, position INTEGER, kind TEXT NOT NULL, source TEXT NOT NULL,
+  row INTEGER, position INTEGER, kind TEXT NOT NULL, source TEXT NOT NULL, sha256 TEXT,
   PRIMARY KEY (row, position)) WITHOUT ROWID;
 CREATE TABLE result (
   row INTEGER, id TEXT NOT NULL, PRIMARY KEY (row, id)) WITHOUT ROWID;
@@ -102,7 +102,8 @@ CREATE TRIGGER item_made AFTER INSERT ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM result WHERE id = new.id) AND kind = new.kind;
 END;
-CREATE TRIGGER item_reviewed AFTER UPDATE OF own_verdict, is_superseded ON item BEGIN
+CREATE TRIGGER item_reviewed
+  AFTER UPDATE OF own_verdict, earlier_verdict, is_superseded ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = new.id AND kind = new.kind);
 END;

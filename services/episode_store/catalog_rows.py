@@ -41,10 +41,10 @@ logger = structlog.get_logger(__name__)
 
 # Most items have no findings, or those of one weight.
 _weight_key = lru_cache(maxsize=1 << 12)(number_key)
-# Sources and products of an item are found by kind and id, whether they are stored or not. A unary
+# Sources and products of an item are found by kind, id and hash, where that is known. A unary
 # plus and CROSS JOIN keep SQLite from beginning with all items of a kind.
 _SOURCES: Final = """FROM lineage l JOIN item s ON s.kind = l.kind AND s.id = l.source
-  WHERE l.row = item.row"""
+  AND (l.sha256 IS NULL OR l.sha256 = s.sha256) WHERE l.row = item.row"""
 # The review of an edit counts as long as one of the results is stored (`Review.standing`).
 _STAND: Final = """UPDATE item SET stands = NOT is_superseded OR EXISTS (
   SELECT 1 FROM result r JOIN item p ON p.kind = item.kind AND p.id = r.id WHERE r.row = item.row)
@@ -53,7 +53,7 @@ _OWN_VERDICT: Final = "iif(stands, own_verdict, earlier_verdict)"
 _LINK_EPISODES: Final = f"""UPDATE item SET
   is_take = origin = 'imagined' OR NOT EXISTS (SELECT 1 {_SOURCES} AND s.kind = 'recording'),
   verdict = coalesce({_OWN_VERDICT}, (SELECT 'rejected' {_SOURCES}
-    AND s.own_verdict = 'rejected' AND NOT s.is_superseded LIMIT 1)),
+    AND iif(s.is_superseded, s.earlier_verdict, s.own_verdict) = 'rejected' LIMIT 1)),
   is_whole = complete AND NOT EXISTS (SELECT 1 {_SOURCES} AND s.kind = 'recording'
     AND NOT s.complete)
   WHERE is_dirty AND +kind = 'episode'"""
@@ -65,6 +65,7 @@ _LINK_RECORDINGS: Final = f"""UPDATE item SET
   is_take = 1, verdict = {_OWN_VERDICT}, is_whole = complete,
   aligned = (SELECT p.row FROM lineage l CROSS JOIN item p ON p.row = l.row
     WHERE l.source = item.id AND l.kind = 'recording'
+      AND (l.sha256 IS NULL OR l.sha256 = item.sha256)
       AND p.kind = 'episode' AND p.origin <> 'imagined' ORDER BY p.id DESC LIMIT 1)
   WHERE is_dirty AND +kind = 'recording'"""
 _JUDGE: Final = f"""UPDATE item SET
@@ -94,7 +95,7 @@ class ItemRow:
 
 def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> ItemRow:
     """Read an item; raises as `EpisodeStore.open`."""
-    reader = store.open(item_id) if kind == "episode" else store.recording(item_id)
+    reader = store.open_item(kind, item_id)
     about = reader.attributes
     summary: EpisodeSummary | RecordingSummary
     if isinstance(reader, EpisodeReader):
@@ -217,8 +218,8 @@ def write_row(connection: sqlite3.Connection, row: ItemRow) -> None:
     number = _insert(connection, "item", {**row.item, "grp": group})
     _insert(connection, "body", {"row": number, **row.body})
     connection.executemany(
-        "INSERT INTO lineage VALUES (?, ?, ?, ?)",
-        [(number, place, one.kind, one.id) for place, one in enumerate(row.lineage)],
+        "INSERT INTO lineage VALUES (?, ?, ?, ?, ?)",
+        [(number, place, one.kind, one.id, one.sha256) for place, one in enumerate(row.lineage)],
     )
     _insert_results(connection, number, row.results)
     known = dict(execute("SELECT name, number FROM figure_name"))

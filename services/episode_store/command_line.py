@@ -175,7 +175,7 @@ def show(context: Context) -> Outcome:
     item_id = context.options.id
     kind = context.kind_of(item_id)
     store = context.store
-    reader = store.recording(item_id) if kind == "recording" else store.open(item_id)
+    reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
     streams = {}

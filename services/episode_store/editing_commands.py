@@ -138,7 +138,7 @@ def note(context: Context) -> Outcome:
     """Add, remove or list notes on time ranges of an item."""
     options, store = context.options, context.store
     kind: Kind = context.kind_of(options.id)
-    reader = store.open(options.id) if kind == "episode" else store.recording(options.id)
+    reader = store.open_item(kind, options.id)
     zero = zero_ns(reader)
     if options.text is not None and options.remove is not None:
         raise InvalidInputError("note: --text and --remove exclude each other")

@@ -43,7 +43,10 @@ def editing_router(store: EpisodeStore, catalog: Catalog) -> APIRouter:
 
     def done(kind: Kind, result: EditedItem, *, dry_run: bool) -> EditedItem:
         if not dry_run:
-            catalog.forget(StoredItem(kind=kind, id=result.source_id))
+            # Their reviews have changed.
+            for source in store.open_item(kind, result.id).attributes.lineage:
+                if source.is_edit and source.kind == kind:
+                    catalog.forget(StoredItem(kind=kind, id=source.id))
             logger.info("item_edited", kind=kind, id=result.id, source=result.source_id)
         return result
 

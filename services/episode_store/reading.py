@@ -293,13 +293,10 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
     """Create the routes below /v1/playback; sizes are checked before reading."""
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
 
-    def opened(kind: ItemKind, item_id: str) -> Reader:
-        return store.open(item_id) if kind == "episode" else store.recording(item_id)
-
     @router.get("/{kind}/{item_id}")
     def get_playback(kind: ItemKind, item_id: str) -> Playback:
         """What can be played of an item: its streams with their extents and longest gaps."""
-        return playback_of(opened(kind, item_id))
+        return playback_of(store.open_item(kind, item_id))
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
     def get_playback_images(
@@ -310,7 +307,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         if_none_match: IfNoneMatch = None,
     ) -> Response:
         """JPEG images of a span: arrays `t_ns`, `num_bytes` of each, and `data`, one by one."""
-        reader = opened(kind, item_id)
+        reader = store.open_item(kind, item_id)
         read = partial(_images, reader, camera, query, settings.max_answer_bytes)
         return response(etag_of(reader, f"jpeg {camera}", query), if_none_match, read, MSGPACK)
 
@@ -322,7 +319,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         if_none_match: IfNoneMatch = None,
     ) -> Response:
         """Lowest and highest value per bin of time: arrays `NAME/low`, `NAME/high` [points]."""
-        reader = opened(kind, item_id)
+        reader = store.open_item(kind, item_id)
         read: Callable[[], bytes] = partial(reduce_signals, reader, query)
         return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
 

@@ -88,6 +88,17 @@ def try_lock(folder: Path) -> int | None:
     return descriptor
 
 
+@contextmanager
+def held_folder(folder: Path) -> Iterator[None]:
+    """Wait for the lock of a folder, and hold it."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def is_folder_at(descriptor: int, path: Path) -> bool:
     """Whether an open folder is still the one at `path`."""
     try:
@@ -287,7 +298,7 @@ def copy_files(files: GroupFiles, names: Iterable[str], folder: Path, *, link: b
             place.parent.mkdir(parents=True, exist_ok=True)
             if link and isinstance(files, LocalGroup):
                 try:
-                    os.link(files.folder / name, place, follow_symlinks=False)
+                    os.link(files.path(name), place, follow_symlinks=False)
                     continue
                 except OSError as error:
                     # Another file system, or one without hard links.
@@ -322,7 +333,7 @@ class LocalGroup:
 
     def get(self, name: str) -> bytes | None:
         """All bytes of a small file; None where there is no such file."""
-        path = self._path(name)
+        path = self.path(name)
         with disk_errors(f"read {path}"):
             if not path.is_file():
                 return None
@@ -344,7 +355,7 @@ class LocalGroup:
 
     def source(self, name: str) -> LocalFile:
         """A file that is read in parts."""
-        return LocalFile(self._path(name))
+        return LocalFile(self.path(name))
 
     def names(self) -> list[str]:
         """Sorted names of all files of the group, with those beside its content."""
@@ -353,7 +364,8 @@ class LocalGroup:
             names = (path.relative_to(self.folder).as_posix() for path in found)
             return sorted(n for n in names if not (is_system_file(n) or n.endswith(PARTIAL)))
 
-    def _path(self, name: str) -> Path:
+    def path(self, name: str) -> Path:
+        """Path of a file; raises CorruptDataError for a symbolic link on the way."""
         path = self.folder
         for part in ("", *name.split("/")):
             path = path / part

@@ -5,9 +5,10 @@ the checksums that a commit record has.
 """
 
 import hashlib
+import itertools
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from typing import Annotated, Any, Final, Generic, Literal, TypeVar, get_args
@@ -55,6 +56,8 @@ ZARR_CODECS: Mapping[Codec, str] = {"jpeg": "dextouch.jpeg", "h264": "dextouch.h
 _CF_TIMES = ("days", "hours", "minutes", "seconds", "milliseconds", "microseconds", "nanoseconds")
 # Far above any real array; a forged one must not overflow later arithmetic.
 MAX_ROWS = 1 << 40
+# Of an id that gets a number: room for that.
+MAX_STEM = 112
 Size = Annotated[int, Field(ge=0, le=MAX_ROWS)]
 STAMPS: Mapping[Kind, tuple[str, ...]] = {
     "episode": ("t_ref_ns",),
@@ -326,11 +329,35 @@ def shard_path(num_dimensions: int) -> str:
     return "/".join(["c", *(["0"] * num_dimensions)])
 
 
+def array_files(arrays: Mapping[str, "ArrayEntry"]) -> set[str]:
+    """Paths of all files of arrays, relative to their group."""
+    return {
+        f"{name}/{file}"
+        for name, entry in arrays.items()
+        for file in (METADATA_FILE, shard_path(len(entry.shape)))
+    }
+
+
+def numbered_ids(item_id: str, word: str) -> Iterator[str]:
+    """Ids `ID-WORD-1`, `ID-WORD-2` and so on, of a long id with its beginning."""
+    return (f"{item_id[:MAX_STEM]}-{word}-{number}" for number in itertools.count(1))
+
+
 def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
     """Bytes of `commit.json` and the record's sha256, which is the content hash of the group."""
     plain = record.model_dump(mode="json")
     digest = sha256_hex(canonical_json(plain))
     return canonical_json({"record": plain, "sha256": digest}), digest
+
+
+def stated_sha256(commit: bytes | None) -> str | None:
+    """The content hash that a commit record states of itself; None if it is damaged."""
+    try:
+        outer = json.loads(commit or b"")
+    except MALFORMED:
+        return None
+    found = outer.get("sha256") if isinstance(outer, dict) else None
+    return found if isinstance(found, str) else None
 
 
 def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:

@@ -4,7 +4,7 @@ import fcntl
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -29,6 +29,7 @@ from dextouch.episodes.format import (
     Kind,
     attributes_id,
     check_id,
+    stated_sha256,
 )
 from dextouch.episodes.groups import A, GroupContents, read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
@@ -39,6 +40,7 @@ from dextouch.episodes.trash import (
     REVIEW_FILE,
     TrashEntry,
     TrashKind,
+    change_trashed_review,
     list_trash,
     purge_trash,
     put_into_trash,
@@ -61,6 +63,7 @@ from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
     ItemNotes,
+    LineageEntry,
     Observation,
     RecordingAttributes,
     Review,
@@ -125,6 +128,10 @@ class EpisodeStore:
         """Open a finished recording; raises as `open`."""
         return RecordingReader(self._read("recording", recording_id, RecordingAttributes))
 
+    def open_item(self, kind: Kind, item_id: str) -> EpisodeReader | RecordingReader:
+        """Open an episode or a recording; raises as `open`."""
+        return self.open(item_id) if _check_kind(kind) == "episode" else self.recording(item_id)
+
     def _read(self, kind: Kind, item_id: str, model: type[A]) -> GroupContents[A]:
         """Open a group; damage of one that is gone is a NotFoundError."""
         group = self._storage.group(*_check(kind, item_id))
@@ -141,6 +148,16 @@ class EpisodeStore:
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Whether an id is committed."""
         return self._storage.exists(*_check(kind, item_id))
+
+    def has_source(self, source: LineageEntry) -> bool:
+        """Whether the item that a lineage entry names is there, and no other one of its id."""
+        kind = next((kind for kind in KINDS if kind == source.kind), None)
+        if kind is None or not self.exists(source.id, kind=kind):
+            return False
+        if source.sha256 is None:
+            return True
+        commit = self._storage.group(kind, source.id).get(COMMIT_FILE)
+        return source.is_of(stated_sha256(commit))
 
     def num_bytes(self, item_id: str, *, kind: Kind = "episode") -> int:
         """Size of a committed group; raises NotFoundError without the id."""
@@ -176,9 +193,47 @@ class EpisodeStore:
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
         """Keep the review of an item in place of an earlier one; None removes it.
 
-        Raises NotFoundError without the id.
+        That an edit supersedes the item stays, unless the item is accepted after the edit. Raises
+        NotFoundError without the id.
         """
-        self._set_remark(kind, item_id, REVIEW_FILE, review)
+        before = self._readable_review(kind, item_id)
+        # Results that whoever reviews the item could know of.
+        results = () if before is None else before.superseded_by
+        is_known = any(self.exists(name, kind=kind) for name in results)
+        with self._storage.held(*_check(kind, item_id), waits=True):
+            now = self._readable_review(kind, item_id)
+            if now is not None and now.superseded_by and not (review and review.superseded_by):
+                is_known = is_known and results == now.superseded_by
+                if review is None or review.verdict == "rejected" or not is_known:
+                    review = now.model_copy(update={"earlier": review})
+            self._set_remark(kind, item_id, REVIEW_FILE, review)
+
+    def _readable_review(self, kind: Kind, item_id: str) -> Review | None:
+        with suppress(CorruptDataError):
+            return self.review(item_id, kind=kind)
+        return None
+
+    def change_source_review(
+        self,
+        source: LineageEntry,
+        change: Callable[[Review | None], Review | None],
+        *,
+        is_held: bool = False,
+    ) -> None:
+        """Change the review of an edited item that a lineage entry names, also in the trash.
+
+        `is_held` says that the caller holds it; otherwise it is held meanwhile.
+        """
+        kind: Kind = "episode" if source.kind == "episode" else "recording"
+        if self.has_source(source):
+            held = nullcontext() if is_held else self._storage.held(kind, source.id, waits=True)
+            with held:
+                review = self.review(source.id, kind=kind)
+                changed = change(review)
+                if changed != review:
+                    self._set_remark(kind, source.id, REVIEW_FILE, changed)
+        for folder in self.folders:
+            change_trashed_review(folder, source, change)
 
     def clicks(self, episode_id: str) -> EpisodeClicks | None:
         """Clicks on the objects of an episode; None if there are none. Raises as `review`."""

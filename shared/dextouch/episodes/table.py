@@ -52,14 +52,14 @@ def is_rejected(
     )
     if own is not None or not isinstance(about, EpisodeAttributes):
         return own is not None and own.verdict == "rejected"
-    sources = [(one.id, kind) for one in about.lineage for kind in KINDS if one.kind == kind]
-    reviews = (
-        place.review(name, kind=kind)
-        for name, kind in sources
+    return any(
+        (review := place.review(source.id, kind=kind)) is not None and review.spreads
+        for source in about.lineage
+        for kind in KINDS
+        if source.kind == kind
         for place in places
-        if place.exists(name, kind=kind)
+        if place.has_source(source)
     )
-    return any(review is not None and review.spreads for review in reviews)
 
 
 def select_episodes(

@@ -23,9 +23,9 @@ from dextouch.episodes.files import (
     replace_file,
     sync_folder,
 )
-from dextouch.episodes.format import COMMIT_FILE, KINDS
+from dextouch.episodes.format import COMMIT_FILE, KINDS, stated_sha256
 from dextouch.errors import ConflictError, CorruptDataError, NotFoundError, UnknownNameError
-from dextouch.schemas import Review
+from dextouch.schemas import LineageEntry, Review
 
 TRASH = ".trash"
 # Besides groups: unfinished uploads that were damaged.
@@ -166,12 +166,16 @@ def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) 
 
 
 def change_trashed_review(
-    root: Path, kind: TrashKind, item_id: str, change: Callable[[Review | None], Review]
+    root: Path, source: LineageEntry, change: Callable[[Review | None], Review | None]
 ) -> None:
-    """Change the reviews of an id's groups in the trash, for when they are restored."""
-    for folder in sorted((root / TRASH).glob(f"{kind}.{item_id}.*")):
-        if (folder / COMMIT_FILE).is_file():
-            what = f"{kind} {item_id!r} in the trash"
-            review = read_remark(LocalGroup(folder), REVIEW_FILE, Review, what=what)
+    """Change the reviews of a source's groups in the trash, for when they are restored."""
+    for folder in sorted((root / TRASH).glob(f"{source.kind}.{source.id}.*")):
+        files, what = LocalGroup(folder), f"{source.kind} {source.id!r} in the trash"
+        commit = files.get(COMMIT_FILE)
+        if commit is None or not source.is_of(stated_sha256(commit)):
+            continue
+        review = read_remark(files, REVIEW_FILE, Review, what=what)
+        changed = change(review)
+        if changed is not None and changed != review:
             with disk_errors(f"write {REVIEW_FILE} of {what}"):
-                replace_file(folder / REVIEW_FILE, change(review).model_dump_json().encode())
+                replace_file(folder / REVIEW_FILE, changed.model_dump_json().encode())

@@ -41,8 +41,10 @@ from dextouch.episodes.format import (
     CommitRecord,
     ImageCodec,
     Kind,
+    array_files,
     array_metadata,
     attributes_id,
+    decode_commit,
     encode_commit,
     group_metadata,
     image_codec,
@@ -61,7 +63,6 @@ from dextouch.episodes.image_codecs import (
     pack_group,
 )
 from dextouch.episodes.shards import ShardWriter
-from dextouch.episodes.trash import REMARK_FILES
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,
@@ -305,8 +306,8 @@ class EpisodeWriter:
         `metadata` and `commit` are the files of these names. With `link` the files of a local group
         are shared with it, where the file system can: committed ones are never written again.
         """
-        names = set(source.names()) - {METADATA_FILE, COMMIT_FILE, *REMARK_FILES}
-        copy_files(source, sorted(names), self._stage, link=link)
+        record, _ = decode_commit(commit, what=source.item_id)
+        copy_files(source, sorted(array_files(record.arrays)), self._stage, link=link)
         with disk_errors(f"copy {source.item_id}"):
             write_file(self._stage / METADATA_FILE, metadata)
         self._taken = commit

@@ -34,6 +34,7 @@ from .catalog import TrashContents as TrashContents
 from .catalog import TrashedItem as TrashedItem
 from .catalog import TrimEpisode as TrimEpisode
 from .catalog import Verdict as Verdict
+from .catalog import superseded as superseded
 from .common import CLASS_OF_STATUS as CLASS_OF_STATUS
 from .common import ID_PATTERN as ID_PATTERN
 from .common import MAX_INSTRUCTION as MAX_INSTRUCTION
@@ -54,6 +55,7 @@ from .common import problem_from_error as problem_from_error
 from .common import status_of as status_of
 from .episodes import ID_TAKEN as ID_TAKEN
 from .episodes import MAX_CAUSE as MAX_CAUSE
+from .episodes import MERGED as MERGED
 from .episodes import BatchReceipt as BatchReceipt
 from .episodes import CatalogHours as CatalogHours
 from .episodes import ClockReport as ClockReport

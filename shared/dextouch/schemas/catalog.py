@@ -1,6 +1,7 @@
 """Schemas of the store's catalog: items, lineage, the trash, reviews, notes, edits, hours."""
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 from operator import not_
 from typing import Annotated, Literal
 
@@ -120,7 +121,23 @@ class Review(FrozenModel):
     @property
     def spreads(self) -> bool:
         """Whether what was made from the item is rejected, too: not by an edit of the item."""
-        return self.verdict == "rejected" and not self.superseded_by
+        review = self.earlier if self.superseded_by else self
+        return review is not None and review.verdict == "rejected"
+
+
+def superseded(review: Review | None, by: str) -> Review:
+    """The review of an item, from an earlier one, once an edit made another one of it."""
+    marked = () if review is None else review.superseded_by
+    if review is not None and by in marked:
+        return review
+    results = (*marked, by)[-MAX_MOVED:]
+    return Review(
+        verdict="rejected",
+        reason=f"superseded by {', '.join(results)}"[:500],
+        reviewed_at=datetime.now(UTC),
+        superseded_by=results,
+        earlier=review.earlier if marked and review is not None else review,
+    )
 
 
 class TimedNote(FrozenModel):

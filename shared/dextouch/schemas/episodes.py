@@ -75,6 +75,10 @@ class StoredAnchor(FrozenModel):
         return AnchorPoses(**{name: np.array(rows) for name, rows in self})
 
 
+# The operation of a copy that a merge of stores gave a new id.
+MERGED: Final = "merge --rename"
+
+
 class LineageEntry(FrozenModel):
     """A source of derived data, by id and content hash.
 
@@ -86,6 +90,15 @@ class LineageEntry(FrozenModel):
     id: str
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
     operation: str = Field(default="", max_length=MAX_OPERATION, exclude_if=not_)
+
+    def is_of(self, sha256: str | None) -> bool:
+        """Whether an item of this kind and id is the source, by its hash, if both are known."""
+        return self.sha256 is None or sha256 in {None, self.sha256}
+
+    @property
+    def is_edit(self) -> bool:
+        """Whether this source was edited, not merely copied under a new id."""
+        return self.operation not in {"", MERGED}
 
 
 class ClockReport(FrozenModel):

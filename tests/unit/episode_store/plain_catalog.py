@@ -91,14 +91,14 @@ def _standing(entry, stored):
 
 
 def _linked(entry, recordings, episodes):
-    names = [one.id for one in entry.lineage if one.kind == "recording" and one.id in recordings]
+    names = _stored(entry, "recording", recordings)
     sources = [recordings[name].item for name in names]
     torn = next((one for one in (entry.item, *sources) if not one.complete), entry.item)
     review = _standing(entry, episodes)
     if review is None:
-        above = [one.id for one in entry.lineage if one.kind == "episode" and one.id in episodes]
+        above = _stored(entry, "episode", episodes)
         reviews = [one.review for one in (*sources, *(episodes[name].item for name in above))]
-        review = next((one for one in reviews if one and one.spreads), None)
+        review = next((one for one in reviews if one and _rejects_products(one)), None)
     return entry.having(
         recordings=tuple(names),
         consent=all(one.consent for one in sources) if names else None,
@@ -106,6 +106,21 @@ def _linked(entry, recordings, episodes):
         complete=torn.complete,
         incomplete_cause=torn.incomplete_cause,
     )
+
+
+def _stored(entry, kind, stored):
+    return [
+        one.id
+        for one in entry.lineage
+        if one.kind == kind and one.id in stored
+        if one.sha256 in {None, stored[one.id].summary.content_sha256}
+    ]
+
+
+def _rejects_products(review):
+    if review.superseded_by:
+        return review.earlier is not None and review.earlier.verdict == "rejected"
+    return review.verdict == "rejected"
 
 
 def _take(recording, episodes):

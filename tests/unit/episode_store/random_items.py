@@ -62,7 +62,12 @@ def put_random(store, rng, names):
 
     def sources():
         for _ in range(rng.integers(3)):
-            yield {"kind": one_of("recording", "episode"), "id": one_of(*names)}
+            kind, name, sha256 = one_of("recording", "episode"), one_of(*names), None
+            if rng.random() < 0.5:
+                # Of the item as it is stored, or of another one with its id.
+                is_stored = store.exists(name, kind=kind) and rng.random() < 0.8
+                sha256 = store.open_item(kind, name).content_sha256 if is_stored else "0" * 64
+            yield {"kind": kind, "id": name, "sha256": sha256}
 
     at = None if rng.random() < 0.2 else NOON + timedelta(minutes=int(rng.integers(-3000, 3000)))
     quality = {name: float(rng.normal() ** 5) for name in QUALITY if rng.random() < 0.7}
@@ -96,7 +101,7 @@ def review_random(store, rng, kind, name):
     """A random review, or none."""
     verdict = [None, "accepted", "accepted", "rejected"][rng.integers(4)]
     review = verdict and Review(verdict=verdict, reviewer="ada", reviewed_at=NOON)
-    if rng.random() < 0.15:
+    if rng.random() < 0.4:
         # Of an edit, whose results are stored, or not any more.
         stored = rng.permutation(store.list(kind=kind))[:1] if rng.random() < 0.5 else ()
         review = Review(

@@ -4,6 +4,7 @@ import pytest
 from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore
+from services.episode_store import catalog_index
 from services.episode_store.app import create_app
 from tests.unit.episode_store.episodes import write_episode, write_recording
 
@@ -43,6 +44,19 @@ async def test_a_trim_supersedes_its_source_in_the_catalog(http, store):
     moved = await http.post("/trash", json={"items": [{"kind": "episode", "id": "a-trimmed-1"}]})
     assert moved.status_code == 200
     assert await reviews(http) == {"a": None}
+
+
+async def test_all_that_an_item_was_edited_from_is_read_again(http, store, monkeypatch):
+    monkeypatch.setattr(catalog_index, "ALWAYS_CHECKED", 0)
+    write_episode(store, "a", num_steps=20)
+    for name in ("a", "a-relabelled-1"):
+        item = {"kind": "episode", "id": name}
+        body = {"items": [item], "instruction": f"not {name}", "keep": name == "a"}
+        assert (await http.post("/catalog/relabel", json=body)).json()["refused"] == []
+        await reviews(http)
+    last = "a-relabelled-1-relabelled-1"
+    said = f"superseded by a-relabelled-1, {last}"
+    assert await reviews(http) == {"a": said, last: None}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Edited items against the arrays that their sources were written from."""
 
 from datetime import UTC, datetime
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from dextouch.episodes.editing import (
     EditOptions,
     relabel_item,
     steps_between,
+    trim,
     trim_episode,
     trim_recording,
 )
@@ -35,6 +37,7 @@ from tests.unit.episodes.conftest import episode_of
 
 NOON = datetime(2026, 5, 4, 12, tzinfo=UTC)
 KEPT = EditOptions(keep=True)
+REJECTED = Review(verdict="rejected", reviewed_at=NOON)
 NUM_STEPS = 60
 # Of the camera's images nothing may be lost, of touch and poses nothing but the mean at the cut.
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
@@ -372,12 +375,94 @@ def test_a_verdict_before_an_edit_is_kept(store):
     store.delete(result.id)
     assert chosen(store) == [name]
     # A rejection stays with the source and holds for the part.
-    store.set_review(name, Review(verdict="rejected", reviewed_at=NOON))
+    store.set_review(name, REJECTED)
     result = trim_episode(store, name, (3, 20), options=KEPT)
-    assert store.review(result.id) is None
+    assert store.review(result.id) == REJECTED
     assert any("accept it" in message for message in result.messages)
     with pytest.raises(NotFoundError, match="rejected in review"):
         chosen(store)
+
+
+@pytest.mark.parametrize("options", [KEPT, EditOptions()])
+def test_an_edit_takes_no_rejection_back(store, options):
+    write_episode(store, "a")
+    store.set_review("a", REJECTED)
+    result = relabel_item(store, "a", {"instruction": "up"}, options=options)
+    assert is_rejected(store, store.open(result.id).attributes)
+    # Nor one of a recording, for the episodes that were made of it.
+    write_take(store, "take")
+    store.set_review("take", REJECTED, kind="recording")
+    relabel_item(store, "take", {"instruction": "up"}, kind="recording", options=KEPT)
+    assert is_rejected(store, store.open("take-aligned").attributes)
+
+
+def test_a_mark_outlives_reviews_but_not_an_acceptance(store):
+    write_episode(store, "a")
+    result = relabel_item(store, "a", {"instruction": "up"}, options=KEPT)
+    for review in (REJECTED, None):
+        store.set_review("a", review)
+        assert store.review("a").superseded_by == (result.id,)
+        assert store.review("a").earlier == review
+    assert chosen(store) == [result.id]
+    store.set_review("a", Review(verdict="accepted", reviewed_at=NOON))
+    assert chosen(store) == ["a", result.id]
+
+
+def test_a_review_during_an_edit_waits_and_keeps_its_mark(store, monkeypatch):
+    write_episode(store, "a", num_steps=20)
+    real, threads = trim._episode_blocks, []
+    accepted = Review(verdict="accepted", reviewed_at=NOON)
+
+    def slow(*args, **kwargs):
+        if not threads:
+            threads.append(Thread(target=store.set_review, args=("a", accepted)))
+            threads[0].start()
+            threads[0].join(0.3)
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(trim, "_episode_blocks", slow)
+    result = trim_episode(store, "a", (1, 20), options=KEPT)
+    threads[0].join()
+    assert store.review("a").superseded_by == (result.id,)
+    assert store.review("a").earlier == accepted
+    assert chosen(store) == [result.id]
+
+
+def test_an_edit_marks_no_other_item_of_its_source_s_id(store):
+    write_episode(store, "a", seed=1)
+    store.delete("a")
+    write_episode(store, "a", seed=2)
+    relabel_item(store, "a", {"instruction": "up"}, options=KEPT)
+    store.delete("a", for_good=True)
+    store.restore("a")
+    assert store.open("a").attributes.seed == 1
+    assert store.review("a") is None
+
+
+@pytest.mark.parametrize("salvaged", ["a", "a-trimmed-1"])
+def test_what_is_salvaged_of_an_edit_is_superseded_or_supersedes(store, salvaged):
+    write_episode(store, "a", num_steps=20)
+    trim_episode(store, "a", (1, 20), options=KEPT)
+    damage(store, salvaged)
+    new_id = care.repair_group(store.root, "episode", salvaged).new_id
+    assert chosen(store) == ["a-trimmed-1" if salvaged == "a" else new_id]
+    write_episode(store, "b")
+    store.set_review("b", REJECTED)
+    damage(store, "b")
+    assert store.review(care.repair_group(store.root, "episode", "b").new_id) == REJECTED
+
+
+def damage(store, name):
+    shard = store.root / "episodes" / name / "tactile_left" / "c" / "0" / "0"
+    shard.unlink()
+    shard.write_bytes(b"x" * 10)
+
+
+def test_a_damaged_result_has_its_id(store):
+    write_episode(store, "a", num_steps=20)
+    trim_episode(store, "a", (1, 20), options=KEPT)
+    (store.root / "episodes/a-trimmed-1/commit.json").write_bytes(b"{}")
+    assert trim_episode(store, "a", (2, 20)).id == "a-trimmed-2"
 
 
 def test_an_edit_that_was_interrupted_after_its_commit_is_completed(store, monkeypatch):
@@ -467,6 +552,32 @@ def test_a_relabel_must_change_something_and_names_no_operator(store):
     assert about.operator == "p-2"
     assert "p-2" not in about.lineage[-1].operation
     assert store.list(kind="recording") == ["take-relabelled-1"]
+
+
+def test_a_relabel_to_another_operator_is_another_one(store, tmp_path):
+    write_recording(store, "take", operator="p-1")
+    for operator in ("p-2", "p-3", "p-2"):
+        change = {"operator": operator}
+        result = relabel_item(store, "take", change, kind="recording", options=KEPT)
+        assert store.recording(result.id).attributes.operator == operator
+    assert len(store.list(kind="recording")) == 3
+    write_recording(store, "other", operator="p-4")
+    request = care.DeletionRequest(operator="p-4")
+    care.delete_for_good(store.root, request, tmp_path / "receipt.json")
+    with pytest.raises(InvalidInputError, match="permanently deleted"):
+        relabel_item(store, "take", {"operator": "p-4"}, kind="recording")
+
+
+def test_an_edit_takes_only_the_files_of_arrays(store):
+    write_episode(store, "a")
+    (store.root / "episodes/a/backup.bin").write_bytes(b"x")
+    shard = store.root / "episodes/a/action/c/0/0"
+    result = relabel_item(store, "a", {"instruction": "up"}, options=KEPT)
+    assert "backup.bin" not in store.files(result.id).names()
+    shard.rename(store.root / "moved")
+    shard.symlink_to(store.root / "moved")
+    with pytest.raises(StorageError, match="symbolic link"):
+        relabel_item(store, "a", {"instruction": "down"})
 
 
 def test_deleting_an_operator_deletes_what_was_relabelled_from_another(store, tmp_path):

@@ -4,8 +4,14 @@ from datetime import UTC, datetime
 
 import pytest
 
-from dextouch.episodes import EpisodeStore, care
-from dextouch.episodes.editing import MergeOptions, merge_stores, relabel_item, trim_episode
+from dextouch.episodes import EpisodeStore, care, is_rejected
+from dextouch.episodes.editing import (
+    EditOptions,
+    MergeOptions,
+    merge_stores,
+    relabel_item,
+    trim_episode,
+)
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeClicks, ItemNotes, Review, TimedNote
 from tests.contracts.s3_server import CREDENTIALS, running_s3
@@ -18,6 +24,8 @@ NOTES = ItemNotes(
 )
 CLICKS = EpisodeClicks.model_validate({"objects": {"cup": {"state": "absent"}}})
 PLAIN = MergeOptions()
+KEPT = EditOptions(keep=True)
+REJECTED = Review(verdict="rejected", reviewed_at=NOON)
 
 
 @pytest.fixture
@@ -89,6 +97,82 @@ def test_an_id_with_other_content_is_refused_or_gets_a_new_id(stores):
     (entry,) = copy.attributes.lineage
     assert (entry.id, entry.sha256) == ("a", one.open("a").content_sha256)
     assert entry.operation == "merge --rename"
+
+
+def test_renamed_items_refer_to_each_other(stores):
+    one, _, target = stores
+    write_take(target, "take", consent=True)
+    write_take(one, "take", num_steps=12, consent=False)
+    relabel_item(one, "take-aligned", {"instruction": "up"}, options=KEPT)
+    write_episode(target, "take-aligned-relabelled-1", seed=7)
+    target.set_review("take", REJECTED, kind="recording")
+    merge_stores([one], target, options=MergeOptions(rename=True))
+    copy = "take-aligned-merged-1"
+    assert target.open(copy).attributes.lineage[0].id == "take-merged-1"
+    assert not is_rejected(target, target.open("take-aligned-relabelled-1-merged-1").attributes)
+    # Superseded by the copy of its result, not by the item that has the id of that.
+    assert target.review(copy).superseded_by == ("take-aligned-relabelled-1-merged-1",)
+    target.set_review("take", None, kind="recording")
+    target.set_review("take-merged-1", REJECTED, kind="recording")
+    rejected = [n for n in target.list() if is_rejected(target, target.open(n).attributes)]
+    assert rejected == [copy, "take-aligned-relabelled-1-merged-1"]
+    # An edit of the copy is none of the item that has its former id.
+    relabel_item(target, copy, {"instruction": "down"}, options=KEPT)
+    assert target.review("take-aligned") is None
+
+
+def test_a_merge_again_brings_back_nothing_that_was_edited_or_deleted(stores):
+    one, _, target = stores
+    for name in ("a", "b", "c"):
+        write_episode(one, name, num_steps=20)
+    write_episode(target, "c")
+    options = MergeOptions(rename=True)
+    merge_stores([one], target, options=options)
+    for name in ("a", "c-merged-1"):
+        trim_episode(target, name, (1, 20))
+    target.purge()
+    target.delete("b")
+    reports = merge_stores([one], target, options=options)
+    ids = ["a-trimmed-1", "b", "c-merged-1-trimmed-1"]
+    assert [(one.action, one.new_id) for one in reports] == [("there", name) for name in ids]
+    assert target.list() == ["a-trimmed-1", "c", "c-merged-1-trimmed-1"]
+    # What an interrupted merge left out is no edited source: the edit itself came over.
+    edit = relabel_item(one, "b", {"instruction": "up"}, options=EditOptions("z", keep=True))
+    merge_stores([one], target, options=options)
+    target.purge()
+    merge_stores([one], target, options=options)
+    assert {"b", edit.id} <= set(target.list())
+
+
+def test_names_of_deleted_operators_do_not_come_back(stores, tmp_path):
+    one, _, target = stores
+    write_recording(target, "take", operator="p-7")
+    request = care.DeletionRequest(operator="p-7")
+    care.delete_for_good(target.root, request, tmp_path / "receipt.json")
+    write_episode(one, "a")
+    one.set_review("a", REVIEW)
+    mine = NOTES.notes[0].model_copy(update={"author": "p-7"})
+    one.change_notes("a", lambda _: ItemNotes(notes=(mine,)))
+    merge_stores([one], target, options=PLAIN)
+    assert target.review("a") == REVIEW.model_copy(update={"reviewer": None})
+    assert target.notes("a") == NOTES
+
+
+def test_a_note_that_is_written_during_a_merge_stays(stores, monkeypatch):
+    one, _, target = stores
+    for store in (one, target):
+        write_episode(store, "a")
+    one.change_notes("a", lambda _: NOTES)
+    mine = ItemNotes(notes=(NOTES.notes[0].model_copy(update={"text": "mine"}),))
+    real = target.change_notes
+
+    def late(*args, **kwargs):
+        real("a", lambda _: mine)
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(target, "change_notes", late)
+    merge_stores([one], target, options=PLAIN)
+    assert target.notes("a") == mine
 
 
 def test_damage_is_refused_and_the_rest_is_copied(stores):

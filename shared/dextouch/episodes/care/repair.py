@@ -4,7 +4,6 @@ A reader stops at the first damage; an inspection continues and lists all of it.
 reversible: damaged groups go to the trash, from where they can be restored.
 """
 
-import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
@@ -36,11 +36,13 @@ from dextouch.episodes.format import (
     CommitRecord,
     Kind,
     Version,
+    array_files,
     array_metadata,
     attributes_id,
     decode_commit,
     group_attributes,
     kind_of,
+    numbered_ids,
     sha256_hex,
     shard_path,
     stream_arrays,
@@ -50,7 +52,16 @@ from dextouch.episodes.format import (
 from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
-from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
+from dextouch.episodes.store import EpisodeStore
+from dextouch.episodes.trash import (
+    HOMES,
+    NOTES_FILE,
+    REMARK_FILES,
+    REVIEW_FILE,
+    TrashKind,
+    put_into_trash,
+    read_remark,
+)
 from dextouch.episodes.writer import DOWNLOADS, STAGING, EpisodeWriter, new_stage
 from dextouch.errors import (
     ConflictError,
@@ -60,7 +71,15 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
-from dextouch.schemas import EpisodeAttributes, LedgerEntry, LineageEntry, RecordingAttributes
+from dextouch.schemas import (
+    EpisodeAttributes,
+    ItemNotes,
+    LedgerEntry,
+    LineageEntry,
+    RecordingAttributes,
+    Review,
+    superseded,
+)
 
 UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
@@ -164,9 +183,7 @@ def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
     # A killed program may have left a part of a remark, which the next one replaces.
     partial = (name + PARTIAL for name in REMARK_FILES)
-    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES, *partial}
-    for name, entry in entries.items():
-        wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES, *partial} | array_files(entries)
     folders = {str(parent) for path in wanted for parent in Path(path).parents}
     found = []
     with disk_errors(f"look through {folder.name}"):
@@ -315,7 +332,9 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
             streams = group_streams(folder, attributes, entries)
         item_id = attributes_id(attributes)
         source = LineageEntry(kind=kind_of(attributes), id=item_id, sha256=sha256)
-        new_id, lost = _write_salvaged(root, attributes, streams, source)
+        remarks = _remarks(folder)
+        new_id, lost = _write_salvaged(root, attributes, streams, source, remarks)
+        _supersede_sources(root, attributes, new_id)
     except DexTouchError as error:
         # Often the inspection has already found the same.
         notes = tuple(dict.fromkeys((*notes, error.message)))
@@ -325,7 +344,11 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
 
 
 def _write_salvaged(
-    root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
+    root: Path,
+    attributes: Attributes,
+    streams: Sequence[SalvagedStream],
+    source: LineageEntry,
+    remarks: Mapping[str, BaseModel],
 ) -> tuple[str, dict[str, int]]:
     """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
@@ -341,7 +364,7 @@ def _write_salvaged(
         with suppress(StorageError):
             if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
                 return folder.name, lost
-    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    names = numbered_ids(item_id, "salvaged")
     free = next(name for name in names if not (root / f"{kind}s" / name).exists())
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
@@ -353,7 +376,32 @@ def _write_salvaged(
         for stream in streams:
             for values, stamps in stream.blocks():
                 writer.append(stream.descriptor.name, values=values, **stamps)
+        for name, remark in remarks.items():
+            writer.add_remark(name, remark)
     return free, lost
+
+
+def _remarks(folder: Path) -> dict[str, BaseModel]:
+    """What people said of a damaged item that holds for its readable samples."""
+    found: dict[str, BaseModel | None] = {}
+    forms: dict[str, type[BaseModel]] = {REVIEW_FILE: Review, NOTES_FILE: ItemNotes}
+    for name, form in forms.items():
+        with suppress(StorageError):
+            found[name] = read_remark(LocalGroup(folder), name, form, what=folder.name)
+    return {name: remark for name, remark in found.items() if remark is not None}
+
+
+def _supersede_sources(root: Path, attributes: Attributes, new_id: str) -> None:
+    """Let what an edited item supersedes be superseded by what was salvaged of it."""
+    item_id, store = attributes_id(attributes), EpisodeStore(root)
+
+    def change(review: Review | None) -> Review | None:
+        is_of_it = review is not None and item_id in review.superseded_by
+        return superseded(review, new_id) if is_of_it else review
+
+    for entry in attributes.lineage:
+        if entry.is_edit and entry.kind == kind_of(attributes):
+            store.change_source_review(entry, change)
 
 
 def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, object]:

@@ -4,32 +4,29 @@ The source is marked as superseded before the result is committed, and the mark 
 the result is in the store (`Review.standing`): the commit alone switches from one to the other.
 """
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from functools import partial
 
 from pydantic import BaseModel
 
-from dextouch.episodes.format import Attributes, Kind, attributes_id, check_id
+from dextouch.episodes.format import Attributes, Kind, attributes_id, check_id, numbered_ids
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE, change_trashed_review
+from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE
 from dextouch.episodes.writer import EpisodeWriter
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas import (
-    MAX_MOVED,
     EditedItem,
     EditedOutcome,
     EpisodeClicks,
     ItemNotes,
     LineageEntry,
-    Review,
+    superseded,
 )
 
 OUTCOMES: Mapping[str, bool | None] = {"success": True, "failure": False, "unknown": None}
-# Room in an id for the number.
-_MAX_STEM = 112
 
 
 @dataclass(frozen=True)
@@ -61,6 +58,7 @@ class Edit:
         word: what the result is, such as `trimmed`, in its id.
         operation: with parameters, as on the command line.
         options: that all edits have.
+        changes: attributes that tell the result from that of another edit of this operation.
     """
 
     store: EpisodeStore
@@ -68,6 +66,7 @@ class Edit:
     word: str
     operation: str
     options: EditOptions
+    changes: Mapping[str, object] = field(default_factory=dict)
     messages: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -88,20 +87,19 @@ class Edit:
     def _choose_id(self) -> tuple[str, bool]:
         """The id of the result, and whether an earlier, interrupted run has written it."""
         given = self.options.new_id
-        stem = f"{self.source_id[:_MAX_STEM]}-{self.word}"
-        names: Iterator[str] = (f"{stem}-{number}" for number in itertools.count(1))
+        names: Iterator[str] = numbered_ids(self.source_id, self.word)
         if given is not None:
             names = iter([check_id(given, kind=f"new {self.kind} id")])
         for name in names:
             if not self.store.exists(name, kind=self.kind):
                 return name, False
-            about = self._open(name).attributes
-            if self.source == next(reversed(about.lineage), None):
-                return name, True
+            # A damaged item has its id nevertheless.
+            with suppress(StorageError):
+                about = self.store.open_item(self.kind, name).attributes
+                is_same = all(getattr(about, key) == want for key, want in self.changes.items())
+                if is_same and self.source == next(reversed(about.lineage), None):
+                    return name, True
         raise ConflictError(f"{self.kind} {given!r} exists already; choose another id with --as")
-
-    def _open(self, name: str) -> EpisodeReader | RecordingReader:
-        return self.store.open(name) if self.kind == "episode" else self.store.recording(name)
 
     def run(
         self,
@@ -126,7 +124,7 @@ class Edit:
             source_id=self.source_id,
             source_sha256=self.reader.content_sha256,
             id=self.new_id,
-            sha256=None if self.options.dry_run else self._open(self.new_id).content_sha256,
+            sha256=None if self.options.dry_run else self._content_of_result(),
             operation=self.operation,
             num_samples=dict(num_samples),
             messages=tuple(self.messages),
@@ -135,29 +133,13 @@ class Edit:
 
     def _mark_sources(self) -> None:
         """Mark the source, and all that it was edited from, also in the trash, as superseded."""
-        store, kind = self.store, self.kind
+        change = partial(superseded, by=self.new_id)
         for entry in self.lineage:
-            if not entry.operation or entry.kind != kind:
-                continue
-            if store.exists(entry.id, kind=kind):
-                review = self._marked(store.review(entry.id, kind=kind))
-                store.set_review(entry.id, review, kind=kind)
-            for folder in store.folders:
-                change_trashed_review(folder, kind, entry.id, self._marked)
+            if entry.is_edit and entry.kind == self.kind:
+                self.store.change_source_review(entry, change, is_held=entry == self.source)
 
-    def _marked(self, review: Review | None) -> Review:
-        marked: tuple[str, ...] = ()
-        earlier = review
-        if review is not None and review.superseded_by:
-            marked, earlier = review.superseded_by, review.earlier
-        superseded_by = tuple(dict.fromkeys([*marked, self.new_id]))[-MAX_MOVED:]
-        return Review(
-            verdict="rejected",
-            reason=f"superseded by {', '.join(superseded_by)}"[:500],
-            reviewed_at=datetime.now(UTC),
-            superseded_by=superseded_by,
-            earlier=earlier,
-        )
+    def _content_of_result(self) -> str:
+        return self.store.open_item(self.kind, self.new_id).content_sha256
 
     def remarks(
         self,
@@ -172,7 +154,6 @@ class Edit:
             review = review.earlier
         if review is not None and review.verdict == "rejected":
             self.messages.append("the source was rejected, and the result is with it: accept it")
-            review = None
         notes = self.store.notes(self.source_id, kind=self.kind)
         kept = shifted_notes(notes, span_ns, shift_ns)
         if lost := len(notes.notes) - len(kept.notes):

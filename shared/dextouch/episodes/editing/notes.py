@@ -34,7 +34,7 @@ def add_note(
     Raises InvalidInputError for a range that is empty or outside the item, LimitExceededError for
     more than MAX_NOTES, and as `EpisodeStore.review`.
     """
-    reader = store.open(item_id) if kind == "episode" else store.recording(item_id)
+    reader = store.open_item(kind, item_id)
     first_ns, last_ns = time_span_ns(reader)
     if not given.start_ns <= given.stop_ns or given.stop_ns < first_ns or given.start_ns > last_ns:
         zero = zero_ns(reader)

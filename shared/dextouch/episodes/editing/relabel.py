@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from pydantic import ValidationError
 
+from dextouch.episodes.care import DeletionRecords
 from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome
 from dextouch.episodes.files import GroupFiles
 from dextouch.episodes.format import (
@@ -60,9 +61,15 @@ def relabel_item(
         NotFoundError, CorruptDataError, ConflictError, UnavailableError: as `trim_episode`.
     """
     with store.held(item_id, kind=kind):
-        reader = store.open(item_id) if kind == "episode" else store.recording(item_id)
+        reader = store.open_item(kind, item_id)
         about = reader.attributes
         changed = {key: text for key, text in changes.items() if getattr(about, key) != text}
+        operator = changed.get("operator")
+        if operator is not None and DeletionRecords(store.root).has_operator(operator):
+            raise InvalidInputError(
+                f"relabel {kind} {item_id!r}: the operator was permanently deleted from the store, "
+                "expected another, or `dextouch store deletions --readmit` first"
+            )
         is_other_task = "task" in changed
         lacking = f"it becomes one of {changed.get('task')!r}" if is_other_task else ""
         fields: dict[str, object] = {**changed, **new_outcome(about, outcome, lacking=lacking)}
@@ -76,11 +83,11 @@ def relabel_item(
         if outcome is not None:
             shown["outcome"] = outcome
         text = shlex.join(["relabel", *(part for k, v in shown.items() for part in (f"--{k}", v))])
-        edit = Edit(store, reader, "relabelled", text, options)
+        edit = Edit(store, reader, "relabelled", text, options, fields)
         if is_other_task and isinstance(about, EpisodeAttributes) and about.event_times_s:
             edit.messages.append(f"events of {about.task!r} are left out")
-            fields["event_times_s"] = {}
-        fields |= {f"{kind}_id": edit.new_id, "lineage": edit.lineage}
+            fields = {**fields, "event_times_s": {}}
+        fields = fields | {f"{kind}_id": edit.new_id, "lineage": edit.lineage}
         attributes = about.model_copy(update=fields)
         try:
             for value in changed.values():

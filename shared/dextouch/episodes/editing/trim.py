@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome
+from dextouch.episodes.editing.notes import time_span_ns
 from dextouch.episodes.format import GOP_IMAGES, STAMPS
 from dextouch.episodes.reader import (
     ACTION_STREAMS,
@@ -270,31 +271,24 @@ def trim_recording(
     with store.held(recording_id, kind="recording"):
         reader = store.recording(recording_id)
         about = reader.attributes
-        firsts_ns = [
-            int(reader.stamps_ns(name)[0]) for name in reader.streams if _has(reader, name)
-        ]
-        lasts_ns = [
-            int(reader.stamps_ns(name)[-1]) for name in reader.streams if _has(reader, name)
-        ]
-        if not firsts_ns:
-            raise InvalidInputError(f"recording {recording_id!r}: has no sample")
+        first_ns, last_ns = time_span_ns(reader)
         zero_ns = about.started_t_host_ns
-        zero_ns = min(firsts_ns) if zero_ns is None else zero_ns
+        zero_ns = first_ns if zero_ns is None else zero_ns
         low_ns = None if from_s is None else zero_ns + round(from_s * 1e9)
         high_ns = None if to_s is None else zero_ns + round(to_s * 1e9)
-        start_ns = min(firsts_ns) if low_ns is None else low_ns
-        stop_ns = max(lasts_ns) + 1 if high_ns is None else high_ns
-        is_inside = start_ns <= max(lasts_ns) and stop_ns > min(firsts_ns)
+        start_ns = first_ns if low_ns is None else low_ns
+        stop_ns = last_ns + 1 if high_ns is None else high_ns
+        is_inside = start_ns <= last_ns and stop_ns > first_ns
         if not (start_ns < stop_ns and is_inside and min(from_s or 0, to_s or 0) >= 0):
             raise InvalidInputError(
                 f"recording {recording_id!r}: got a span from {(start_ns - zero_ns) / 1e9:g} to "
                 f"{(stop_ns - zero_ns) / 1e9:g} s, expected one within 0 … "
-                f"{(max(lasts_ns) - zero_ns) / 1e9:.3f} s"
+                f"{(last_ns - zero_ns) / 1e9:.3f} s"
             )
         bounds = (("--from", from_s), ("--to", to_s), ("--outcome", outcome))
         text = "".join(f" {key} {value}" for key, value in bounds if value is not None)
         edit = Edit(store, reader, "trimmed", f"trim{text}", options)
-        is_cut_off = high_ns is not None and high_ns <= max(lasts_ns)
+        is_cut_off = high_ns is not None and high_ns <= last_ns
         changes = new_outcome(about, outcome, lacking="its end is cut off" * is_cut_off)
         more = {"recording_id": edit.new_id, "lineage": edit.lineage, "quality": {}}
         if about.quality:
@@ -317,7 +311,3 @@ def trim_recording(
         counts = {name: high - low for name, (low, high) in spans.items()}
         changed = about.model_copy(update=more | changes | {"num_batches": {}})
         return edit.run(changed, counts, write, remarks)
-
-
-def _has(reader: RecordingReader, name: str) -> bool:
-    return reader.num_samples(name) > 0
