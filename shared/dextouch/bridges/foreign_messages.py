@@ -296,9 +296,9 @@ def _compressed_image(message: Plain) -> list[Item]:
     return [_item(message, replace(form, frame=_frame(message)), decode)]
 
 
-def _depths_m(decode: Callable[[], np.ndarray], a: float, b: float) -> np.ndarray:
+def _depths_m(decode: Callable[[], np.ndarray | bytes], a: float, b: float) -> np.ndarray:
     """Depths of quantised inverse ones, which are 0 where there is none."""
-    inverse = decode().astype(np.float64)
+    inverse = np.asarray(decode()).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(inverse > 0, a / (inverse - b), np.nan).astype(np.float32)
 
