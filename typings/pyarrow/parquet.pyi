@@ -9,14 +9,15 @@ class ColumnChunkMetaData:
     total_uncompressed_size: int
     physical_type: str
     num_values: int
-    encodings: tuple[str, ...]
 
 class ColumnSchema:
+    path: str
+    physical_type: str
     length: int
 
 class ParquetSchema:
     def column(self, i: int) -> ColumnSchema: ...
-    def to_arrow_schema(self) -> Schema: ...
+    def __len__(self) -> int: ...
 
 class RowGroupMetaData:
     total_byte_size: int

@@ -354,3 +354,22 @@ def test_the_sidecar_is_json_that_people_can_read(folder):
     said = json.loads((folder / SIDECAR).read_text())
     assert said["attributes"]["K_head"][0][0] == 60.0
     assert said["grid"] == "model"
+
+
+def test_flipped_bytes_of_texts_neither_end_the_process_nor_read_elsewhere(tmp_path):
+    texts = [f"x{k % 5}" for k in range(200)]
+    lists = [[{"a": f"q{k % 7}", "b": k}] * 2 if k % 3 else None for k in range(200)]
+    path = tmp_path / "texts.parquet"
+    pq.write_table(
+        pa.table({"text": texts, "lists": lists}), path, row_group_size=70, data_page_version="2.0"
+    )
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(3), 0
+    for place in rng.integers(4, len(whole), 200):
+        damaged = bytearray(whole)
+        damaged[place] = int(rng.integers(256))
+        path.write_bytes(damaged)
+        try:
+            source._table_rows(source._read_table(path), path)
+        except CorruptDataError:
+            refused += 1
+    assert refused

@@ -464,54 +464,42 @@ def _read_table(
     if not path.is_file():
         raise NotFoundError(f"{path}: is missing from the dataset")
     try:
-        metadata = pq.read_metadata(path)
-        present = metadata.schema.to_arrow_schema()
-        asked = present.names if columns is None else columns
-        wanted = [c for c in asked if c in present.names and c not in leave_out]
-        size, texts = _table_size(path, metadata, wanted)
+        schema = pq.read_metadata(path).schema
+        leaves = [schema.column(index) for index in range(len(schema))]
+        texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
         # Repeated texts stay one, whatever their number.
         with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
-            _check_size(path, metadata.num_rows, size)
-            tables = []
-            for number in range(metadata.num_row_groups):
+            present = file.schema_arrow.names
+            asked = present if columns is None else columns
+            wanted = [c for c in asked if c in present and c not in leave_out]
+            # Columns of lists and structures have a path that goes on after their name.
+            starts = tuple(f"{column}." for column in wanted)
+            chosen = [k for k, leaf in enumerate(leaves) if f"{leaf.path}.".startswith(starts)]
+            tables, size = [], 0
+            for number in range(file.num_row_groups):
+                # Damaged statistics raise here; below they would end the process.
+                next(file.iter_batches(1, row_groups=[number], columns=wanted), None)
+                group = file.metadata.row_group(number)
+                size += sum(_decoded_bytes(group.column(k), leaves[k]) for k in chosen)
+                _check_size(path, file.metadata.num_rows, size)
                 table = file.read_row_group(number, columns=wanted, use_threads=False)
                 size += sum(_repeated_bytes(column) for column in table.columns)
-                _check_size(path, metadata.num_rows, size)
+                _check_size(path, file.metadata.num_rows, size)
                 tables.append(table)
-            if not tables:
-                return file.read(columns=wanted)
-            return pa.concat_tables(tables)
-    except (pa.ArrowException, OSError) as error:
+            return pa.concat_tables(tables) if tables else file.read(columns=wanted)
+    except (pa.ArrowException, OSError, UnicodeError) as error:
         raise CorruptDataError(
             f"{path}: is not a complete parquet file ({error}); copy the dataset again"
         ) from error
 
 
-def _table_size(
-    path: Path, metadata: pq.FileMetaData, wanted: Sequence[str]
-) -> tuple[int, list[str]]:
-    """Bytes of the decoded columns, without repeated texts, and the paths of their texts."""
-    # Columns of lists and structures have a path that goes on after their name.
-    starts = tuple(f"{column}." for column in wanted)
-    size, texts = 0, set()
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for index in range(group.num_columns):
-            part = group.column(index)
-            if not f"{part.path_in_schema}.".startswith(starts):
-                continue
-            width = _PHYSICAL_BYTES.get(part.physical_type, metadata.schema.column(index).length)
-            if width:
-                size += part.num_values * width
-                continue
-            texts.add(part.path_in_schema)
-            # What a text without a dictionary has in the file is what it has in memory.
-            size += part.total_uncompressed_size + part.num_values * TEXT_OVERHEAD_BYTES
-            if "DELTA_BYTE_ARRAY" in part.encodings:
-                raise InvalidInputError(
-                    f"{path}: column {part.path_in_schema!r} is encoded as DELTA_BYTE_ARRAY; "
-                    "expected texts with or without a dictionary"
-                )
-    return size, sorted(texts)
+def _decoded_bytes(part: pq.ColumnChunkMetaData, leaf: pq.ColumnSchema) -> int:
+    """Bytes of a part of a column in memory, without the repetitions of texts."""
+    width = _PHYSICAL_BYTES.get(part.physical_type, leaf.length)
+    if width:
+        return part.num_values * width
+    # What a text without a dictionary has in the file is what it has in memory.
+    return part.total_uncompressed_size + part.num_values * TEXT_OVERHEAD_BYTES
 
 
 def _check_size(path: Path, rows: int, size: int) -> None:
@@ -527,7 +515,11 @@ def _repeated_bytes(column: object) -> int:
     array: Any = column
     parts = getattr(array, "chunks", None)
     if parts is None and hasattr(array, "dictionary"):
-        counts = np.bincount(array.indices.drop_null().to_numpy(), minlength=len(array.dictionary))
+        indices = array.indices.drop_null().to_numpy()
+        # The reader of parquet does not look.
+        if len(indices) and not 0 <= indices.min() <= indices.max() < len(array.dictionary):
+            raise pa.ArrowInvalid("a text is not in the dictionary")
+        counts = np.bincount(indices, minlength=len(array.dictionary))
         lengths = pc.binary_length(array.dictionary).fill_null(0).to_numpy(zero_copy_only=False)
         return int(counts.astype(np.int64) @ lengths.astype(np.int64))
     if parts is None and hasattr(array, "flatten"):
