@@ -92,6 +92,8 @@ def test_what_is_erased_while_it_is_read_gets_no_row(store, tmp_path, monkeypatc
 
 
 def test_what_is_reviewed_while_it_is_read_is_read_again(store, monkeypatch):
+    monkeypatch.setattr(catalog_index, "SETTLED_NS", 0)
+    monkeypatch.setattr(catalog_index, "ALWAYS_CHECKED", 0)
     whole = catalog_index.read_row
 
     def slow(*args):
