@@ -24,6 +24,8 @@ def anything(self, name):
 
 class Class(type):
     __getattr__ = anything
+    # As of Sphinx's, no unions can be made of them.
+    __or__ = __ror__ = None
 
 class Mocked(ModuleType):
     __path__ = []

@@ -166,7 +166,7 @@ def _log_format(
     stream: rr.RecordingStream,
     entity: str,
     shape: tuple[int, ...],
-    archetype: type[rr.Image | rr.DepthImage] = rr.Image,
+    archetype: "type[rr.Image | rr.DepthImage]" = rr.Image,
 ) -> None:
     """The form of images: depths of 16 bits, RGB or gray of 8."""
     is_depth = archetype is rr.DepthImage
@@ -179,7 +179,7 @@ def _log_format(
     stream.log(entity, archetype.from_fields(format=kind), static=True)
 
 
-def _pixels(images: np.ndarray, archetype: type[rr.Image | rr.DepthImage] = rr.Image) -> Any:  # noqa: ANN401 - the library does not export the type
+def _pixels(images: np.ndarray, archetype: "type[rr.Image | rr.DepthImage]" = rr.Image) -> Any:  # noqa: ANN401 - the library does not export the type
     pixels = np.ascontiguousarray(images).reshape(len(images), -1)
     return archetype.columns(buffer=pixels.astype(pixels.dtype.newbyteorder("<")).view(np.uint8))
 
