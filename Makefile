@@ -6,6 +6,7 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 OPENPI_VENV ?= .venv-openpi
 LEROBOT_POLICY_VENV ?= .venv-lerobot-policy
+API_CLIENT_VENV ?= .venv-api-client
 RAY_VENV ?= .venv-ray
 STAGE ?= store loader acquisition clocks calibration retargeting teleoperation alignment closure twin world-model starts objects evaluator agreement rollouts
 MADE := runs/reproduce
@@ -14,7 +15,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments check-zarr-readers wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -117,11 +118,12 @@ fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, commits, tags and builds the wheel in dist
+release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, builds the wheels in dist, commits and tags
 	$(BIN)/python deploy/release.py $(VERSION)
 
-vendor:                  ## fetch the vendored files of the dashboard again (needs npm); git diff shows whether they changed
+vendor:                  ## fetch the vendored files of the pages again (needs npm); git diff shows whether they changed
 	$(PYTHON) deploy/fetch_vendored.py services/dashboard/static/vendor
+	$(PYTHON) deploy/fetch_vendored.py shared/dextouch/serving/static/vendor
 
 $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $(LEROBOT)/prepare.py
 	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)
@@ -129,8 +131,9 @@ $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $
 bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: compare our store with LeRobotDataset v3; ARGS="--rounds 5"
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py --out runs/bench_lerobot $(ARGS)
 
-check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: check that lerobot itself opens our exports
+check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: check that lerobot itself opens our exports, and we what it writes
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
+	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_import.py
 
 $(OPENPI_VENV)/.complete:
 	$(PYTHON) -m venv $(OPENPI_VENV)
@@ -139,6 +142,17 @@ $(OPENPI_VENV)/.complete:
 
 check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: check interoperability with openpi's own client and packing
 	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
+
+$(API_CLIENT_VENV)/.complete:
+	$(PYTHON) -m venv $(API_CLIENT_VENV)
+	$(API_CLIENT_VENV)/bin/pip install --quiet --disable-pip-version-check openapi-python-client==0.29.1
+	touch $@
+
+check-api-client: $(VENV)/.dev $(API_CLIENT_VENV)/.complete   ## opt-in: generate clients of all services by their OpenAPI documents, and run a rollout with one
+	PYTHONPATH=.:shared $(BIN)/python -m tests.system.api_client.check $(abspath $(API_CLIENT_VENV))/bin/python
+
+check-zarr-readers: $(VENV)/.dev   ## opt-in: list and read an episode with zarr-python, xarray and tensorstore in environments without this package; ARGS="--python python3.13"
+	PYTHONPATH=.:shared $(BIN)/python tests/system/zarr_readers/check.py $(ARGS)
 
 $(LEROBOT_POLICY_VENV)/.complete:
 	$(PYTHON) -m venv $(LEROBOT_POLICY_VENV)
@@ -166,6 +180,9 @@ $(DOCS_VENV)/.complete: pyproject.toml constraints.txt
 docs: $(DOCS_VENV)/.complete   ## build the documentation site in build/docs; warnings are errors
 	$(DOCS_VENV)/bin/python -m sphinx --builder html --fresh-env --write-all --fail-on-warning --quiet docs $(SITE)
 	@echo "open $(SITE)/index.html"
+
+check-environments:      ## opt-in: install the package beside LeRobot and with the oldest and newest packages of its ranges, for several Pythons; needs uv (pip install uv); 10 GB; ARGS="store" for some
+	$(PYTHON) tests/environments/check.py $(ARGS)
 
 clean:
 	rm -rf $(SITE) demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

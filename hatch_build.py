@@ -1,8 +1,9 @@
-"""Build hook of the wheel: the package `services` is installed as `dextouch_services`.
+"""Build hook of the wheel: `services` is installed as `dextouch_services`, without weights.
 
 A top-level package called `services` would collide with those of other distributions
 (docs/decisions/0022-name-of-the-services-in-a-wheel.md). Checkouts and editable installations keep
-the name of the folder.
+the name of the folder. Weights are a wheel of their own, which extras with networks ask for
+(docs/decisions/0024-weights-in-a-wheel-of-their-own.md).
 """
 
 import io
@@ -10,6 +11,7 @@ import re
 import shutil
 import tempfile
 import tokenize
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ FOLDER, INSTALLED = "services", "dextouch_services"
 # A module named in a string, such as "services.cli.main:main" or in a docstring.
 # From Python 3.12 on, the text of an f-string ends before its first expression.
 _IN_STRING = re.compile(r"(?<![\w./])services(?=\.(?:[a-z_{]|\Z))")
+WEIGHTS = ".safetensors"
+# Extras with this distribution read weights.
+_READER = "safetensors"
 _STRINGS = ("STRING", "FSTRING_MIDDLE")
 
 
@@ -56,9 +61,9 @@ def installed_source(source: str) -> str:
 
 
 def write_installed(source: Path, target: Path) -> None:
-    """Copy a package with all of its files, and Python code as it is installed."""
+    """Copy a package with all of its files but weights, and Python code as it is installed."""
     for path in sorted(source.rglob("*")):
-        if not path.is_file() or path.suffix == ".pyc":
+        if not path.is_file() or path.suffix in {".pyc", WEIGHTS}:
             continue
         copy = target / path.relative_to(source)
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -72,6 +77,22 @@ def write_installed(source: Path, target: Path) -> None:
             shutil.copyfile(path, copy)
 
 
+def required_weights(root: Path, extras: dict[str, list[str]]) -> list[str]:
+    """Requirements of the wheel of the weights, by the extras; none without weights beside it.
+
+    Docker builds install what the package depends on before its code.
+    """
+    if not any((root / FOLDER).rglob(f"*{WEIGHTS}")):
+        return []
+    text = (root / "weights/pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)["project"]
+    pin = f"{project['name']}=={project['version']}"
+    readers = (
+        name for name, wanted in extras.items() if any(w.startswith(_READER) for w in wanted)
+    )
+    return [f"{pin}; extra == '{name}'" for name in readers]
+
+
 class ServicesHook(BuildHookInterface[Any]):
     """Puts `services` into wheels under its other name."""
 
@@ -83,6 +104,8 @@ class ServicesHook(BuildHookInterface[Any]):
         renamed = Path(self._folder) / INSTALLED
         write_installed(Path(self.root) / FOLDER, renamed)
         build_data["force_include"][str(renamed)] = INSTALLED
+        extras = self.metadata.core.optional_dependencies
+        build_data["dependencies"] += required_weights(Path(self.root), extras)
         # The table of scripts names a module of the checkout.
         scripts = self.metadata.core.scripts
         for name, place in scripts.items():

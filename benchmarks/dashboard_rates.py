@@ -23,7 +23,7 @@ from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
-from services.pipelines.servers import bind, serve_all
+from services.pipelines.servers import bind, run_on_event_loop, serve_all
 
 WARM_UP_S = 6.0
 GLOVES = ("tactile_left", "tactile_right")
@@ -44,7 +44,8 @@ def serve_child(kind: str, *arguments: str) -> None:
     def tell() -> None:
         os.write(1, f"{place.url}\n".encode())
 
-    asyncio.run(serve_all([(place, app)], stop=asyncio.Event(), on_ready=tell, grace_s=1))
+    serving = serve_all([(place, app)], stop=asyncio.Event(), on_ready=tell, grace_s=1)
+    run_on_event_loop(serving)
 
 
 async def count_updates(

@@ -1,7 +1,7 @@
 """Make a release: `make release VERSION=0.2.0`.
 
-Writes the version into the package and the changelog, commits, tags, and builds the wheel with its
-SHA-256 in `dist`. Nothing is pushed. Run `.ci/run` first.
+Writes the version into the package and the changelog, builds the wheels of code and
+weights with their SHA-256 in `dist`, commits and tags. Nothing is pushed. Run `.ci/run` first.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from packaging.version import InvalidVersion, Version
 _UNRELEASED = "## Unreleased\n"
 _PLACES = (
     ("pyproject.toml", r'(?m)^version = "(.+)"$'),
+    ("weights/pyproject.toml", r'(?m)^version = "(.+)"$'),
     ("shared/dextouch/__init__.py", r'(?m)^__version__ = "(.+)"$'),
 )
 
@@ -33,16 +34,13 @@ def main() -> int:
     root = Path.cwd()
     try:
         changed = prepare(root, options.version, datetime.now(UTC).date())
+        wheels = make(root, options.version, changed)
     except ReleaseError as error:
         print(f"no release: {error}", file=sys.stderr)  # noqa: T201
         return 1
-    for name, text in changed.items():
-        (root / name).write_text(text, encoding="utf-8")
-    _git(root, "commit", "--quiet", "--message", f"Release {options.version}", *changed)
     tag = f"v{options.version}"
-    _git(root, "tag", "--annotate", tag, "--message", f"DexTouch {options.version}")
-    wheel = _build(root)
-    print(f"made {tag} and {wheel}\npush them with: git push origin main {tag}")  # noqa: T201
+    made = ", ".join(map(str, wheels))
+    print(f"made {tag} and {made}\npush them with: git push origin main {tag}")  # noqa: T201
     return 0
 
 
@@ -57,6 +55,8 @@ def prepare(root: Path, version: str, today: date) -> dict[str, str]:
         new = Version(version)
     except InvalidVersion as error:
         raise ReleaseError(f"got version {version!r}, expected one such as 0.2.0") from error
+    if str(new) != version:
+        raise ReleaseError(f"got version {version!r}, expected {str(new)!r}, as wheels write it")
     branch = _git(root, "rev-parse", "--abbrev-ref", "HEAD")
     if branch != "main":
         raise ReleaseError(f"got branch {branch!r}, expected main")
@@ -81,15 +81,41 @@ def prepare(root: Path, version: str, today: date) -> dict[str, str]:
     return changed
 
 
-def _build(root: Path) -> Path:
-    """Build the wheel, and write its SHA-256 beside it."""
+def make(root: Path, version: str, changed: dict[str, str]) -> list[Path]:
+    """Write the texts, build the wheels, then commit and tag.
+
+    Raises:
+        ReleaseError: the wheels cannot be built; the texts are as before, and there is no tag.
+    """
+    for name, text in changed.items():
+        (root / name).write_text(text, encoding="utf-8")
+    try:
+        wheels = _build(root, version)
+    except ReleaseError:
+        _git(root, "checkout", "--", *changed)
+        raise
+    _git(root, "commit", "--quiet", "--message", f"Release {version}", *changed)
+    _git(root, "tag", "--annotate", f"v{version}", "--message", f"DexTouch {version}")
+    return wheels
+
+
+def _build(root: Path, version: str) -> list[Path]:
+    """Build both wheels, and write the SHA-256 of each beside it."""
     target = root / "dist"
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir"]
-    subprocess.run([*words, str(target), str(root)], check=True)  # noqa: S603 - own words
-    wheel = max(target.glob("*.whl"), key=lambda path: path.stat().st_mtime)
-    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
-    wheel.with_suffix(".whl.sha256").write_text(f"{digest}  {wheel.name}\n", encoding="utf-8")
-    return wheel
+    folders = [str(root), str(root / "weights")]
+    done = subprocess.run([*words, str(target), *folders], check=False)  # noqa: S603 - own words
+    wheels = sorted(target.glob(f"dextouch_wm*-{version}-*.whl"))
+    names = [wheel.name.partition("-")[0] for wheel in wheels]
+    if done.returncode or names != ["dextouch_wm", "dextouch_wm_weights"]:
+        raise ReleaseError(
+            f"{target}: pip ended with {done.returncode}, got {names or 'nothing'} of version "
+            f"{version}, expected one wheel each of dextouch_wm and dextouch_wm_weights"
+        )
+    for wheel in wheels:
+        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        wheel.with_suffix(".whl.sha256").write_text(f"{digest}  {wheel.name}\n", encoding="utf-8")
+    return wheels
 
 
 def _git(root: Path, *words: str) -> str:

@@ -31,5 +31,6 @@ autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True}
 # Packages of the extras export, s3 and rerun, which the site does without.
 autodoc_mock_imports = [
-    "foxglove_schemas_protobuf", "google", "mcap", "obstore", "pyarrow", "rerun",
+    "foxglove_schemas_protobuf", "google", "lz4", "mcap", "mcap_ros2", "obstore", "pyarrow",
+    "rerun",
 ]  # fmt: skip

@@ -4,7 +4,6 @@ Answers once with its URLs, and ends when its parent does. "durable" is among th
 redis-server.
 """
 
-import asyncio
 import gc
 import shutil
 import subprocess
@@ -25,7 +24,7 @@ from benchmarks.rollouts.ways import BatchDevice, Device, StillWorld
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.pipelines.servers import Server, bind, served
+from services.pipelines.servers import Server, bind, run_on_event_loop, served
 
 STEPS: Final[tuple[Literal["last", "all"], ...]] = ("last", "all")
 
@@ -90,7 +89,7 @@ def bare_servers() -> Iterator[dict[str, str]]:
             started.set()
             await server.serve(sockets=[place.socket])
 
-    thread = threading.Thread(target=asyncio.run, args=[run()], daemon=True)
+    thread = threading.Thread(target=run_on_event_loop, args=[run()], daemon=True)
     thread.start()
     started.wait()
     try:

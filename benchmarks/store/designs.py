@@ -23,6 +23,7 @@ from benchmarks.store.workload import (
 )
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.hands.actions import AnchorPoses
+from dextouch.installation import install_command
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams import StreamDescriptor, StreamKind
 
@@ -132,7 +133,7 @@ class OurDesign:
     def missing(self) -> str | None:
         """The package for H.264, if it is not installed."""
         if self.unit == "h264" and importlib.util.find_spec("av") is None:
-            return "module av (pip install 'dextouch-wm[store]')"
+            return f"module av ({install_command('store')})"
         return None
 
     def write(self, workload: Workload, folder: Path) -> None:

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.streams import pack, unpack
 from services.alignment.retargeting import HandRetargeter, warm_up
-from services.pipelines.servers import served
+from services.pipelines.servers import run_on_event_loop, served
 from services.pipelines.teleoperation.app import create_app
 from services.pipelines.teleoperation.settings import TeleoperationSettings
 
@@ -50,19 +50,20 @@ async def answer_samples(connection: ServerConnection) -> None:
 def naive_server() -> Iterator[str]:
     """The loop that answers every sample, in a thread."""
     started, stop, ports = threading.Event(), asyncio.Event(), []
-    loop = asyncio.new_event_loop()
+    loops: list[asyncio.AbstractEventLoop] = []
 
     async def run() -> None:
         async with serve(answer_samples, "127.0.0.1", 0, compression=None) as server:
+            loops.append(asyncio.get_running_loop())
             ports.append(next(iter(server.sockets)).getsockname()[1])
             started.set()
             await stop.wait()
 
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),), daemon=True)
+    thread = threading.Thread(target=run_on_event_loop, args=(run(),), daemon=True)
     thread.start()
     started.wait()
     yield f"http://127.0.0.1:{ports[0]}"
-    loop.call_soon_threadsafe(stop.set)
+    loops[0].call_soon_threadsafe(stop.set)
     thread.join()
 
 

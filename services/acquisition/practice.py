@@ -80,17 +80,17 @@ class Practice:
         )
 
         @router.get("")
-        async def status() -> PracticeStatus:
+        async def get_practice() -> PracticeStatus:
             """Whether devices to practise calibration with run, below `/practice`."""
             return self.status
 
         @router.post("/start")
-        async def start() -> PracticeStatus:
+        async def start_practice() -> PracticeStatus:
             """Start the practice devices."""
             return await self.start()
 
         @router.post("/stop")
-        async def stop() -> PracticeStatus:
+        async def stop_practice() -> PracticeStatus:
             """Stop the practice devices."""
             return await self.stop()
 

@@ -37,42 +37,42 @@ def recorder_router(station: Station) -> APIRouter:
     recorder = station.recorder
 
     @router.get("")
-    async def status() -> RecorderStatus:
+    async def get_recorder() -> RecorderStatus:
         """Current state of the recorder."""
         return await run_in_threadpool(recorder.status)
 
     @router.post("/arm")
-    async def arm(prompt: TakePrompt) -> RecorderStatus:
+    async def arm_recorder(prompt: TakePrompt) -> RecorderStatus:
         """Announce task and instruction."""
         return await run_in_threadpool(recorder.arm, prompt)
 
     @router.post("/record")
-    async def record(take: Named = None) -> RecorderStatus:
+    async def start_recording(take: Named = None) -> RecorderStatus:
         """Start the take."""
         return await run_in_threadpool(recorder.record, take.recording_id if take else None)
 
     @router.post("/stop")
-    async def stop(take: Named = None) -> RecorderStatus:
+    async def stop_recording(take: Named = None) -> RecorderStatus:
         """End the take and check it."""
         return await run_in_threadpool(recorder.stop, take.recording_id if take else None)
 
     @router.post("/save")
-    async def save(how: Annotated[SaveTake | None, Body()] = None) -> RecorderStatus:
+    async def save_take(how: Annotated[SaveTake | None, Body()] = None) -> RecorderStatus:
         """Keep the take."""
         return await run_in_threadpool(recorder.save, how or SaveTake())
 
     @router.post("/discard")
-    async def discard(take: Named = None) -> RecorderStatus:
+    async def discard_take(take: Named = None) -> RecorderStatus:
         """Throw the take away."""
         return await run_in_threadpool(recorder.discard, take.recording_id if take else None)
 
     @router.post("/rerecord")
-    async def rerecord(take: Named = None) -> RecorderStatus:
+    async def rerecord_take(take: Named = None) -> RecorderStatus:
         """Throw the take away and arm the same prompt again."""
         return await run_in_threadpool(recorder.rerecord, take.recording_id if take else None)
 
     @router.post("/session")
-    async def session() -> RecorderStatus:
+    async def begin_session() -> RecorderStatus:
         """Begin a session: the count of saved takes starts at zero."""
         return await run_in_threadpool(recorder.begin_session)
 
@@ -96,12 +96,12 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     router = _router("/v1")
 
     @router.get("/health")
-    async def health() -> StationHealth:
+    async def get_station_health() -> StationHealth:
         """Every stream and device."""
         return await run_in_threadpool(station.health.report)
 
     @router.get("/health/events")
-    async def events(since_ns: int = 0) -> HealthEvents:
+    async def list_health_events(since_ns: int = 0) -> HealthEvents:
         """When something was raised and when it ended, on the station's clock."""
         return station.health.events(since_ns)
 
@@ -110,7 +110,7 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         response_class=Response,
         responses={200: {"model": HealthHistory, "content": {MSGPACK: {}}}},
     )
-    async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
+    async def get_health_history(query: Annotated[HistoryQuery, Query()]) -> Response:
         """Health of the newest hour, about a row a second, and all takes of that hour.
 
         Packed, it has the arrays `t_ns` [rows], `station` [series, rows] and `streams` [stream,
@@ -134,17 +134,17 @@ def uploads_router(uploader: Uploader) -> APIRouter:
     router = _router("/v1/uploads")
 
     @router.get("")
-    async def uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
+    async def list_uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
         """Saved takes and whether the store has them; with `refused`, those alone it refused."""
         return await run_in_threadpool(uploader.status, only_refused=refused)
 
     @router.get("/{recording_id}")
-    async def upload(recording_id: StoreId) -> UploadStatus:
+    async def get_upload(recording_id: StoreId) -> UploadStatus:
         """One saved take and whether the store has it."""
         return await run_in_threadpool(uploader.status_of, recording_id)
 
     @router.post("/{recording_id}/retry")
-    async def retry(recording_id: StoreId) -> UploadStatus:
+    async def retry_upload(recording_id: StoreId) -> UploadStatus:
         """Send a take again that the store refused."""
         return await run_in_threadpool(uploader.retry, recording_id)
 
@@ -156,20 +156,20 @@ def live_router(station: Station) -> APIRouter:
     router = _router("/v1/live")
 
     @router.get("/overview", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def overview() -> Response:
+    async def get_live_overview() -> Response:
         """A `StationOverview` and the newest pressures of the gloves that are heard, packed."""
         fields = await run_in_threadpool(station_overview, station)
         pressures = station.live.pressures_kpa(station.clock.now_ns())
         return Response(pack(fields.model_dump(mode="json"), pressures), media_type=MSGPACK)
 
     @router.get("/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def taxels() -> Response:
+    async def get_live_taxels() -> Response:
         """Newest pressures (kPa, float32 [taxels]) of the gloves that are heard, packed."""
         pressures = station.live.pressures_kpa(station.clock.now_ns())
         return Response(pack({}, pressures), media_type=MSGPACK)
 
     @router.get("/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def poses(mounted: Annotated[bool, Query()] = True) -> Response:  # noqa: FBT002 - a query's flag
+    async def get_live_poses(mounted: Annotated[bool, Query()] = True) -> Response:  # noqa: FBT002 - a query's flag
         """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's.
 
         Poses are those of the bodies; with `mounted=false` those of the trackers on them.
@@ -180,14 +180,14 @@ def live_router(station: Station) -> APIRouter:
         return Response(pack({"age_s": ages_s}, poses), media_type=MSGPACK)
 
     @router.get("/cameras")
-    async def cameras() -> CameraList:
+    async def list_cameras() -> CameraList:
         """Cameras that have sent an image."""
         return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
 
     @router.get(
         "/cameras/{name}", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}}
     )
-    async def camera(name: str) -> Response:
+    async def get_camera_image(name: str) -> Response:
         """Newest image as JPEG."""
         image = station.live.jpeg(name, station.clock.now_ns())
         return Response(image, media_type="image/jpeg")

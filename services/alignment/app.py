@@ -94,7 +94,7 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
 
     @router.post("", status_code=status.HTTP_202_ACCEPTED)
     @takes({JSON: 256 * KIB})
-    async def start(
+    async def start_alignments(
         request: Annotated[AlignmentRequest, Depends(JsonBody(AlignmentRequest))],
         response: Response,
         wait: bool = Query(default=False),  # noqa: FBT001 - a query parameter
@@ -117,7 +117,7 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
         return submitted[0]
 
     @router.get("", responses={404: {}})
-    async def listing(
+    async def list_alignments(
         state: JobState | None = None,
         recording_id: Annotated[tuple[str, ...], Query(max_length=MAX_BATCH)] = (),
         after: str | None = None,
@@ -132,12 +132,12 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
         )
 
     @router.get("/{alignment_id}")
-    async def one(alignment_id: str) -> AlignmentJob:
+    async def get_alignment(alignment_id: str) -> AlignmentJob:
         """The state of one alignment."""
         return jobs.queue.get(alignment_id)
 
     @router.post("/{alignment_id}/cancel")
-    async def cancel(alignment_id: str) -> AlignmentJob:
+    async def cancel_alignment(alignment_id: str) -> AlignmentJob:
         """Cancel an alignment that waits or runs; one that is done or failed is a conflict."""
         return await jobs.cancel(alignment_id)
 

@@ -11,7 +11,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas import ClockReport, Domain, Matrix, Problem, StoreId, problem_from_error
 from services.alignment.calibration.tactile_tare import REASONS
 from services.alignment.settings import AlignmentOptions
@@ -34,6 +34,8 @@ EXPECTED_STREAMS = (
 
 class AlignmentRequest(FrozenModel):
     """Align one or up to a thousand recordings; missing options default to the service's."""
+
+    model_config = example(recording_ids=["take-20260301-1", "take-20260301-2"])
 
     recording_id: StoreId | None = None
     recording_ids: Annotated[tuple[StoreId, ...], Field(fail_fast=True)] | None = Field(

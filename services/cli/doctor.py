@@ -9,19 +9,23 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import socket
 import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final
 
+from dextouch import __version__
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import printable
+from dextouch.installation import install_command, pip_install
 from services.cli.extras import install_hint, missing_package
 
 # Distributions that are named otherwise than what they provide.
@@ -32,6 +36,7 @@ _DISTRIBUTIONS = {
     "cv2": "opencv-contrib-python-headless",
     "mujoco": "mujoco-core",
     "rerun": "rerun-sdk",
+    "mcap_ros2": "mcap-ros2-support",
 }
 _PURPOSES = {
     "zstandard": "episodes",
@@ -52,9 +57,18 @@ _OPTIONAL = {
     "rerun": "shows the .rrd files of the player's command: rerun FILE.rrd",
     "pyarrow": "LeRobot datasets",
     "mcap": "MCAP files",
+    "mcap_ros2": "MCAP files of ROS 2",
     "obstore": "stores in a bucket, s3://…",
     "diffusers": "the full-size world model",
+    "uvloop": "a faster event loop of the services",
 }
+# Distributions of OpenCV, which all bring the module `cv2`.
+_OPENCV_BUILDS = (
+    "opencv-python",
+    "opencv-python-headless",
+    "opencv-contrib-python",
+    "opencv-contrib-python-headless",
+)
 DEVICE_KINDS: Final = {
     "serial devices": ("ttyACM*", "ttyUSB*"),
     "HID devices": ("hidraw*",),
@@ -247,10 +261,12 @@ def examine() -> list[Finding]:
     version = platform.python_version()
     is_supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
     findings = [
+        Finding("dextouch-wm", f"{__version__}, extras are added by {install_command('EXTRA')}"),
         Finding("Python", version, ok=is_supported, do="install Python 3.11, 3.12 or 3.13"),
         Finding("processor cores", str(os.cpu_count())),
     ]
     findings += [_package(package, purpose) for package, purpose in _PURPOSES.items()]
+    findings += opencv_findings()
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     redis = shutil.which("redis-server") or "no: rollouts are kept in memory"
     libusb = ctypes.util.find_library("usb-1.0") or "no: trackers by link usb need it"
@@ -278,6 +294,49 @@ def _ports_of_up() -> tuple[dict[str, int], list[Finding]]:
         return {}, [Finding("ports of dextouch up", "unknown: it cannot run", required=False)]
     except InvalidInputError as error:
         return {}, [_advice("settings of dextouch up", error.message, "correct them")]
+
+
+def opencv_findings() -> list[Finding]:
+    """Which build of OpenCV is the module `cv2`, where several distributions bring one.
+
+    They all write the same folder: the one that was installed last is imported, and what removes
+    one of them removes files of the others.
+    """
+    installed = {}
+    for name in _OPENCV_BUILDS:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            installed[name] = importlib.metadata.version(name)
+    if not installed:
+        return []
+    ours = _DISTRIBUTIONS["cv2"]
+    kept = f"{ours}=={installed[ours]}" if ours in installed else f"{ours}>=4.14,<5"
+    do = pip_install("--force-reinstall", "--no-deps", kept)
+    told = ", ".join(f"{name} {version}" for name, version in installed.items())
+    loaded = _loaded_opencv()
+    if loaded is None:
+        return [_advice("module cv2", f"damaged; {told} bring it", do)]
+    if loaded == (ours, installed.get(ours)):
+        also = f"; installed with it: {told}" if len(installed) > 1 else ""
+        return [Finding("module cv2", f"of {ours} {loaded[1]}{also}")]
+    found = f"of {loaded[0]} {loaded[1]}; installed: {told}"
+    return [_advice("module cv2", found, do)]
+
+
+def _loaded_opencv() -> tuple[str, str] | None:
+    """Distribution and version that the files of `cv2` are of, as its version.py says."""
+    spec = importlib.util.find_spec("cv2")
+    if spec is None or spec.origin is None:
+        return None
+    try:
+        text = Path(spec.origin).with_name("version.py").read_text(encoding="utf-8")
+    except OSError:
+        return None
+    version = re.search(r'^opencv_version = "([^"]+)"', text, re.MULTILINE)
+    if version is None:
+        return None
+    contrib = "-contrib" if re.search(r"^contrib = True", text, re.MULTILINE) else ""
+    headless = "-headless" if re.search(r"^headless = True", text, re.MULTILINE) else ""
+    return f"opencv{contrib}-python{headless}", version[1]
 
 
 def _optional(name: str, purpose: str) -> Finding:
@@ -314,7 +373,7 @@ def _outdated() -> list[Finding]:
             continue
         if not requirement.specifier.contains(version, prereleases=True):
             spec = f"{requirement.name}{requirement.specifier}"
-            do = f"pip install '{spec}'"
+            do = pip_install(spec)
             found = f"{version}, expected {requirement.specifier}"
             wrong.append(_advice(requirement.name, found, do))
     return wrong

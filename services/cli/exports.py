@@ -1,24 +1,46 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
-import shutil
 import sys
-import uuid
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
 
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes
-from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
+from dextouch.episodes import (
+    Attributes,
+    EpisodeReader,
+    EpisodeStore,
+    Kind,
+    RecordingReader,
+    is_rejected,
+)
+from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.schemas import first_problems
+from services.pipelines.parsers import (
+    JOINT_FORMATS,
+    check_format_options,
+    export_parser,
+    import_parser,
+)
+
+if TYPE_CHECKING:
+    from dextouch.bridges.foreign import ImportReport
 
 Reader = EpisodeReader | RecordingReader
-Report = dict[str, object]
+Report = dict[str, Any]
 # By id and camera.
 DamagedImages = dict[str, dict[str, list[int]]]
+# Exit status if some of several files were refused, as of a command that is.
+_SOME_FAILED = 3
+# Options that choose items, as on the dashboard's list.
+FILTERS = (
+    "text", "task", "operator", "station", "domain", "outcome", "origin", "review", "after",
+    "before",
+)  # fmt: skip
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -30,63 +52,65 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
         return export_rrd(reader, path, overwrite=options.force)
     from dextouch.bridges.mcap import export_mcap
 
-    return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
+    return export_mcap(
+        reader,
+        path,
+        overwrite=options.force,
+        jpeg_quality=options.jpeg_quality,
+        touch_images=options.touch_images,
+    )
 
 
-def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
+    """Write all episodes together; the report's part about them."""
     if options.format == "umi":
         from dextouch.bridges.umi import export_umi
 
-        return export_umi(readers, options.to, overwrite=options.force)
-    from dextouch.bridges.lerobot import ExportOptions, export_lerobot
+        return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+    from dextouch.bridges.lerobot import ExportOptions, export_dataset
 
-    with _replaced(options.to, force=options.force):
-        chosen = ExportOptions(fps=options.fps)
-        return export_lerobot(readers, options.to, repo_id=options.repo_id, options=chosen)
-
-
-@contextmanager
-def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
-    """Replace an existing data set, restoring it if the new one fails."""
-    if not folder.exists():
-        yield
-        return
-    if not force:
-        raise ConflictError(f"{folder}: exists already; choose another folder or add --force")
-    if not (folder / "meta" / "info.json").is_file():
-        raise ConflictError(f"{folder}: is not a LeRobot data set, so --force does not remove it")
-    aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
-    folder.rename(aside)
-    with ExitStack() as undo:
-        undo.callback(aside.rename, folder)
-        yield
-        undo.pop_all()
-    shutil.rmtree(aside)
+    chosen = ExportOptions(
+        fps=options.fps,
+        touch_samples=options.touch_samples,
+        license_name=options.license,
+        existing="append" if options.append else "replace" if options.force else "refuse",
+    )
+    done = export_dataset(readers, options.to, repo_id=options.repo_id, options=chosen)
+    if done.present:
+        print(f"{len(done.present)} episodes were in the data set already", file=sys.stderr)
+    if done.num_touch_left_out:
+        print(
+            f"{done.num_touch_left_out} touch samples are left out: more of them lie between two "
+            "frames than the data set has room for",
+            file=sys.stderr,
+        )
+    return {
+        "num_steps": done.num_frames,
+        "present": list(done.present),
+        "num_touch_left_out": done.num_touch_left_out,
+    }
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
-    wanted = {key: value for key, value in given if value is not None}
+    wanted = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
     if options.ids and wanted:
         raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
         raise InvalidInputError("got an id twice; expected every id once")
     if options.ids:
         return list(options.ids)
-    found, num_rejected = [], 0
-    for item_id in store.list(kind=options.kind):
-        attributes = _open(store, options.kind, item_id).attributes
-        if any(getattr(attributes, key) != value for key, value in wanted.items()):
-            continue
-        if not options.with_rejected and _is_rejected(store, attributes):
-            num_rejected += 1
-        else:
-            found.append(item_id)
+    matching = _matching(store, options.kind, wanted)
+    found = matching
+    if not options.with_rejected and options.review is None:
+        about = ((name, store.open_item(options.kind, name).attributes) for name in matching)
+        found = [name for name, attributes in about if not is_rejected(store, attributes)]
+    num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
+        shown = {key: str(value) for key, value in wanted.items()}
         raise NotFoundError(
-            f"{options.store}: no {options.kind} matches {wanted or 'anything'}"
+            f"{options.store}: no {options.kind} matches {shown or 'anything'}"
             f"{f' ({left_out})' if num_rejected else ''}; `dextouch store list` shows its contents"
         )
     if num_rejected:
@@ -94,11 +118,24 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     return found
 
 
-def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttributes) -> bool:
-    if isinstance(about, EpisodeAttributes):
-        return is_rejected(store, about)
-    review = store.review(about.recording_id, kind="recording")
-    return review is not None and review.verdict == "rejected"
+def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> list[str]:
+    from services.episode_store.catalog import Catalog
+    from services.episode_store.filters import ItemFilter
+
+    stored, catalog = store.list(kind=kind), Catalog(store)
+    every = ItemFilter.model_validate({"kind": kind})
+    known = {item.id for item in catalog.items(every, limit=len(stored) + 1).items}
+    for item_id in sorted({*stored} - known):
+        # The catalog omits damaged items; this tells why.
+        store.open_item(kind, item_id)
+    named = {"after": "created_after", "before": "created_before"}
+    try:
+        query = ItemFilter.model_validate(
+            {"kind": kind} | {named.get(key, key): value for key, value in wanted.items()}
+        )
+    except ValidationError as error:
+        raise InvalidInputError(f"filters: {first_problems(error)}") from error
+    return [item.id for item in catalog.items(query, limit=len(stored) + 1).items]
 
 
 def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
@@ -132,67 +169,153 @@ def _episodes(
             yield episode
 
 
-def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
-    return store.recording(item_id) if kind == "recording" else store.open(item_id)
-
-
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
+    check_format_options(export_parser(), options, form)
     if form in JOINT_FORMATS and options.kind == "recording":
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
     ids = _ids(store, options)
-    report: Report = {"format": form, "kind": options.kind, "ids": ids}
-    shown = progress(ids, f"export {form}", len(ids))
     damaged: DamagedImages = {}
-    report["damaged_images"] = damaged
+    report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
+    shown = progress(ids, f"export {form}", len(ids))
     if form in JOINT_FORMATS:
         left_out: list[str] = []
-        num_steps = _export_all(_episodes(store, shown, damaged, left_out), options)
-        print(f"{to}  {len(ids) - len(left_out)} episodes  {num_steps} steps")
-        return report | {"path": str(to), "num_steps": num_steps, "left_out": left_out}
-    # One file for one id, a folder of files otherwise.
+        done = _export_all(_episodes(store, shown, damaged, left_out), options)
+        num_new = len(ids) - len(left_out) - len(done.get("present", []))
+        print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
+        return report | done | {"path": str(to), "left_out": left_out}
+    paths = _paths(ids, options)
+    files: list[dict[str, object]] = []
+    exported: list[Attributes] = []
+    for item_id in shown:
+        reader = store.open_item(options.kind, item_id)
+        _note_damaged(reader, damaged)
+        count = _export_one(reader, paths[item_id], options)
+        files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})
+        print(f"{paths[item_id]}  {count} messages")
+        exported.append(reader.attributes)
+    return report | {"files": files} | (_end_mcap(exported, options) if form == "mcap" else {})
+
+
+def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
+    """Files by id: the one that was named for one id, otherwise files in a folder."""
+    to, form = options.to, options.format
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":
         if len(ids) > 1:
             raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
         paths = {ids[0]: to}
-    taken = [path for path in paths.values() if path.exists()]
+    layout = _layout_path(options) if form == "mcap" else None
+    if layout in paths.values():
+        raise InvalidInputError(f"--layout {layout}: is one of the exported files; name another")
+    taken = [path for path in (*paths.values(), layout) if path and path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
-    files: list[dict[str, object]] = []
-    for item_id in shown:
-        path = paths[item_id]
-        reader = _open(store, options.kind, item_id)
-        _note_damaged(reader, damaged)
-        count = _export_one(reader, path, options)
-        files.append({"id": item_id, "path": str(path), "num_messages": count})
-        print(f"{path}  {count} messages")
-    return report | {"files": files}
+    return paths
+
+
+def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
+    """Say which files have no dates, and write the layout for Foxglove where there is to be one."""
+    from dextouch.bridges.foxglove import write_layout
+    from dextouch.bridges.mcap import has_wall_times
+
+    num_undated = sum(not has_wall_times(about) for about in exported)
+    if num_undated:
+        print(
+            f"{num_undated} of {len(exported)} do not know when they were recorded (created_at, or "
+            "started_at and started_t_host_ns); their times do not begin at a date but near 1970",
+            file=sys.stderr,
+        )
+    layout = _layout_path(options)
+    if layout is None:
+        return {}
+    write_layout(layout, [stream for about in exported for stream in about.streams])
+    print(f"{layout}  layout for Foxglove: open it with Import from file")
+    return {"layout": str(layout)}
+
+
+def _layout_path(options: argparse.Namespace) -> Path | None:
+    """Where a layout for Foxglove goes: the path that was given, or into the folder of files."""
+    if options.layout is not None or options.to.suffix == ".mcap":
+        given: Path | None = options.layout
+        return given
+    from dextouch.bridges.foxglove import LAYOUT_FILE
+
+    return Path(options.to / LAYOUT_FILE)
 
 
 def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    if options.format == "mcap":
-        from dextouch.bridges.mcap import import_mcap
+    from dextouch.bridges.foreign import find_format
 
-        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        files = [file for file in found if file == path or not is_system_file(file.name)]
-        if not files:
-            raise NotFoundError(f"{path}: holds no .mcap file")
-        names = progress(files, "import mcap", len(files))
-        ids = [import_mcap(file, store) for file in names]
-    else:
-        from dextouch.bridges.lerobot import ImportOptions, import_lerobot
+    form = options.format or find_format(path)
+    check_format_options(import_parser(), options, form)
+    about = {"format": form, "store": options.store}
+    if form == "lerobot":
+        from dextouch.bridges.lerobot import ImportOptions, import_dataset
 
-        chosen = ImportOptions(id_prefix=options.id_prefix, images=options.images)
-        ids = import_lerobot(path, store, options=chosen)
-    for item_id in ids:
-        print(item_id)
-    return {"format": options.format, "store": options.store, "ids": ids}
+        chosen = ImportOptions(
+            mapping=options.map,
+            id_prefix=options.id_prefix,
+            images=options.images,
+            K_head=options.k_head,
+            domain=options.domain or "robot",
+            task=options.task,
+            instruction=options.instruction,
+            fps=options.fps,
+        )
+        result = import_dataset(path, store, options=chosen)
+        print(*result.lines(), sep="\n")
+        for name, reason in result.failed.items():
+            print(f"{path}: {name}: not imported: {reason}", file=sys.stderr)
+        return about | result.as_json()
+    found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
+    files = [file for file in found if file == path or not is_system_file(file.name)]
+    if not files:
+        raise NotFoundError(f"{path}: holds no .{form} file")
+    reports, failed = [], {}
+    for file in progress(files, f"import {form}", len(files)):
+        try:
+            report = _import_file(file, store, form, options)
+        except DexTouchError as error:
+            if len(files) == 1:
+                raise
+            failed[str(file)] = error.message
+            print(f"{file}: not imported: {error.message}", file=sys.stderr)
+            continue
+        reports.append(report)
+        print(*(report.lines() if report.imported else [report.recording_id]), sep="\n")
+    ids = [report.recording_id for report in reports]
+    files_of = [report.as_json() for report in reports]
+    return about | {"ids": ids, "reports": files_of, "failed": failed}
+
+
+def _import_file(
+    path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
+) -> "ImportReport":
+    from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.tactile.layout import read_layout
+
+    about = ImportAttributes(
+        mapping=options.map,
+        id_prefix=options.id_prefix,
+        task=options.task or "imported",
+        instruction=options.instruction,
+        domain=options.domain or "human",
+        images=options.images or "h264",
+        layout=None if options.layout is None else read_layout(options.layout),
+    )
+    if form == "rrd":
+        from dextouch.bridges.foreign_rerun import import_rrd
+
+        return import_rrd(path, store, about, timeline=options.timeline)
+    from dextouch.bridges.foreign_mcap import import_any_mcap
+
+    return import_any_mcap(path, store, about)
 
 
 def export_main(argv: Sequence[str]) -> int:
@@ -205,5 +328,6 @@ def export_main(argv: Sequence[str]) -> int:
 def import_main(argv: Sequence[str]) -> int:
     """Run `dextouch import`."""
     options = import_parser().parse_args(list(argv))
-    write_result(options.json, _import(options))
-    return 0
+    report = _import(options)
+    write_result(options.json, report)
+    return _SOME_FAILED if report.get("failed") else 0

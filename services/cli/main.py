@@ -60,7 +60,7 @@ COMMANDS = {
         "calibrate gloves, cameras and latencies", "pipelines.calibrate:main"
     ),
     "store": Command(
-        "list, show, verify, clicks, repair, delete, deletions, restore, purge, enrol, serve",
+        "list, show, verify, clicks, note, trim, relabel, merge, repair, delete, …",
         "episode_store.command_line:main",
         "episode_store.parser:store_parser",
     ),
@@ -78,7 +78,7 @@ COMMANDS = {
         "pipelines.parsers:export_parser",
     ),
     "import": Command(
-        "read LeRobot or MCAP files into a store",
+        "read LeRobot, MCAP or Rerun files into a store",
         "cli.exports:import_main",
         "pipelines.parsers:import_parser",
     ),

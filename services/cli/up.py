@@ -20,7 +20,13 @@ from dextouch.serving import configure_logging, explained, load_settings
 from services.cli.extras import missing_package
 from services.cli.standard_streams import discard_output
 from services.cli.up_settings import UpSettings
-from services.pipelines.servers import BoundAddress, bind, serve_all, stop_on_signals
+from services.pipelines.servers import (
+    BoundAddress,
+    bind,
+    run_on_event_loop,
+    serve_all,
+    stop_on_signals,
+)
 
 if TYPE_CHECKING:
     from services.acquisition.settings import AcquisitionSettings
@@ -53,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     """Serve until SIGINT or SIGTERM."""
     settings = load_settings(UpSettings, list(argv))
     configure_logging(service="up", log_format="auto", level=settings.log_level)
-    return asyncio.run(run(settings))
+    return run_on_event_loop(run(settings))
 
 
 async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from dextouch import schemas
 from dextouch.errors import DexTouchError, EndedError, InvalidInputError, NotFoundError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.metrics import tactile
 from dextouch.serving import MSGPACK, OCTETS
 from dextouch.streams import HEAD_CAMERA, unpack
@@ -34,6 +34,8 @@ SERVICES: Final = {"real": "twin", "imagined": "world_model"}
 
 class StartComparison(FrozenModel):
     """Body of POST /v1/comparisons: an episode of the store, recorded in the twin."""
+
+    model_config = example(episode_id="take-20260301-1")
 
     episode_id: str = Field(pattern=schemas.ID_PATTERN)
 

@@ -167,6 +167,50 @@ class TakesView(FrozenModel):
     note: str = ""
 
 
+class OverviewView(FrozenModel):
+    """Everything that the page of a station shows."""
+
+    name: str
+    station: StationView
+    services: tuple[ServiceView, ...]
+    takes: tuple[TakeView, ...]
+    takes_note: str
+    refused: tuple[UploadStatus, ...]
+
+
+class PadLayout(FrozenModel):
+    """A pad of the hand, and the index of its first taxel."""
+
+    part: str
+    start: int
+    rows: int
+    columns: int
+    taxel_area_mm2: float
+
+
+class HeatmapLayout(FrozenModel):
+    """How taxels and keypoints are drawn.
+
+    Attributes:
+        cells: of each taxel, its cell in the picture of a hand, row by row.
+        raw_cells: of each taxel, its cell among those of a packet.
+        ramp: red, green and blue from no pressure to `full_scale_kpa`.
+        contact_kpa: pressure above which a taxel counts as touched.
+        bones: pairs of keypoints that a bone connects.
+    """
+
+    rows: int
+    columns: int
+    cells: dict[Side, tuple[int, ...]]
+    pads: tuple[PadLayout, ...]
+    num_raw_cells: int
+    raw_cells: dict[Side, tuple[int, ...]]
+    ramp: tuple[tuple[int, int, int], ...]
+    full_scale_kpa: float
+    contact_kpa: float
+    bones: tuple[tuple[int, int], ...]
+
+
 @dataclass(eq=False)
 class Topic:
     """A topic: its newest messages, fetched at most once a period for all of its viewers."""

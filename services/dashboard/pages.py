@@ -28,23 +28,20 @@ from dextouch.errors import AccessDeniedError, InvalidInputError, NotFoundError
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
-from dextouch.serving import FORM, KIB, AccessControl, Grant, not_signed_in, takes
+from dextouch.serving import (
+    FORM,
+    KIB,
+    AccessControl,
+    Grant,
+    not_signed_in,
+    page_headers,
+    takes,
+)
 from services.dashboard.settings import DashboardSettings
 
 COOKIE = "dextouch_session"
 SCOPE = "operate"
 MAX_SESSIONS = 1000
-CONTENT_SECURITY_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
-)
-PAGE_HEADERS = {
-    "content-security-policy": CONTENT_SECURITY_POLICY,
-    "x-content-type-options": "nosniff",
-    # With "no-referrer", browsers send the sign-in with "Origin: null", which is refused.
-    "referrer-policy": "same-origin",
-    "cache-control": "no-store",
-}
 # Jinja2 escapes all values; no HTML is built from strings elsewhere.
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True
@@ -373,7 +370,7 @@ def refusal_page(station: str, reason: str, status: int) -> Response:
 
 def _page(station: str, name: str, code: int = 200, **values: object) -> HTMLResponse:
     text = TEMPLATES.get_template(name).render(station=station, **values)
-    return HTMLResponse(text, code, headers=PAGE_HEADERS)
+    return HTMLResponse(text, code, headers=page_headers(forms="'self'"))
 
 
 def find_documents() -> Path:

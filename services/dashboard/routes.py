@@ -22,17 +22,23 @@ from fastapi import (
 from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
-from pydantic_core import to_jsonable_python
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import QueryParams
 from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import JSON, KIB, OCTETS, takes
+from dextouch.serving import JSON, KIB, OCTETS, StreamedResponse, takes
 from services.dashboard.audit import ALL_ACTIONS, AuditLog, AuditPage, used_tokens
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
-from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
+from services.dashboard.feeds import (
+    Feeds,
+    HeatmapLayout,
+    OverviewView,
+    Topic,
+    heatmap_layout,
+    skeleton_bones,
+)
 from services.dashboard.fleet import Fleet
 from services.dashboard.pages import COOKIE, SCOPE, Sessions
 from services.dashboard.settings import DashboardSettings
@@ -50,9 +56,18 @@ CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 # Finds a topic by its name; None where it knows none.
 TopicFinder = Callable[[str], Topic | None]
 # Headers of a response that a browser needs to show and to cache it.
-PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
+PASSED_HEADERS: Final = (
+    "content-type",
+    "etag",
+    "cache-control",
+    "location",
+    "content-disposition",
+    "x-dextouch-estimated-bytes",
+)
 # What a user asked for may take longer to compute than the state that pages fetch again and again.
 TIMEOUT_S: Final = 60.0
+# Without a byte of a download: the time in which the store exports a long recording.
+DOWNLOAD_TIMEOUT_S: Final = 600.0
 # Of administrators, who have it beside that of operators.
 ENROL: Final = "enrol"
 
@@ -71,30 +86,37 @@ def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) ->
     Station = Annotated[Feeds, Depends(fleet.of)]
     layout = {**heatmap_layout(), "bones": skeleton_bones()}
 
-    @router.get("/heatmap")
-    async def heatmap() -> JSONResponse:
+    @router.get("/heatmap", responses={200: {"model": HeatmapLayout}})
+    async def get_heatmap_layout() -> JSONResponse:
         """Layout and colours of the taxel maps, and the bones of a hand's keypoints."""
         return JSONResponse(layout)
 
     @router.get("/overview")
-    async def overview(feeds: Station) -> JSONResponse:
+    async def get_overview(feeds: Station) -> OverviewView:
         """Everything that the page shows, as JSON."""
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
         )
-        shown = {"name": settings.station, "station": station, "services": services}
-        shown |= {"takes": takes.takes, "takes_note": takes.note, "refused": takes.refused}
-        return JSONResponse(to_jsonable_python(shown))
+        return OverviewView(
+            name=settings.station,
+            station=station,
+            services=tuple(services),
+            takes=takes.takes,
+            takes_note=takes.note,
+            refused=takes.refused,
+        )
 
     @router.post("/recorder/{action}")
-    async def operate(
-        action: str, body: Annotated[dict[str, Any], Body()], feeds: Station
+    async def operate_recorder(
+        action: str,
+        body: Annotated[dict[str, Any], Body(examples=[{"success": True}])],
+        feeds: Station,
     ) -> RecorderView:
         """Arm, record, stop, save (`success` required) or discard; the recorder's new state."""
         return await feeds.operate(action, body)
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
-    async def retry(recording_id: str, feeds: Station) -> None:
+    async def retry_upload(recording_id: str, feeds: Station) -> None:
         """Upload a refused take again."""
         path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
         await feeds.upstream("acquisition").send("POST", path)
@@ -104,7 +126,7 @@ def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) ->
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    async def camera(name: CameraName, feeds: Station) -> Response:
+    async def get_camera_image(name: CameraName, feeds: Station) -> Response:
         """The newest image of one camera."""
         image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
         media_type = image.headers.get("content-type", "image/jpeg")
@@ -120,12 +142,12 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
 
     @router.post("", status_code=202)
     @takes({JSON: KIB})
-    async def start(body: StartComparison) -> ComparisonView:
+    async def start_comparison(body: StartComparison) -> ComparisonView:
         """Replay an episode in the twin and in the world model; ends the comparison before."""
         return await comparisons.start(body.episode_id)
 
     @router.post("/stop", status_code=204)
-    async def stop() -> None:
+    async def stop_comparison() -> None:
         """End the running comparison and its rollouts."""
         await comparisons.stop()
 
@@ -134,7 +156,7 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
         response_class=Response,
         responses={200: {"content": {OCTETS: {}}}},
     )
-    async def chunk(comparison_id: str, number: int) -> Response:
+    async def get_comparison_chunk(comparison_id: str, number: int) -> Response:
         """Images and touch of both worlds over one chunk."""
         headers = {"cache-control": "no-store"}
         content = comparisons.chunk(comparison_id, number)
@@ -151,12 +173,12 @@ def system_router(
     router = APIRouter(prefix="/v1", dependencies=guards, tags=["system"])
 
     @router.get("/system")
-    async def state() -> SystemView:
+    async def get_system() -> SystemView:
         """Services, disks and queues."""
         return await system.read()
 
     @router.get("/audit")
-    async def audit(
+    async def list_audit_entries(
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
         action: Annotated[str | None, Query(max_length=200)] = None,
         person: Annotated[str | None, Query(max_length=64)] = None,
@@ -248,7 +270,7 @@ def _view(text: str) -> tuple[str, ...]:
 class Forwarded:
     """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
 
-    The key that signed in needs `scope`.
+    The key that signed in needs `scope`. A `streamed` response is passed on as it comes.
     """
 
     service: str
@@ -256,6 +278,7 @@ class Forwarded:
     method: Literal["GET", "POST", "DELETE"] = "GET"
     max_body_bytes: int = 64 * KIB
     scope: str = SCOPE
+    streamed: bool = False
 
 
 FORWARDED: Final = (
@@ -273,6 +296,11 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/catalog/clicks/file"),
     Forwarded("episode_store", "/episodes/{item_id}/clicks"),
     Forwarded("episode_store", "/episodes/{item_id}/clicks", "POST", max_body_bytes=16 * KIB),
+    Forwarded("episode_store", "/episodes/{item_id}/trim", "POST", max_body_bytes=16 * KIB),
+    Forwarded("episode_store", "/catalog/relabel", "POST", max_body_bytes=256 * KIB),
+    Forwarded("episode_store", "/notes/{kind}/{item_id}"),
+    Forwarded("episode_store", "/notes/{kind}/{item_id}", "POST", max_body_bytes=16 * KIB),
+    Forwarded("episode_store", "/notes/{kind}/{item_id}/remove", "POST", max_body_bytes=16 * KIB),
     Forwarded("episode_store", "/catalog/hours"),
     Forwarded("episode_store", "/catalog/hours/{field}"),
     Forwarded("episode_store", "/catalog/values"),
@@ -283,6 +311,7 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/playback/episode/{item_id}/robot_hands"),
     Forwarded("episode_store", "/episodes/{item_id}/streams/{stream}"),
     Forwarded("episode_store", "/recordings/{item_id}/streams/{stream}"),
+    Forwarded("episode_store", "/downloads", "POST", max_body_bytes=1024 * KIB, streamed=True),
     Forwarded("episode_store", "/trash"),
     Forwarded("episode_store", "/trash", "POST", max_body_bytes=256 * KIB),
     Forwarded("episode_store", "/trash/restore", "POST", max_body_bytes=256 * KIB),
@@ -349,9 +378,19 @@ def _forwarder(
         if content:
             sent["content-type"] = JSON
         answer = await feeds.upstream(route.service).forward(
-            route.method, path, sent, content, timeout_s=TIMEOUT_S
+            route.method,
+            path,
+            sent,
+            content,
+            timeout_s=DOWNLOAD_TIMEOUT_S if route.streamed else TIMEOUT_S,
+            stream=route.streamed,
         )
         passed = {name: answer.headers[name] for name in PASSED_HEADERS if name in answer.headers}
+        if route.streamed:
+            pieces = answer.aiter_bytes()
+            return StreamedResponse(
+                pieces, answer.status_code, headers=passed, on_end=answer.aclose
+            )
         return Response(answer.content, answer.status_code, headers=passed)
 
     return takes({JSON: route.max_body_bytes})(forward) if route.method == "POST" else forward

@@ -101,8 +101,12 @@ class Upstream:
         content: bytes,
         *,
         timeout_s: float | None = None,
+        stream: bool = False,
     ) -> httpx.Response:
-        """Response to a request of a browser, also "304 Not Modified"; otherwise as `send`."""
+        """Response to a request of a browser, also "304 Not Modified"; otherwise as `send`.
+
+        With `stream` its content is not read yet, and the caller closes it.
+        """
         request = self._client.build_request(
             method,
             path,
@@ -110,15 +114,17 @@ class Upstream:
             content=content or None,
             timeout=httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s,
         )
-        return await self._sent(request)
+        return await self._sent(request, stream=stream)
 
-    async def _sent(self, request: httpx.Request) -> httpx.Response:
+    async def _sent(self, request: httpx.Request, *, stream: bool = False) -> httpx.Response:
         method, path = request.method, request.url.path
         request.headers.update(trace_headers())
         began_s = time.perf_counter()
         outcome = "failed"
         try:
-            response = await self._client.send(request)
+            response = await self._client.send(request, stream=stream)
+            if stream and response.is_error:
+                await response.aread()
             outcome = "refused" if response.is_error else "answered"
         except httpx.HTTPError as error:
             raise self._no_answer(method, path, error) from error

@@ -16,6 +16,8 @@ from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.deletions import deletions_router
+from services.episode_store.downloads import Downloads, downloads_router
+from services.episode_store.editing_routes import editing_router, notes_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.keys import Enrolments, enrolment_router
@@ -74,6 +76,11 @@ class PeriodicThread(ABC):
                 if error.message != problem:
                     logger.error(self._event, reason=error.message)  # noqa: TRY400
                 problem = error.message
+            except Exception as error:
+                # A mistake of ours, or of a driver, must not end the thread for good.
+                if repr(error) != problem:
+                    logger.exception(self._event)
+                problem = repr(error)
             self._stopping.wait(self._period_s)
 
 
@@ -124,6 +131,23 @@ class DeletionWatch(PeriodicThread):
             self._revision = revision
 
 
+class CatalogCheck(PeriodicThread):
+    """Compares a catalog with its store: at once, as a large one takes time, and now and then."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        super().__init__("catalog_not_checked", catalog.index.check_period_s)
+        self._index = catalog.index
+
+    def work(self) -> None:
+        """Check once."""
+        self._index.check()
+
+    def stop(self) -> None:
+        """End soon: reading a large store takes minutes, and can be interrupted anywhere."""
+        self._stopping.set()
+        self._thread.join(timeout=2.0)
+
+
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
@@ -137,19 +161,19 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
     watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
-    pending = PendingUploads(store)
+    pending, check = PendingUploads(store), CatalogCheck(catalog)
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         pending.start()
-        # The first listing of a large store takes seconds, so it is warmed up in the background.
-        threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
+        check.start()
         watch.start()
         try:
             yield
         finally:
             pending.stop()
+            check.stop()
             watch.stop()
             ingest.close()
 
@@ -162,8 +186,11 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             catalog_router(catalog, max_page=settings.max_page),
             reviews_router(catalog),
             clicks_router(store, catalog, objects),
+            editing_router(store, catalog),
+            notes_router(store),
             content_router(store, settings),
             playback_router(store, settings),
+            downloads_router(Downloads(store, settings)),
             trash_router(store, max_page=settings.max_page),
             deletions_router(deletions),
             enrolment_router(enrolments),
@@ -174,13 +201,6 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     enrolments.connect(app.state.access)
     app.state.registry.register(metrics.registry)
     return app
-
-
-def _warm_up(catalog: Catalog) -> None:
-    try:
-        catalog.warm_up()
-    except DexTouchError as error:
-        logger.warning("warm_up_failed", reason=error.message)
 
 
 def main(argv: Sequence[str]) -> int:

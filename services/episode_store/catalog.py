@@ -1,254 +1,208 @@
-"""Catalog of a store: filtered lists of episodes and recordings from cached summaries."""
+"""Catalog of a store: filtered lists of episodes and recordings, hours, lineage and groups."""
 
-import os
-import re
-import threading
-import time
-from bisect import bisect_left, bisect_right
-from collections import defaultdict
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from datetime import datetime
+import json
+import sqlite3
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
 from functools import partial
-from typing import Any, Generic
+from typing import Any, Final, TypeVar
 
-import structlog
+import numpy as np
 
-from dextouch.episodes import (
-    COMMIT_FILE,
-    EpisodeReader,
-    EpisodeStore,
-    Kind,
-    RecordingReader,
-    disk_errors,
-    has_object_poses,
-)
-from dextouch.errors import NotFoundError, StorageError
+from dextouch.episodes import KINDS, EpisodeStore, Kind
+from dextouch.errors import NotFoundError
 from dextouch.schemas import (
-    ID_PATTERN,
     CatalogHours,
+    CatalogItem,
     CatalogItems,
     CatalogValues,
+    ComparedGroup,
     ComparedGroups,
-    EpisodeAttributes,
     EpisodeClicks,
     EpisodeList,
     EpisodeSummary,
     HoursByField,
+    HoursOf,
+    HoursRow,
     Lineage,
+    LineageNode,
     RecordingList,
     RecordingSummary,
     Review,
     StoredItem,
 )
+from services.episode_store.catalog_index import CatalogIndex, Progress
 from services.episode_store.filters import (
+    EARLIEST,
+    NO_WEIGHT,
+    SORT_COLUMNS,
+    WEIGHTS,
     CatalogFilter,
-    Entry,
+    Condition,
     EpisodeFilter,
     ItemFilter,
-    ItemsKind,
     Page,
-    S,
     cursor_of,
+    microseconds,
+    number_key,
     place_of,
-    sort_key,
 )
 from services.episode_store.items import (
+    FIGURES,
+    MIN_ITEMS,
     HoursField,
     HoursFilter,
-    ItemLists,
-    hours_by,
-    hours_of,
-    item_of,
-    lineage_of,
+    Source,
+    all_findings,
+    linked_episode,
+    take_of,
 )
 
-logger = structlog.get_logger(__name__)
-
-# Stamps of a file system can be this coarse: another change may get the same stamp.
-SETTLED_NS = 2_000_000_000
-# Listing a bucket takes one request per 1000 objects.
-BUCKET_PERIOD_NS = 5_000_000_000
-# Stamp and inode of a commit record.
-Revision = tuple[int, int]
-NO_REVISION = (-1, -1)
-FIRST_PAGE = Page()
+T = TypeVar("T")
+S = TypeVar("S", EpisodeSummary, RecordingSummary)
+FIRST_PAGE: Final = Page()
 # Limit of the values of a field in one response.
-MAX_VALUES = 500
+MAX_VALUES: Final = 500
+MAX_NODES: Final = 200
+SECONDS_AN_HOUR: Final = 3600.0
+DAY_US: Final = 24 * 3600 * 10**6
+# Larger limits overflow SQLite's numbers once they are added to an offset.
+MAX_LIMIT: Final = 1 << 60
+# The row of an item, and of its last episode in the list of takes.
+Found = tuple[int, int | None]
+# Kind and id of an item.
+Name = tuple[str, str]
+_KEYS: Final = {"id": "''"} | {name: key.format("i.") for name, key in SORT_COLUMNS.items()}
+_BEYOND_LIMIT: Final = number_key(WEIGHTS["beyond_limit"])
+_BODIES: Final = """SELECT i.row, i.kind, i.stands, i.is_compared, b.item, b.review, g.spread
+  FROM item i JOIN body b USING (row) JOIN grp g ON g.number = i.grp
+  WHERE i.row IN (SELECT value FROM json_each(?))"""
+_SOURCES: Final = """SELECT l.row, s.kind, s.id, b.consent, s.complete, b.incomplete_cause, b.review
+  FROM lineage l JOIN item s ON s.kind = l.kind AND s.id = l.source
+    AND (l.sha256 IS NULL OR l.sha256 = s.sha256) JOIN body b ON b.row = s.row
+  WHERE l.row IN (SELECT value FROM json_each(?)) ORDER BY l.row, l.position"""
+_PRODUCTS: Final = """SELECT i.row, p.id
+  FROM item i CROSS JOIN lineage l ON l.kind = 'recording' AND l.source = i.id
+    AND (l.sha256 IS NULL OR l.sha256 = i.sha256)
+  CROSS JOIN item p ON p.row = l.row AND p.kind = 'episode' AND p.origin <> 'imagined'
+  WHERE i.kind = 'recording' AND i.row IN (SELECT value FROM json_each(?))
+  ORDER BY p.id, l.position"""
 
 
-class _Shelf(Generic[S]):
-    """Entries of one kind sorted by id; a single `stat` while nothing changes.
+@dataclass(frozen=True)
+class Clickable:
+    """An episode that training would take if its objects were clicked."""
 
-    Commits and deletions rename folders, which updates the parent folder's stamp. In-place changes
-    by other programs are noticed only at the next commit or deletion. A bucket is listed at most
-    once per BUCKET_PERIOD_NS, by ids only: an id that is deleted and written again in between goes
-    unnoticed.
-    """
-
-    def __init__(
-        self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
-    ) -> None:
-        self._store = store
-        self._summarize: Callable[[str], Entry[S]] = summarize
-        self._kind: Kind = kind
-        self._folder = store.root / f"{kind}s"
-        self._listed_ns: int | None = None
-        self._stamp_ns: int | None = None
-        self._is_settled = False
-        self._known: dict[str, tuple[Revision, Entry[S] | None]] = {}
-        self._entries: dict[str, Entry[S]] = {}
-        self._guard = threading.Lock()
-
-    def __len__(self) -> int:
-        """Entries at the last look, without another one."""
-        return len(self._entries)
-
-    def entries(self) -> dict[str, Entry[S]]:
-        """Current entries by id; the returned dictionary is never modified."""
-        with self._guard:
-            found = self._look()
-            known = None if found is None else {k: self._read(k, now) for k, now in found.items()}
-            # The same dictionary while nothing changed: lists that are made of it stay valid.
-            if known is not None and known != self._known:
-                self._known = known
-                rows = ((name, entry) for name, (_, entry) in known.items())
-                self._entries = {name: entry for name, entry in rows if entry is not None}
-            return self._entries
-
-    def forget(self, item_id: str) -> None:
-        """Read an item again at the next look, after a change of what is beside its content."""
-        with self._guard:
-            self._known.pop(item_id, None)
-            self._is_settled, self._listed_ns = False, None
-
-    def _read(self, item_id: str, revision: Revision) -> tuple[Revision, Entry[S] | None]:
-        before = self._known.get(item_id)
-        if before is not None and before[0] == revision:
-            return before
-        try:
-            return revision, self._summarize(item_id)
-        except NotFoundError:
-            # Deleted while we were listing; one that comes back is read again.
-            return NO_REVISION, None
-        except StorageError as error:
-            logger.warning(
-                "omitted_from_catalog", kind=self._kind, id=item_id, reason=error.message
-            )
-            return revision, None
-
-    def _look(self) -> dict[str, Revision] | None:
-        """Revisions by sorted id; None if nothing changed since the last call."""
-        with disk_errors(f"list {self._folder.name}"):
-            try:
-                stamp_ns = self._folder.stat().st_mtime_ns
-            except FileNotFoundError:
-                self._stamp_ns = None
-                return self._list()
-            if self._is_settled and stamp_ns == self._stamp_ns:
-                return None
-            now_ns = time.time_ns()
-            found = self._scan()
-        self._stamp_ns, self._is_settled = stamp_ns, now_ns - stamp_ns > SETTLED_NS
-        return found
-
-    def _list(self) -> dict[str, Revision] | None:
-        # Listing an empty folder is free; a bucket is not listed again at once.
-        now_ns = time.monotonic_ns()
-        if self._listed_ns is not None and now_ns - self._listed_ns < BUCKET_PERIOD_NS:
-            return None
-        found = dict.fromkeys(self._store.list(kind=self._kind), (0, 0))
-        self._listed_ns = now_ns if found else None
-        return found
-
-    def _scan(self) -> dict[str, Revision]:
-        found = {}
-        # Plain names and one stat per id: thousands of Path objects would slow down a listing.
-        for name in sorted(os.listdir(self._folder)):  # noqa: PTH208
-            try:
-                state = os.stat(f"{self._folder}/{name}/{COMMIT_FILE}")  # noqa: PTH116
-            except (FileNotFoundError, NotADirectoryError):
-                continue
-            except PermissionError:
-                # Reading it reports the error; a name that is not an id is not an episode.
-                if re.fullmatch(ID_PATTERN, name):
-                    found[name] = (0, 0)
-                continue
-            found[name] = (state.st_mtime_ns, state.st_ino)
-        return found
+    task: str
+    clicks: EpisodeClicks | None
 
 
 class Catalog:
-    """Summaries of all groups of a store, cached since committed groups are immutable.
+    """Lists of all items of a store, from an index that all processes share.
 
     A damaged episode is omitted and logged once; `verify` reports the damage.
     """
 
-    def __init__(self, store: EpisodeStore) -> None:
+    def __init__(self, store: EpisodeStore, progress: Progress | None = None) -> None:
         self._store = store
-        self._episodes = _Shelf(store, "episode", self._episode)
-        self._recordings = _Shelf(store, "recording", self._recording)
-        self._items = ItemLists()
-
-    def warm_up(self) -> None:
-        """Read the summaries in advance."""
-        self._episodes.entries()
-        self._recordings.entries()
+        self.index = CatalogIndex(store, progress)
 
     def num_items(self) -> dict[str, Callable[[], int]]:
         """Functions that say how many items of a kind were there when they were last listed."""
         return {
-            "recording": partial(len, self._recordings),
-            "episode": partial(len, self._episodes),
+            "recording": partial(self.index.num_items, "recording"),
+            "episode": partial(self.index.num_items, "episode"),
         }
 
     def episodes(self, query: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE) -> EpisodeList:
         """One page of matching episodes in the order of the page."""
-        rows, facts = _page(self._episodes.entries(), query, limit, page)
-        summaries = tuple(row.summary for row in rows)
-        return EpisodeList.model_construct(episodes=summaries, **facts)
+        rows, facts = self._summaries("episode", EpisodeSummary, query, limit, page)
+        return EpisodeList.model_construct(episodes=rows, **facts)
 
     def recordings(
         self, query: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
     ) -> RecordingList:
         """One page of matching finished recordings in the order of the page."""
-        query = query or CatalogFilter()
-        rows, facts = _page(self._recordings.entries(), query, limit, page)
-        summaries = tuple(row.summary for row in rows)
-        return RecordingList.model_construct(recordings=summaries, **facts)
+        wanted = query or CatalogFilter()
+        rows, facts = self._summaries("recording", RecordingSummary, wanted, limit, page)
+        return RecordingList.model_construct(recordings=rows, **facts)
+
+    def _summaries(
+        self, kind: Kind, model: type[S], query: CatalogFilter, limit: int, page: Page
+    ) -> tuple[tuple[S, ...], dict[str, Any]]:
+        where = Condition(terms=["i.kind = ?"], values=[kind])
+        query.restrict(where)
+        # Findings of an item on its own: limits, not outliers.
+        weight = f"CASE WHEN i.beyond_limit THEN '{_BEYOND_LIMIT}' ELSE '{NO_WEIGHT}' END"
+        order = _Order(_KEYS.get(page.sort, weight), "i.id", page)
+
+        def read(connection: sqlite3.Connection) -> tuple[tuple[S, ...], dict[str, Any]]:
+            found, facts = _page(connection, where, order, limit)
+            text = "SELECT row, summary FROM body WHERE row IN (SELECT value FROM json_each(?))"
+            bodies = dict(connection.execute(text, (_array(row for row, _ in found),)).fetchall())
+            return tuple(model.model_validate_json(bodies[row]) for row, _ in found), facts
+
+        return self.index.read(read)
 
     def values(self) -> CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
-        rows: list[Entry[Any]] = [
-            *self._recordings.entries().values(),
-            *self._episodes.entries().values(),
-        ]
-        found: dict[str, tuple[str, ...]] = {}
-        for name in ("task", "operator", "station"):
-            values = {getattr(row.summary, name) for row in rows} - {None}
-            found[f"{name}s"] = tuple(sorted(values)[:MAX_VALUES])
-        return CatalogValues(**found)
+
+        def read(connection: sqlite3.Connection) -> CatalogValues:
+            found: dict[str, tuple[str, ...]] = {}
+            for name in ("task", "operator", "station"):
+                key = _KEYS[name]
+                # From one value to the next, over the index.
+                text = f"""WITH RECURSIVE v(x) AS (
+                  SELECT min({key}) FROM item i WHERE kind = :kind UNION ALL
+                  SELECT (SELECT min({key}) FROM item i WHERE kind = :kind AND {key} > x)
+                  FROM v WHERE x IS NOT NULL LIMIT {MAX_VALUES + 2})
+                  SELECT x FROM v WHERE x > ''"""
+                rows = (row for kind in KINDS for row in connection.execute(text, {"kind": kind}))
+                found[f"{name}s"] = tuple(sorted({value for (value,) in rows})[:MAX_VALUES])
+            return CatalogValues(**found)
+
+        return self.index.read(read)
 
     def lineage(self, kind: Kind, item_id: str) -> Lineage:
-        """Everything that an item was made from and that was made from it; as `lineage_of`."""
-        shelves: dict[Kind, _Shelf[Any]]
-        shelves = {"recording": self._recordings, "episode": self._episodes}
-        entries: dict[tuple[str, str], Entry[Any]] = {
-            (each, name): entry
-            for each in shelves
-            for name, entry in shelves[each].entries().items()
-        }
-        return lineage_of(entries, (kind, item_id))
+        """Everything that an item was made from and that was made from it, nearest first.
+
+        Raises:
+            NotFoundError: no such item.
+        """
+        return self.index.read(partial(_lineage, start=(kind, item_id)))
 
     def items(self, query: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
         """One page of matching recordings, episodes or takes in the order of the page."""
-        rows, facts = _page(self._listed(query.kind), query, limit, page)
-        return CatalogItems.model_construct(items=tuple(row.item for row in rows), **facts)
+        of_takes = query.kind == "take"
+        where = Condition(of_takes=of_takes, terms=["i.is_take"])
+        if not of_takes:
+            where = Condition(terms=["i.kind = ?"], values=[query.kind])
+        query.restrict(where)
+        weight = "i.take_weight" if of_takes else "i.weight"
+        order = _Order(_KEYS.get(page.sort, weight), "i.name", page)
+
+        def read(connection: sqlite3.Connection) -> CatalogItems:
+            found, facts = _page(connection, where, order, limit)
+            return CatalogItems.model_construct(items=_items(connection, found), **facts)
+
+        return self.index.read(read)
 
     def groups(self) -> ComparedGroups:
         """The groups of items that are compared with each other to find outliers."""
-        groups = self._items.groups(self._recordings.entries(), self._episodes.entries())
-        return ComparedGroups(groups=groups)
+        names = ("task", "domain", "origin", "kind", "num_items")
+        text = f"SELECT {', '.join(names)} FROM grp WHERE num_items > 0 ORDER BY 1, 2, 3, 4"
+        rows = self.index.read(lambda connection: connection.execute(text).fetchall())
+        groups = (
+            ComparedGroup(
+                **dict(zip(names, row, strict=True)),
+                min_items=MIN_ITEMS,
+                is_compared=row[-1] >= MIN_ITEMS,
+            )
+            for row in rows
+        )
+        return ComparedGroups(groups=tuple(groups))
 
     def review(self, item: StoredItem, review: Review | None) -> None:
         """Keep the review of an item; None removes it.
@@ -257,124 +211,217 @@ class Catalog:
             NotFoundError: no such item.
         """
         self._store.set_review(item.id, review, kind=item.kind)
-        (self._episodes if item.kind == "episode" else self._recordings).forget(item.id)
+        self.forget(item)
 
-    def clickable(self) -> dict[str, Entry[Any]]:
+    def forget(self, item: StoredItem) -> None:
+        """Read an item again, after a change of what is beside its content."""
+        self.index.reread(item.kind, item.id)
+
+    def clickable(self) -> dict[str, Clickable]:
         """Episodes by id that training would take if their objects were clicked."""
+        text = """SELECT i.id, i.task, b.clicks FROM item i JOIN body b USING (row)
+          WHERE i.is_clickable AND i.verdict IS NOT 'rejected' ORDER BY i.id"""
+        rows = self.index.read(lambda connection: connection.execute(text).fetchall())
         return {
-            one.item.id: one
-            for one in self._listed("episode").values()
-            if one.is_clickable and not (one.item.review and one.item.review.verdict == "rejected")
+            name: Clickable(task, clicks and EpisodeClicks.model_validate_json(clicks))
+            for name, task, clicks in rows
         }
 
     def set_clicks(self, episode_id: str, clicks: EpisodeClicks | None) -> None:
         """Keep the clicks on the objects of an episode; raises as `review`."""
         self._store.set_clicks(episode_id, clicks)
-        self._episodes.forget(episode_id)
+        self.index.reread("episode", episode_id)
 
     def hours(self, query: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
-        return hours_of(_matching(self._episodes.entries(), query).values())
+        columns = "count(*), coalesce(sum(i.success), 0), sum(i.duration_s)"
+        by = ("task", "domain", "origin")
+        rows = [
+            HoursRow(
+                **dict(zip(by, names, strict=True)),
+                num_episodes=count,
+                num_successes=num_successes,
+                hours=seconds / SECONDS_AN_HOUR,
+            )
+            for *names, count, num_successes, seconds in self._sums(
+                [f"i.{name}" for name in by], columns, query
+            )
+        ]
+        return CatalogHours(
+            rows=tuple(rows),
+            num_episodes=sum(row.num_episodes for row in rows),
+            hours=sum(row.hours for row in rows),
+        )
 
     def hours_by(self, field: HoursField, query: HoursFilter) -> HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
-        items = [one.item for one in _matching(self._listed("episode"), query).values()]
-        return hours_by(field, items, utc_offset_min=query.utc_offset_min)
+        column = f"i.{field}"
+        if field == "day":
+            # Days since the year 1, which are never negative.
+            first_us = query.utc_offset_min * 60 * 10**6 - microseconds(EARLIEST)
+            column = f"(i.at_us + {first_us}) / {DAY_US}"
+        found: defaultdict[Any, dict[str | None, tuple[int, float]]] = defaultdict(dict)
+        sums = self._sums((column, "i.verdict"), "count(*), sum(i.duration_s)", query)
+        for value, verdict, count, seconds in sums:
+            found[value][verdict] = count, seconds / SECONDS_AN_HOUR
+        rows = []
+        # SQLite sorts episodes without a value first.
+        for value in sorted(found, key=lambda value: value is None):
+            parts = found[value]
+            names = {"accepted_h": "accepted", "rejected_h": "rejected", "not_reviewed_h": None}
+            is_day = field == "day" and value is not None
+            row = HoursOf(
+                value=date.fromordinal(1 + value).isoformat() if is_day else value,
+                num_episodes=sum(count for count, _ in parts.values()),
+                **{name: parts.get(verdict, (0, 0.0))[1] for name, verdict in names.items()},
+            )
+            rows.append(row)
+        return HoursByField(rows=tuple(rows))
 
-    def _listed(self, kind: ItemsKind) -> Mapping[str, Entry[Any]]:
-        return self._items.entries(kind, self._recordings.entries(), self._episodes.entries())
+    def _sums(self, by: Sequence[str], columns: str, query: EpisodeFilter) -> list[tuple[Any, ...]]:
+        """Sums over matching episodes by values, in their order."""
+        where = Condition(terms=["i.kind = 'episode'"])
+        query.restrict(where)
+        names = ", ".join(by)
+        text = f"SELECT {names}, {columns} FROM item i WHERE {where.sql} "
+        text += f"GROUP BY {names} ORDER BY {names}"
+        return self.index.read(lambda connection: connection.execute(text, where.values).fetchall())
 
     def bytes_by_station(self) -> dict[str, int]:
         """Disk usage of finished recordings by station."""
-        totals: defaultdict[str, int] = defaultdict(int)
-        for entry in self._recordings.entries().values():
-            totals[entry.summary.station] += entry.summary.num_bytes
-        return dict(totals)
-
-    def _episode(self, episode_id: str) -> Entry[EpisodeSummary]:
-        reader = self._store.open(episode_id)
-        attributes, num_steps = reader.attributes, reader.num_steps
-        on_grid_s = num_steps / attributes.model_rate_hz
-        summary = EpisodeSummary(
-            episode_id=episode_id,
-            origin=attributes.origin,
-            num_steps=num_steps,
-            duration_s=on_grid_s or _nominal_duration_s(reader),
-            lineage=attributes.lineage,
-            created_at=attributes.created_at,
-            **_shared_fields(reader),
-        )
-        entry = self._entry(reader, summary, attributes.created_at)
-        is_judged = attributes.success is not None and not attributes.recovered
-        if attributes.origin != "recorded" or not is_judged or has_object_poses(reader):
-            return entry
-        is_clickable = num_steps > 0 and "camera_head" in reader.streams
-        return replace(entry, is_clickable=is_clickable, clicks=self._store.clicks(episode_id))
-
-    def _recording(self, recording_id: str) -> Entry[RecordingSummary]:
-        reader = self._store.recording(recording_id)
-        attributes = reader.attributes
-        summary = RecordingSummary(
-            recording_id=recording_id,
-            consent=attributes.consent,
-            num_samples={name: reader.num_samples(name) for name in reader.streams},
-            duration_s=_nominal_duration_s(reader),
-            num_bytes=self._store.num_bytes(recording_id, kind="recording"),
-            started_at=attributes.started_at,
-            **_shared_fields(reader),
-        )
-        return self._entry(reader, summary, attributes.started_at)
-
-    def _entry(
-        self, reader: EpisodeReader | RecordingReader, summary: S, at: datetime | None
-    ) -> Entry[S]:
-        about, item_id = reader.attributes, reader.item_id
-        kind: Kind = "episode" if isinstance(about, EpisodeAttributes) else "recording"
-        item = item_of(reader, summary, self._store.review(item_id, kind=kind))
-        parts = (
-            item_id,
-            about.task,
-            about.instruction,
-            about.operator,
-            about.station,
-            about.trace_id,
-        )
-        text = "\n".join(part or "" for part in parts)
-        return Entry(summary, item, dict(about.quality), at, about.lineage, text.casefold())
+        text = "SELECT station, sum(num_bytes) FROM item WHERE kind = 'recording' GROUP BY station"
+        return dict(self.index.read(lambda connection: connection.execute(text).fetchall()))
 
 
-def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
-    """The fields that the summaries of both kinds have under one name."""
-    names = ("task", "domain", "station", "operator", "success", "recovered")
-    fields = {name: getattr(reader.attributes, name) for name in names}
-    return fields | {"content_sha256": reader.content_sha256}
+@dataclass(frozen=True)
+class _Order:
+    """Columns of the key and the name by which rows are sorted, and the page of them."""
 
+    key: str
+    name: str
+    page: Page
 
-def _matching(entries: Mapping[str, Entry[S]], query: CatalogFilter) -> dict[str, Entry[S]]:
-    matches = query.matcher()
-    return {name: entry for name, entry in entries.items() if matches(entry)}
+    @property
+    def columns(self) -> str:
+        """Columns to order by."""
+        down = " DESC" if self.page.descending else ""
+        names = (self.name,) if self.page.sort == "id" else (self.key, self.name)
+        return ", ".join(name + down for name in names)
+
+    def go_on(self, where: Condition) -> Condition:
+        """Only what comes after the page's cursor."""
+        if self.page.after is None:
+            return where
+        later = replace(where, terms=[*where.terms], values=[*where.values])
+        sign = "<" if self.page.descending else ">"
+        place = place_of(self.page.after, descending=self.page.descending)
+        if self.page.sort == "id" and not place[0]:
+            later.add(f"{self.name} {sign} ?", place[1])
+        else:
+            later.add(f"({self.key}, {self.name}) {sign} (?, ?)", *place)
+        return later
 
 
 def _page(
-    entries: Mapping[str, Entry[S]], query: CatalogFilter, limit: int, page: Page
-) -> tuple[list[Entry[S]], dict[str, Any]]:
+    connection: sqlite3.Connection, where: Condition, order: _Order, limit: int
+) -> tuple[list[Found], dict[str, Any]]:
     """The rows of a page, and the number of all that match with the cursor to go on after."""
-    found = _matching(entries, query)
-    places = sorted((sort_key(row.item, page.sort), name) for name, row in found.items())
-    first = page.offset
-    if page.after is not None:
-        after = place_of(page.after)
-        left, right = bisect_left(places, after), bisect_right(places, after)
-        first += len(places) - left if page.descending else right
-    if page.descending:
-        places.reverse()
-    chosen = places[first : first + limit]
-    next_after = None if first + limit >= len(places) else cursor_of(chosen[-1])
-    facts = {"num_matching": len(found), "next_after": next_after}
-    return [found[name] for _, name in chosen], facts
+    limit = min(limit, MAX_LIMIT)
+    count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
+    (num_matching,) = connection.execute(count, where.values).fetchone()
+    later = order.go_on(where)
+    rows = connection.execute(
+        f"SELECT i.row, i.aligned, {order.key}, {order.name} FROM {where.tables} WHERE {later.sql} "
+        f"ORDER BY {order.columns} LIMIT ? OFFSET ?",
+        [*later.values, limit + 1, min(order.page.offset, MAX_LIMIT)],
+    ).fetchall()
+    next_after = cursor_of(rows[limit - 1][2:]) if len(rows) > limit else None
+    facts = {"num_matching": num_matching, "next_after": next_after}
+    aligned = (lambda row: row[1]) if where.of_takes else (lambda _: None)
+    return [(row[0], aligned(row)) for row in rows[:limit]], facts
 
 
-def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:
-    # Counts come from the commit record, so no array is opened.
-    rates_hz = {name: stream.nominal_rate_hz for name, stream in reader.streams.items()}
-    return max((reader.num_samples(name) / rates_hz[name] for name in rates_hz), default=0.0)
+def _array(rows: Iterable[int]) -> str:
+    """Rows as a parameter of a query."""
+    return json.dumps(list(rows))
+
+
+def _items(connection: sqlite3.Connection, found: Sequence[Found]) -> tuple[CatalogItem, ...]:
+    """Items of rows with what others say of them; takes where a second row is given."""
+    wanted = _array(row for pair in found for row in pair if row is not None)
+    sources: defaultdict[int, list[Source]] = defaultdict(list)
+    for row, kind, item_id, consent, complete, cause, review in connection.execute(
+        _SOURCES, (wanted,)
+    ):
+        said = None if consent is None else bool(consent)
+        one = Source(kind, item_id, said, bool(complete), cause, _review(review))
+        sources[row].append(one)
+    products: defaultdict[int, list[str]] = defaultdict(list)
+    for row, item_id in connection.execute(_PRODUCTS, (wanted,)):
+        products[row].append(item_id)
+    items = {}
+    for row, kind, stands, is_compared, text, written, spread in connection.execute(
+        _BODIES, (wanted,)
+    ):
+        item = CatalogItem.model_validate_json(text)
+        review = _review(written)
+        counts = review if stands or review is None else review.earlier
+        changes = {"review": counts, "episodes": tuple(products[row])}
+        item = item.model_copy(update=changes)
+        if kind == "episode":
+            item = linked_episode(item, sources[row])
+        scales = None if spread is None else np.frombuffer(spread).reshape(2, len(FIGURES))
+        findings = all_findings(item, scales) if is_compared else ()
+        items[row] = item.model_copy(update={"findings": findings})
+    return tuple(
+        items[row] if aligned is None else take_of(items[row], items[aligned])
+        for row, aligned in found
+    )
+
+
+def _review(text: str | None) -> Review | None:
+    return None if text is None else Review.model_validate_json(text)
+
+
+def _lineage(connection: sqlite3.Connection, start: Name) -> Lineage:
+    def sources(name: Name) -> list[Name]:
+        text = """SELECT l.kind, l.source FROM item i JOIN lineage l USING (row)
+          WHERE i.kind = ? AND i.id = ? ORDER BY l.position"""
+        return connection.execute(text, name).fetchall()
+
+    def products(name: Name) -> list[Name]:
+        text = """SELECT i.kind, i.id FROM lineage l JOIN item i USING (row)
+          WHERE l.kind = ? AND l.source = ? ORDER BY i.kind DESC, i.id, l.position"""
+        return connection.execute(text, name).fetchall()
+
+    text = "SELECT b.item FROM item i JOIN body b USING (row) WHERE i.kind = ? AND i.id = ?"
+    if connection.execute(text, start).fetchone() is None:
+        raise NotFoundError(f"{start[0]} {start[1]!r}: not in the catalog")
+    nodes = {start: "self"}
+    _walk(nodes, start, sources, "source")
+    _walk(nodes, start, products, "product")
+    rows = []
+    for name, relation in nodes.items():
+        found = connection.execute(text, name).fetchone()
+        facts: dict[str, Any] = {"kind": name[0], "id": name[1], "relation": relation}
+        facts |= {"is_stored": found is not None, "made_from": [one for _, one in sources(name)]}
+        if found is not None:
+            facts["summary"] = _summary(CatalogItem.model_validate_json(found[0]))
+        rows.append(LineageNode.model_validate(facts))
+    return Lineage(nodes=tuple(rows))
+
+
+def _walk(
+    nodes: dict[Name, str], start: Name, neighbours: Callable[[Name], Iterable[Name]], relation: str
+) -> None:
+    """Add everything that can be reached from an item, breadth first, until MAX_NODES."""
+    waiting = deque([start])
+    while waiting and len(nodes) < MAX_NODES:
+        for name in neighbours(waiting.popleft()):
+            if name not in nodes and len(nodes) < MAX_NODES:
+                nodes[name] = relation
+                waiting.append(name)
+
+
+def _summary(item: CatalogItem) -> str:
+    return f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"

@@ -1,17 +1,15 @@
 """Command line `dextouch store`: inspect, repair and delete items of a store."""
 
-import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dextouch.command_line import progress, write_result
-from dextouch.data_folder import is_system_file
+from dextouch.command_line import progress, say, write_result
 from dextouch.episodes import (
     KINDS,
     ClickedPoses,
@@ -22,10 +20,8 @@ from dextouch.episodes import (
     Kind,
     LocalGroup,
     TrashKind,
-    check_id,
     clicked_poses,
     has_object_poses,
-    local_folder,
     shard_path,
     stream_arrays,
     touched_objects,
@@ -48,13 +44,14 @@ from dextouch.episodes.care import (
     unfinished_folders,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.free_text import printable
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
+    EpisodeList,
     EpisodeSummary,
     RecordingAttributes,
+    RecordingList,
     RecordingSummary,
     SceneObject,
     SceneObjects,
@@ -63,7 +60,9 @@ from dextouch.schemas import (
 )
 from dextouch.serving import configure_logging, load_settings
 from services.episode_store.catalog import Catalog
+from services.episode_store.command_context import Context, Outcome
 from services.episode_store.deletions import deletion_statuses
+from services.episode_store.editing_commands import merge, note, relabel, trim
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 from services.episode_store.settings import EpisodeStoreSettings
@@ -71,8 +70,6 @@ from services.episode_store.settings import EpisodeStoreSettings
 EXIT_DAMAGED = 1
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
 _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
-
-Outcome = tuple[dict[str, Any], int]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -88,80 +85,6 @@ def main(argv: Sequence[str]) -> int:
     result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options))
     write_result(options.json, result)
     return status
-
-
-def say(line: str) -> None:
-    """Print a line that may hold text of others."""
-    print(printable(line))
-
-
-@dataclass(frozen=True)
-class Context:
-    """The store, its URL, and parsed arguments."""
-
-    store: EpisodeStore
-    url: str
-    options: argparse.Namespace
-
-    def kind_of(self, item_id: str) -> Kind:
-        """Kind of an id: given by --kind, otherwise the one under which it exists.
-
-        Raises:
-            NotFoundError: no such id.
-            InvalidInputError: both kinds exist.
-        """
-        check_id(item_id)
-        if self.options.kind:
-            return self.options.kind
-        found = [kind for kind in KINDS if self._is_there(kind, item_id)]
-        if not found:
-            raise NotFoundError(
-                f"{item_id!r}: not in the store {self.url}, neither episode nor recording"
-            )
-        if len(found) > 1:
-            raise InvalidInputError(
-                f"{item_id!r} is an episode and a recording; name one with --kind"
-            )
-        return found[0]
-
-    def _is_there(self, kind: Kind, item_id: str) -> bool:
-        if self.store.exists(item_id, kind=kind):
-            return True
-        return self.root is not None and (self.root / f"{kind}s" / item_id).is_dir()
-
-    def items(self) -> list[tuple[Kind, str]]:
-        """Selected items: the given ids, otherwise all of the given kinds.
-
-        A folder counts even without a commit record.
-        """
-        if self.options.ids:
-            return [(self.kind_of(item_id), item_id) for item_id in self.options.ids]
-        found: list[tuple[Kind, str]] = []
-        for kind in KINDS if self.options.kind is None else (self.options.kind,):
-            names = set(self.store.list(kind=kind))
-            folder = None if self.root is None else self.root / f"{kind}s"
-            if folder is not None and folder.is_dir():
-                names |= {p.name for p in folder.iterdir() if not is_system_file(p.name)}
-            found += [(kind, name) for name in sorted(names)]
-        return found
-
-    @property
-    def root(self) -> Path | None:
-        """The store's folder; None for one in a bucket."""
-        return None if self.url.startswith("s3://") else local_folder(self.url)
-
-    def need_local_root(self) -> Path:
-        """The store's folder.
-
-        Raises:
-            InvalidInputError: a store in a bucket.
-        """
-        if self.root is None:
-            raise InvalidInputError(
-                f"{self.options.command}: got the store {self.url}, expected one in a folder; copy "
-                "it to a folder first, or use the versions of the bucket"
-            )
-        return self.root
 
 
 def readable_size(num_bytes: int) -> str:
@@ -191,7 +114,7 @@ def list_items(context: Context) -> Outcome:
         raise NotFoundError(f"store {root}: no such folder; name another with --store")
     if options.kind == "recording" and options.origin is not None:
         raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
-    catalog = Catalog(context.store)
+    catalog = Catalog(context.store, progress)
     # Recordings have no origin to match.
     kind: Kind | None = "episode" if options.origin is not None else options.kind
     result: dict[str, Any] = {"num_matching": 0, "next_after": None}
@@ -214,12 +137,20 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
         for row in episodes.episodes:
             facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
             say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
-        return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+        return _result_of(context, episodes), catalog.index.num_items(kind)
     recordings = catalog.recordings(query, limit=sys.maxsize)
     for each in recordings.recordings:
         facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
         say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
-    return json_ready(recordings), catalog.recordings(limit=1).num_matching
+    return _result_of(context, recordings), catalog.index.num_items(kind)
+
+
+def _result_of(context: Context, found: EpisodeList | RecordingList) -> dict[str, Any]:
+    # Of many items it takes as long as listing them.
+    if context.options.json is None:
+        return {"num_matching": found.num_matching}
+    result: dict[str, Any] = json_ready(found)
+    return result
 
 
 def _outcome(
@@ -244,16 +175,17 @@ def show(context: Context) -> Outcome:
     item_id = context.options.id
     kind = context.kind_of(item_id)
     store = context.store
-    reader = store.recording(item_id) if kind == "recording" else store.open(item_id)
+    reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
     streams = {}
     rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
     for name, descriptor in reader.streams.items():
         entry = contents.entries[name]
+        codec = entry.attributes.get("encoding", entry.codec)
         # Steps between samples above one and a half nominal periods.
         num_gaps = int((np.diff(reader.stamps_ns(name)) > 1.5 * descriptor.period_ns()).sum())
-        arrays = stream_arrays(descriptor, kind)
+        arrays = stream_arrays(descriptor, kind, contents.version)
         shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
@@ -262,11 +194,11 @@ def show(context: Context) -> Outcome:
             "num_samples": num_samples,
             "num_gaps": num_gaps,
             "num_bytes": num_bytes,
-            "codec": entry.codec,
+            "codec": codec,
             "encoder": entry.encoder,
         }
         numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
-        rows.append((name, *numbers, entry.codec, entry.encoder or ""))
+        rows.append((name, *numbers, codec, entry.encoder or ""))
     result = {
         "attributes": json_ready(reader.attributes),
         "num_samples": {name: reader.num_samples(name) for name in reader.streams},
@@ -277,7 +209,7 @@ def show(context: Context) -> Outcome:
     say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
     say(_outcome(attributes))
     for source in attributes.lineage:
-        say(f"made from {source.kind} {source.id}")
+        say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
     say(f"content {reader.content_sha256}")
@@ -299,9 +231,13 @@ def verify(context: Context) -> Outcome:
             reports.append(inspect_group(files, kind))
         except NotFoundError:
             say(f"{item_id}  deleted meanwhile  {kind}")
-    if not context.options.ids and root is not None:
-        for what, folder in unfinished_folders(root):
+    if not context.options.ids:
+        for what, folder in () if root is None else unfinished_folders(root):
             reports.append(_inspect_unfinished(what, folder))
+        reports += [
+            ItemReport("catalog", "catalog", findings=(Finding(problem, foreign=True),))
+            for problem in Catalog(context.store).index.verify()
+        ]
     for report in reports:
         _say_report(report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
@@ -317,7 +253,7 @@ def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
     if not folder.is_dir() or folder.is_symlink():
         finding = Finding(f"{kind} {folder.name}: is not a folder; move it away", foreign=True)
         return ItemReport(kind, folder.name, findings=(finding,))
-    return inspect_stage(folder) if kind == "stage" else inspect_upload(folder)
+    return inspect_upload(folder) if kind == "upload" else inspect_stage(folder, kind)
 
 
 def _say_report(report: ItemReport) -> None:
@@ -439,7 +375,7 @@ def _delete_all_of(context: Context) -> Outcome:
     gone = {(victim.place, victim.folder) for victim in victims}
     for facts in reviews_by(root, request):
         if (facts.place, facts.folder.name) not in gone:
-            say(f"{facts.place}/{facts.folder.name}  review: loses its reviewer's name")
+            say(f"{facts.place}/{facts.folder.name}  review or notes: lose their author's name")
     if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
@@ -536,8 +472,8 @@ def repair(context: Context) -> Outcome:
         say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
         for name, count in report.lost.items():
             say(f"  {name}: {count} samples lost")
-        for note in report.notes:
-            say(f"  {note}")
+        for text in report.notes:
+            say(f"  {text}")
     left = any(report.action == LEFT for report in reports)
     return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
 
@@ -561,4 +497,8 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "restore": restore,
     "purge": purge,
     "repair": repair,
+    "trim": trim,
+    "relabel": relabel,
+    "merge": merge,
+    "note": note,
 }

@@ -63,18 +63,18 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
     router = APIRouter(prefix="/v1/deletions", tags=["deletions"])
 
     @router.get("", dependencies=[MAY_DELETE])
-    def listing() -> Deletions:
+    def list_deletions() -> Deletions:
         """Deletions, and the takes that stations have yet to remove."""
         return Deletions(deletions=tuple(deletion_statuses(records)))
 
     @router.get("/revision", dependencies=[MAY_WRITE])
-    def revision() -> DeletionsRevision:
+    def get_deletions_revision() -> DeletionsRevision:
         """Changes with every deletion; a station then checks its spool."""
         return DeletionsRevision(revision=records.revision)
 
     @router.post("/check", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
-    def check(body: Checked, sender: Writer) -> CheckedTakes:
+    def check_takes(body: Checked, sender: Writer) -> CheckedTakes:
         """Which of these takes were deleted, and which operators."""
         sender.check_station(body.station)
         # Before the takes, so that a deletion in between is found by the next check.
@@ -92,7 +92,7 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
 
     @router.post("/confirm", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
-    def confirm(
+    def confirm_deletions(
         removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))], sender: Writer
     ) -> DeletionsRevision:
         """Note that a station holds none of the deleted takes, except those that it names."""

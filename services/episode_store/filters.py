@@ -1,28 +1,16 @@
 """Filters, order and pages of the catalog's lists."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from operator import attrgetter
-from typing import Annotated, Generic, Literal, TypeVar
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, AwareDatetime, Field
 
 from dextouch.errors import LimitExceededError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    CatalogItem,
-    Domain,
-    EpisodeClicks,
-    EpisodeSummary,
-    LineageEntry,
-    Origin,
-    RecordingSummary,
-    Verdict,
-)
+from dextouch.schemas import Domain, Origin, Verdict
 
-S = TypeVar("S", EpisodeSummary, RecordingSummary)
 Outcome = Literal["success", "failure", "not_judged"]
 SortKey = Literal["id", "time", "duration", "task", "operator", "station", "findings"]
 ItemsKind = Literal["take", "recording", "episode"]
@@ -30,33 +18,49 @@ _COMPARED = (
     "task", "operator", "station", "domain", "success", "recovered", "origin", "trace_id",
 )  # fmt: skip
 # Order of items by their findings, where those without a score are among the outliers.
-_WEIGHTS = {
+WEIGHTS: Final = {
     "incomplete": 20.0,
     "beyond_limit": 15.0,
     "doubtful_clock": 10.0,
     "recovered": 5.0,
     "not_judged": 1.0,
 }
+# Columns by which lists are sorted, `name` behind each, with a place for the name of the table.
+SORT_COLUMNS: Final = {
+    "time": "{}at_key", "duration": "{}duration_key", "task": "{}task",
+    "operator": "coalesce({}operator, '')", "station": "coalesce({}station, '')",
+}  # fmt: skip
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_FIGURE = "SELECT value FROM figure JOIN figure_name USING (number) WHERE name = ?"
 EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
 
-@dataclass(frozen=True, slots=True)
-class Entry(Generic[S]):
-    """A row of the catalog in both forms, with further properties to filter by.
+@dataclass
+class Condition:
+    """An SQL condition on a row `i` of the catalog with its parameters.
 
-    `text` is in lower case. `is_clickable` marks episodes whose objects no stream knows, and
-    `clicks` are those on them.
+    In the list of takes (`of_takes`) a recording's last episode is the row `a`.
     """
 
-    summary: S
-    item: CatalogItem
-    quality: Mapping[str, float]
-    created_at: datetime | None
-    lineage: tuple[LineageEntry, ...] = ()
-    text: str = ""
-    is_clickable: bool = False
-    clicks: EpisodeClicks | None = None
+    of_takes: bool = False
+    tables: str = "item i"
+    terms: list[str] = field(default_factory=list)
+    values: list[object] = field(default_factory=list)
+
+    def join_episode(self) -> None:
+        """Make the last episode of a take known to the terms."""
+        self.tables = "item i LEFT JOIN item a ON a.row = i.aligned"
+
+    def add(self, term: str, *values: object) -> None:
+        """A further term that must hold."""
+        self.terms.append(term)
+        self.values += values
+
+    @property
+    def sql(self) -> str:
+        """All terms."""
+        return " AND ".join(self.terms)
 
 
 def quality_bound(text: str) -> tuple[str, float]:
@@ -94,40 +98,34 @@ class CatalogFilter(FrozenModel):
     text: str | None = Field(default=None, max_length=200)
     min_quality: tuple[
         Annotated[str, AfterValidator(lambda text: quality_bound(text) and text)], ...
-    ] = ()
+    ] = Field(default=(), max_length=20)
     created_after: AwareDatetime | None = None
     created_before: AwareDatetime | None = None
 
-    def matcher(self) -> Callable[[Entry[S]], bool]:
-        """Compile the filter to a fast predicate."""
-        fields = [name for name in _COMPARED if getattr(self, name, None) is not None]
-        get = attrgetter(*fields) if fields else None
-        expected = get(self) if get else None
-        bounds = [quality_bound(text) for text in self.min_quality]
-        further = self._further()
-
-        def matches(entry: Entry[S]) -> bool:
-            if get is not None and get(entry.item) != expected:
-                return False
-            if any(not entry.quality.get(name, -math.inf) >= least for name, least in bounds):
-                return False
-            return all(check(entry) for check in further)
-
-        return matches
-
-    def _further(self) -> list[Callable[[Entry[S]], bool]]:
-        """Checks of the filters that do not compare one field of the summary."""
-        checks: list[Callable[[Entry[S]], bool]] = []
+    def restrict(self, to: Condition) -> None:
+        """Add what must hold of a matching row."""
+        for name in _COMPARED:
+            if (value := getattr(self, name, None)) is not None:
+                to.add(f"i.{name} = ?", value)
         if self.outcome is not None:
-            success = _SUCCESS[self.outcome]
-            checks.append(lambda entry: entry.item.success is success)
+            to.add("i.success IS ?", _SUCCESS[self.outcome])
         if self.text:
-            text = self.text.casefold()
-            checks.append(lambda entry: text in entry.text)
+            # `text` of a take is that of its recording and of its episode.
+            column = "i.text"
+            if to.of_takes:
+                to.join_episode()
+                column = "i.text || coalesce(char(10) || a.text, '')"
+            to.add(f"instr({column}, ?) > 0", self.text.casefold())
+        for name, least in map(quality_bound, self.min_quality):
+            if least > -math.inf:
+                figure = f"({_FIGURE} AND row = i.row)"
+                if to.of_takes:
+                    to.join_episode()
+                    figure = f"coalesce(({_FIGURE} AND row = a.row), {figure})"
+                to.add(f"{figure} >= ?", *[name] * (1 + to.of_takes), least)
         if self.created_after is not None or self.created_before is not None:
             after, before = self.created_after or EARLIEST, self.created_before or LATEST
-            checks.append(lambda entry: after <= (entry.created_at or LATEST) < before)
-        return checks
+            to.add("i.at_us >= ? AND i.at_us < ?", microseconds(after), microseconds(before))
 
 
 class EpisodeFilter(CatalogFilter):
@@ -136,12 +134,11 @@ class EpisodeFilter(CatalogFilter):
     origin: Origin | None = None
     derived_from: str | None = None
 
-    def _further(self) -> list[Callable[[Entry[S]], bool]]:
-        checks: list[Callable[[Entry[S]], bool]] = super()._further()
+    def restrict(self, to: Condition) -> None:
+        """Add what must hold of a matching row."""
+        super().restrict(to)
         if self.derived_from is not None:
-            source = self.derived_from
-            checks.append(lambda entry: any(one.id == source for one in entry.lineage))
-        return checks
+            to.add("i.row IN (SELECT row FROM lineage WHERE source = ?)", self.derived_from)
 
 
 class ItemFilter(CatalogFilter):
@@ -156,27 +153,24 @@ class ItemFilter(CatalogFilter):
     flagged: bool | None = None
     id: tuple[str, ...] = Field(default=(), max_length=200)
 
-    def _further(self) -> list[Callable[[Entry[S]], bool]]:
-        checks: list[Callable[[Entry[S]], bool]] = super()._further()
+    def restrict(self, to: Condition) -> None:
+        """Add what must hold of a matching row."""
+        super().restrict(to)
+        prefix = "take_" if to.of_takes else ""
         if self.review is not None:
             verdict = None if self.review == "not_reviewed" else self.review
-            checks.append(
-                lambda entry: (entry.item.review and entry.item.review.verdict) == verdict
-            )
+            to.add(f"i.{prefix}verdict IS ?", verdict)
         if self.flagged is not None:
-            flagged = self.flagged
-            checks.append(lambda entry: bool(entry.item.findings) == flagged)
+            to.add(f"i.{prefix}weight {'>' if self.flagged else '='} ?", NO_WEIGHT)
         if self.id:
-            ids = frozenset(self.id)
-            checks.append(lambda entry: entry.item.id in ids)
-        return checks
+            to.add(f"i.id IN ({', '.join('?' * len(self.id))})", *self.id)
 
 
 class Page(FrozenModel):
     """Page of a list in an order: after a cursor, or from an offset.
 
-    Rows of equal keys are in the order of ids; rows without a key come first. `findings` sorts
-    items by how far they are from what is usual.
+    Rows of equal keys are in the order of ids, the episode of an id before the recording; rows
+    without a key come first. `findings` sorts items by how far they are from what is usual.
     """
 
     sort: SortKey = "id"
@@ -217,19 +211,33 @@ class ItemQuery(ItemFilter, Page):
     """Filter and page of items."""
 
 
-def sort_key(item: CatalogItem, sort: SortKey) -> str:
-    """Text by which a row is sorted; empty for ids, which follow anyway."""
-    if sort == "id":
-        return ""
-    if sort == "duration":
-        return f"{item.duration_s:020.6f}"
-    if sort == "findings":
-        scores = (abs(one.score or _WEIGHTS.get(one.code, 0.0)) for one in item.findings)
-        return f"{max(scores, default=0.0):020.6f}"
-    if sort == "time":
-        at = item.at
-        return "" if at is None else at.astimezone(UTC).isoformat(timespec="microseconds")
-    return getattr(item, sort) or ""
+def within_calendar(at: datetime) -> datetime:
+    """The same time in UTC, or the first or last one where that has no date in UTC."""
+    return min(max(at, EARLIEST), LATEST).astimezone(UTC)
+
+
+def time_key(at: datetime | None) -> str:
+    """Text by which rows are sorted by time, which is `within_calendar`."""
+    return "" if at is None else at.isoformat(timespec="microseconds")
+
+
+def item_name(item_id: str, kind: str) -> str:
+    """Name by which items of both kinds are sorted: a comma comes before any part of an id."""
+    return f"{item_id},{kind}"
+
+
+def number_key(number: float) -> str:
+    """Text by which rows are sorted by a duration, or by how unusual they are."""
+    return f"{number:020.6f}"
+
+
+def microseconds(at: datetime) -> int:
+    """Microseconds since 1970, without rounding."""
+    return (at - _EPOCH) // timedelta(microseconds=1)
+
+
+# Sort key of an item without findings.
+NO_WEIGHT: Final = number_key(0.0)
 
 
 def cursor_of(place: tuple[str, str]) -> str:
@@ -238,7 +246,11 @@ def cursor_of(place: tuple[str, str]) -> str:
     return f"{key}|{item_id}" if key else item_id
 
 
-def place_of(cursor: str) -> tuple[str, str]:
-    """Key and id of a cursor; the row itself may be gone."""
+def place_of(cursor: str, *, descending: bool = False) -> tuple[str, str]:
+    """Key and id or name of a cursor; the row itself may be gone.
+
+    In the list of both kinds an id alone stands for all items of it: they come before its place, or
+    after it where the list is `descending`.
+    """
     key, _, item_id = cursor.rpartition("|")
-    return key, item_id
+    return key, item_id if descending or "," in item_id else item_name(item_id, "~")

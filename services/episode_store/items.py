@@ -1,4 +1,4 @@
-"""What a catalog makes of its entries: items in one list, their findings, hours, and lineage.
+"""What a catalog says of an item: its figures, what its sources add, and findings.
 
 Items are recordings, episodes, or takes. A take is a recording together with the episodes that were
 made from it, or an episode without a stored recording.
@@ -10,11 +10,10 @@ first take of a task on. Outliers have robust z-scores of figures, 0.6745 (x −
 """
 
 import re
-import threading
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import timedelta, timezone
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -22,38 +21,25 @@ from jaxtyping import Float64
 from pydantic import Field
 
 from dextouch.episodes import EpisodeReader, RecordingReader
-from dextouch.errors import NotFoundError
 from dextouch.schemas import (
-    CatalogHours,
     CatalogItem,
     ClockReport,
-    ComparedGroup,
     EpisodeAttributes,
     EpisodeSummary,
     Finding,
-    HoursByField,
-    HoursOf,
-    HoursRow,
-    Lineage,
-    LineageNode,
     RecordingAttributes,
     RecordingSummary,
     Review,
 )
 from dextouch.streams import LEAST_SHARE_KEPT, residual_limits_s
-from services.episode_store.filters import Entry, EpisodeFilter, ItemsKind
+from services.episode_store.filters import EpisodeFilter
 
-AnyEntry = Entry[Any]
-Entries = Mapping[str, AnyEntry]
-Group = tuple[str, str, str, str]
+# Median and scale of each figure among the items of a group.
+Spread = Float64[np.ndarray, "2 figures"]
 _SHARED: Final = (
     "task", "instruction", "domain", "station", "operator", "success", "recovered", "trace_id",
     "complete", "incomplete_cause",
 )  # fmt: skip
-MAX_NODES = 200
-# Kind and id of an item.
-Name = tuple[str, str]
-SECONDS_AN_HOUR = 3600.0
 HoursField = Literal["task", "operator", "station", "day"]
 # MAD of a normal distribution with standard deviation 1 (Iglewicz and Hoaglin, section 3.3).
 MAD_OF_SIGMA: Final = 0.6745
@@ -86,143 +72,53 @@ def item_of(
     return CatalogItem.model_validate(fields | {"review": review})
 
 
-class ItemLists:
-    """The lists of a catalog's items, made anew when its entries have changed."""
+@dataclass(frozen=True)
+class Source:
+    """A stored item that another one was made from."""
 
-    def __init__(self) -> None:
-        self._guard = threading.Lock()
-        self._made_of: tuple[Entries, Entries] = ({}, {})
-        self._lists: dict[ItemsKind, dict[str, AnyEntry]] = {}
-        self._groups: tuple[ComparedGroup, ...] = ()
-
-    def entries(self, kind: ItemsKind, recordings: Entries, episodes: Entries) -> Entries:
-        """Entries of a list by `ID/KIND`, made from the catalog's own ones by id."""
-        with self._guard:
-            self._update(recordings, episodes)
-            return self._lists[kind]
-
-    def groups(self, recordings: Entries, episodes: Entries) -> tuple[ComparedGroup, ...]:
-        """The groups of items that are compared with each other."""
-        with self._guard:
-            self._update(recordings, episodes)
-            return self._groups
-
-    def _update(self, recordings: Entries, episodes: Entries) -> None:
-        known = self._made_of
-        if self._lists and known[0] is recordings and known[1] is episodes:
-            return
-        ours = dict(recordings)
-        made: defaultdict[str, list[str]] = defaultdict(list)
-        theirs = {}
-        for name, entry in episodes.items():
-            theirs[name] = linked = _linked_episode(entry, recordings, episodes)
-            for source in linked.item.recordings if linked.item.origin != "imagined" else ():
-                made[source].append(name)
-        for name, products in made.items():
-            ours[name] = _with(ours[name], episodes=tuple(products))
-        compared = [*theirs.values(), *(one for one in ours.values() if not one.item.episodes)]
-        found, self._groups = _compare(compared)
-        theirs = {name: _with(one, findings=found[name, "episode"]) for name, one in theirs.items()}
-        ours = {
-            name: _with(one, findings=found.get((name, "recording"), ()))
-            for name, one in ours.items()
-        }
-        takes = {f"{name}/recording": _take(one, theirs) for name, one in ours.items()}
-        takes |= {
-            f"{name}/episode": one
-            for name, one in theirs.items()
-            if one.item.origin == "imagined" or not one.item.recordings
-        }
-        self._lists = {
-            "recording": {f"{name}/recording": one for name, one in ours.items()},
-            "episode": {f"{name}/episode": one for name, one in theirs.items()},
-            "take": takes,
-        }
-        self._made_of = (recordings, episodes)
+    kind: str
+    id: str
+    consent: bool | None
+    complete: bool
+    incomplete_cause: str
+    review: Review | None
 
 
-def _with(entry: AnyEntry, **changes: object) -> AnyEntry:
-    return replace(entry, item=entry.item.model_copy(update=changes))
-
-
-def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> AnyEntry:
+def linked_episode(item: CatalogItem, sources: Sequence[Source]) -> CatalogItem:
     """An episode with what its stored sources say: consent, incompleteness, rejection."""
-    names = [one.id for one in entry.lineage if one.kind == "recording" and one.id in recordings]
-    sources = [recordings[name].item for name in names]
-    torn = next((one for one in (entry.item, *sources) if not one.complete), entry.item)
-    review = entry.item.review
+    recordings = [one for one in sources if one.kind == "recording"]
+    parts: list[CatalogItem | Source] = [item, *recordings]
+    torn = next((one for one in parts if not one.complete), item)
+    review = item.review
     if review is None:
-        sources += [
-            episodes[one.id].item
-            for one in entry.lineage
-            if one.kind == "episode" and one.id in episodes
-        ]
-        reviews = (one.review for one in sources)
-        review = next((one for one in reviews if one and one.verdict == "rejected"), None)
-    consent = all(recordings[name].item.consent for name in names) if names else None
-    return _with(
-        entry,
-        recordings=tuple(names),
-        consent=consent,
-        review=review,
-        complete=torn.complete,
-        incomplete_cause=torn.incomplete_cause,
-    )
+        others = [one for one in sources if one.kind == "episode"]
+        reviews = (one.review for one in (*recordings, *others))
+        review = next((one for one in reviews if one and one.spreads), None)
+    changes = {
+        "recordings": tuple(one.id for one in recordings),
+        "consent": all(one.consent for one in recordings) if recordings else None,
+        "review": review,
+        "complete": torn.complete,
+        "incomplete_cause": torn.incomplete_cause,
+    }
+    return item.model_copy(update=changes)
 
 
-def _take(recording: AnyEntry, episodes: Entries) -> AnyEntry:
+def take_of(recording: CatalogItem, aligned: CatalogItem) -> CatalogItem:
     """A recording as a take: with the last of its episodes, and what was found in that."""
-    item = recording.item
-    if not item.episodes:
-        return recording
-    aligned = episodes[item.episodes[-1]]
-    take = _with(
-        recording,
-        aligned=aligned.item,
-        figures=aligned.item.figures,
-        time_doubts=aligned.item.time_doubts,
-        findings=aligned.item.findings,
-        review=aligned.item.review or item.review,
-    )
-    quality = {**recording.quality, **aligned.quality}
-    return replace(take, quality=quality, text=f"{recording.text}\n{aligned.text}")
+    changes = {
+        "aligned": aligned,
+        "figures": aligned.figures,
+        "time_doubts": aligned.time_doubts,
+        "findings": aligned.findings,
+        "review": aligned.review or recording.review,
+    }
+    return recording.model_copy(update=changes)
 
 
-def _compare(
-    entries: list[AnyEntry],
-) -> tuple[dict[tuple[str, str], tuple[Finding, ...]], tuple[ComparedGroup, ...]]:
-    """Findings by id and kind, and the groups that were compared; rejected items are left out.
-
-    Items come with the findings that need no comparison.
-    """
-    groups: defaultdict[Group, list[CatalogItem]] = defaultdict(list)
-    found: dict[tuple[str, str], tuple[Finding, ...]] = {}
-    for entry in entries:
-        item = entry.item
-        if item.review is not None and item.review.verdict == "rejected":
-            found[item.id, item.kind] = ()
-        else:
-            groups[item.task, item.domain, item.origin, item.kind].append(item)
-    rows = []
-    for (task, *_), items in sorted(groups.items()):
-        outliers = find_outliers([item.figures for item in items])
-        for item, own in zip(items, outliers, strict=True):
-            found[item.id, item.kind] = _all_findings(item, own)
-        row = ComparedGroup(
-            kind=items[0].kind,
-            task=task,
-            domain=items[0].domain,
-            origin=items[0].origin,
-            num_items=len(items),
-            min_items=MIN_ITEMS,
-            is_compared=len(items) >= MIN_ITEMS,
-        )
-        rows.append(row)
-    return found, tuple(rows)
-
-
-def _all_findings(item: CatalogItem, outliers: list[Finding]) -> tuple[Finding, ...]:
-    found = [*item.findings, *outliers]
+def all_findings(item: CatalogItem, spread: Spread | None) -> tuple[Finding, ...]:
+    """Findings of a linked item that is compared; `item` has those that need no comparison."""
+    found = [*item.findings, *outliers_of(item.figures, spread)]
     if not item.complete:
         text = f"incomplete: {item.incomplete_cause or 'no cause noted'}"
         found.insert(0, Finding(code="incomplete", message=text))
@@ -241,108 +137,6 @@ class HoursFilter(EpisodeFilter):
     """Filter of episodes; days begin at midnight of the zone `utc_offset_min` ahead of UTC."""
 
     utc_offset_min: int = Field(default=0, ge=-14 * 60, le=14 * 60)
-
-
-def hours_of(entries: Iterable[Entry[EpisodeSummary]]) -> CatalogHours:
-    """Total duration of episodes by task, domain and origin."""
-    groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
-    for episode in (entry.summary for entry in entries):
-        groups[episode.task, episode.domain, episode.origin].append(episode)
-    rows = [
-        HoursRow(
-            task=task,
-            domain=group[0].domain,
-            origin=group[0].origin,
-            num_episodes=len(group),
-            num_successes=sum(episode.success is True for episode in group),
-            hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
-        )
-        for (task, *_), group in sorted(groups.items())
-    ]
-    return CatalogHours(
-        rows=tuple(rows),
-        num_episodes=sum(row.num_episodes for row in rows),
-        hours=sum(row.hours for row in rows),
-    )
-
-
-def hours_by(
-    field: HoursField, episodes: Iterable[CatalogItem], *, utc_offset_min: int
-) -> HoursByField:
-    """Total duration of episodes by the values of a field, in their order, and by their reviews."""
-    groups: defaultdict[str | None, list[CatalogItem]] = defaultdict(list)
-    for item in episodes:
-        groups[_value(field, item, utc_offset_min)].append(item)
-    ordered = sorted(groups, key=lambda value: (value is None, value or ""))
-    rows = []
-    for value in ordered:
-        seconds = {"accepted": 0.0, "rejected": 0.0, "not_reviewed": 0.0}
-        for item in groups[value]:
-            seconds[item.review.verdict if item.review else "not_reviewed"] += item.duration_s
-        hours = {f"{name}_h": total_s / SECONDS_AN_HOUR for name, total_s in seconds.items()}
-        rows.append(HoursOf(value=value, num_episodes=len(groups[value]), **hours))
-    return HoursByField(rows=tuple(rows))
-
-
-def _value(field: HoursField, item: CatalogItem, utc_offset_min: int) -> str | None:
-    if field != "day":
-        value: str | None = getattr(item, field)
-        return value
-    if item.at is None:
-        return None
-    zone = timezone(timedelta(minutes=utc_offset_min))
-    return item.at.astimezone(zone).date().isoformat()
-
-
-def lineage_of(entries: Mapping[Name, AnyEntry], start: Name) -> Lineage:
-    """Everything that an item was made from and that was made from it, nearest first.
-
-    Raises:
-        NotFoundError: no such item.
-    """
-    kind, item_id = start
-    if start not in entries:
-        raise NotFoundError(f"{kind} {item_id!r}: not in the catalog")
-    sources = {
-        name: tuple((one.kind, one.id) for one in entry.lineage) for name, entry in entries.items()
-    }
-    products: defaultdict[Name, list[Name]] = defaultdict(list)
-    for name, above in sources.items():
-        for one in above:
-            products[one].append(name)
-    nodes = {start: "self"}
-    _walk(nodes, start, lambda name: sources.get(name, ()), "source")
-    _walk(nodes, start, lambda name: products[name], "product")
-    rows = [
-        LineageNode.model_validate(
-            {
-                "kind": name[0],
-                "id": name[1],
-                "relation": relation,
-                "is_stored": name in entries,
-                "made_from": [one for _, one in sources.get(name, ())],
-                "summary": _summary(entries[name].item) if name in entries else "",
-            }
-        )
-        for name, relation in nodes.items()
-    ]
-    return Lineage(nodes=tuple(rows))
-
-
-def _walk(
-    nodes: dict[Name, str], start: Name, neighbours: Callable[[Name], Iterable[Name]], relation: str
-) -> None:
-    """Add everything that can be reached from an item, breadth first, until MAX_NODES."""
-    waiting = deque([start])
-    while waiting and len(nodes) < MAX_NODES:
-        for name in neighbours(waiting.popleft()):
-            if name not in nodes and len(nodes) < MAX_NODES:
-                nodes[name] = relation
-                waiting.append(name)
-
-
-def _summary(item: CatalogItem) -> str:
-    return f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"
 
 
 @dataclass(frozen=True)
@@ -376,6 +170,7 @@ FIGURES: Final = (
     Figure("jerk_p95_m_s3", "jerk of a wrist", "m/s³", "high", 5.0),
     Figure("static_share", "share of time at rest", "%", "both", 0.02),
 )
+_SIGNS: Final = np.array([{"high": 1, "low": -1, "both": 0}[figure.bad] for figure in FIGURES])
 # Figures that are made of those of single streams or hands: their names, and how.
 _COLLECTED: Final[Mapping[str, tuple[str, Callable[[Iterable[float]], float]]]] = {
     "num_gaps": (r".+_num_gaps", sum),
@@ -387,16 +182,24 @@ _COLLECTED: Final[Mapping[str, tuple[str, Callable[[Iterable[float]], float]]]] 
 }
 
 
+# More than the streams and hands of all stations have.
+@lru_cache(maxsize=1 << 14)
+def _collected_into(key: str) -> tuple[str, ...]:
+    """The figures that are made of a figure of quality."""
+    return tuple(name for name, (form, _) in _COLLECTED.items() if re.fullmatch(form, key))
+
+
 def figures_of(
     attributes: EpisodeAttributes | RecordingAttributes, *, num_steps: int, duration_s: float
 ) -> dict[str, float]:
     """The figures that an item has; `num_steps` are those of an episode."""
     quality = attributes.quality
     found = {"duration_s": duration_s}
-    for name, (pattern, collect) in _COLLECTED.items():
-        values = [value for key, value in quality.items() if re.fullmatch(pattern, key)]
-        if values:
-            found[name] = float(collect(values))
+    values: defaultdict[str, list[float]] = defaultdict(list)
+    for key, value in quality.items():
+        for name in _collected_into(key):
+            values[name].append(value)
+    found |= {name: float(_COLLECTED[name][1](some)) for name, some in values.items()}
     if "coverage" in quality:
         found["coverage"] = quality["coverage"]
     elif num_steps and "num_steps_refused" in quality:
@@ -419,38 +222,53 @@ def _clock_figures(clocks: Iterable[ClockReport]) -> dict[str, float]:
     return found
 
 
-def robust_scores(
-    values: Float64[np.ndarray, " n"], *, resolution: float
-) -> Float64[np.ndarray, " n"]:
-    """Deviations from the median in robust standard deviations, at least `resolution` each."""
-    deviations = values - np.median(values)
-    sigma = float(np.median(np.abs(deviations))) / MAD_OF_SIGMA
-    return deviations / max(sigma, resolution)
+def spread_of(values: Float64[np.ndarray, "items figures"]) -> Spread:
+    """Median and scale of each figure: robust standard deviation, at least its resolution.
+
+    NaN of figures that fewer than MIN_ITEMS have; items without a figure have NaN.
+    """
+    spread = np.full((2, values.shape[1]), np.nan)
+    for place, figure in enumerate(FIGURES):
+        known = values[:, place][~np.isnan(values[:, place])]
+        if len(known) >= MIN_ITEMS:
+            median = np.median(known)
+            sigma = float(np.median(np.abs(known - median))) / MAD_OF_SIGMA
+            spread[:, place] = median, max(sigma, figure.resolution)
+    return spread
 
 
-def find_outliers(items: Sequence[Mapping[str, float]]) -> list[list[Finding]]:
-    """Findings of each item of one task; none where fewer than MIN_ITEMS have a figure."""
-    found: list[list[Finding]] = [[] for _ in items]
-    for figure in FIGURES:
-        owners = [place for place, figures in enumerate(items) if figure.name in figures]
-        if len(owners) < MIN_ITEMS:
-            continue
-        values = np.array([items[place][figure.name] for place in owners])
-        median = float(np.median(values))
-        scores = robust_scores(values, resolution=figure.resolution)
-        for place, value, score in zip(owners, values.tolist(), scores.tolist(), strict=True):
-            if {"both": abs(score), "high": score, "low": -score}[figure.bad] <= MAX_SCORE:
-                continue
-            one = Finding(
-                code="outlier",
-                message=f"{figure.label} {figure.text(value)}, usually {figure.text(median)}",
-                figure=figure.name,
-                value=value,
-                median=median,
-                score=score,
-            )
-            found[place].append(one)
+def outlier_scores(
+    values: Float64[np.ndarray, "items figures"], spread: Spread
+) -> Float64[np.ndarray, "items figures"]:
+    """Absolute deviations in scales where they are findings, 0 elsewhere."""
+    scores = (values - spread[0]) / spread[1]
+    bad = np.where(_SIGNS == 0, np.abs(scores), _SIGNS * scores)
+    return np.where(bad > MAX_SCORE, bad, 0.0)
+
+
+def outliers_of(figures: Mapping[str, float], spread: Spread | None) -> list[Finding]:
+    """Findings of an item of a group with this spread; none where it has too few items."""
+    found: list[Finding] = []
+    if spread is None:
+        return found
+    values = figure_row(figures)
+    for place in np.flatnonzero(outlier_scores(values[None], spread)[0]):
+        figure, value, median = FIGURES[place], float(values[place]), float(spread[0, place])
+        one = Finding(
+            code="outlier",
+            message=f"{figure.label} {figure.text(value)}, usually {figure.text(median)}",
+            figure=figure.name,
+            value=value,
+            median=median,
+            score=(value - median) / float(spread[1, place]),
+        )
+        found.append(one)
     return found
+
+
+def figure_row(figures: Mapping[str, float]) -> Float64[np.ndarray, " figures"]:
+    """Figures in the order of FIGURES; NaN where an item lacks one."""
+    return np.array([figures.get(figure.name, np.nan) for figure in FIGURES])
 
 
 def beyond_limits(

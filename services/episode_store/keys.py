@@ -365,12 +365,12 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
     router = APIRouter(prefix="/v1/enrolments", tags=["enrolments"])
 
     @router.get("", dependencies=[MAY_ENROL])
-    def listing() -> StationEnrolments:
+    def list_enrolments() -> StationEnrolments:
         """List enrolled, waiting and revoked stations."""
         return enrolments.listing()
 
     @router.post("", status_code=201)
-    def issue(
+    def issue_enrolment(
         body: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
     ) -> EnrolmentToken:
         """Issue a one-time token for a station, valid for 15 minutes."""
@@ -379,7 +379,7 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
 
     @router.post("/exchange", status_code=201)
     @takes({JSON: KIB}, needs_key=False)
-    def exchange(given: UseToken, request: Request, response: Response) -> StationKey:
+    def exchange_enrolment(given: UseToken, request: Request, response: Response) -> StationKey:
         """Exchange a token for a key of the station's own, once."""
         response.headers["cache-control"] = "no-store"
         client = request.client.host if request.client else "unknown"
@@ -392,7 +392,7 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
             raise
 
     @router.post("/{station}/revoke")
-    def revoke(station: str, by: Annotated[str, MAY_ENROL]) -> StationEnrolments:
+    def revoke_enrolment(station: str, by: Annotated[str, MAY_ENROL]) -> StationEnrolments:
         """Refuse the key of a station from now on, or its unused token."""
         enrolments.revoke(station, by=by)
         return enrolments.listing()

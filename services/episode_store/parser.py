@@ -1,6 +1,7 @@
 """Command line of `dextouch store`; importing it opens no store."""
 
 import argparse
+import math
 from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json
@@ -17,6 +18,17 @@ def seconds_of(text: str) -> float:
             f"got {text!r}, expected a number and one of s m h d, such as 30d"
         )
     return int(text[:-1]) * factor
+
+
+def _seconds(text: str) -> float:
+    """Parse seconds of an item, for argparse; a year is more than any has."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not abs(seconds) < 366 * _UNITS["d"]:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected seconds, such as 2.5")
+    return seconds
 
 
 def store_parser() -> argparse.ArgumentParser:
@@ -60,6 +72,7 @@ def store_parser() -> argparse.ArgumentParser:
     repairing.add_argument(
         "--from", dest="source", metavar="URL", help="intact copy of the store to repair from"
     )
+    _add_edits(commands, kind)
     does = "move items to the trash, or delete them permanently"
     _add_delete(_command(commands, kind, "delete", does, "take-7 take-8"))
     _add_deletions(_command(commands, shared, "deletions", _DELETIONS))
@@ -82,9 +95,76 @@ def store_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: CommandParser) -> None:
+    """Add the commands that make new items of others."""
+    edit = CommandParser(add_help=False)
+    _add_dry_run(edit)
+    edit.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the source as superseded, not in the trash",
+    )
+    edit.add_argument(
+        "--as", dest="new_id", metavar="ID", help="of the result (default: ID-trimmed-1 …)"
+    )
+    edit.add_argument(
+        "--outcome",
+        choices=("keep", "success", "failure", "unknown"),
+        help="of the result; needed where the source's may not hold any more",
+    )
+    both = (kind, edit)
+    does = "write a span of an episode or recording as a new one"
+    trim = _command(commands, both, "trim", does, "take-7 --from 1.5 --to 8 --outcome keep")
+    trim.add_argument("id", metavar="ID", help="of the source")
+    _add_span(trim, "seconds after step 0 of an episode or the start of a recording")
+    trim.add_argument(
+        "--steps", type=int, nargs=2, metavar=("FIRST", "STOP"), help="steps FIRST … STOP - 1"
+    )
+    trim.add_argument(
+        "--exact", action="store_true", help="encode H.264 anew where a group is cut in two"
+    )
+    does = "write items with other attributes as new ones"
+    usual = "take-7 take-8 --instruction 'stand the bottle up'"
+    relabel = _command(commands, both, "relabel", does, usual)
+    relabel.add_argument("ids", nargs="+", metavar="ID", help="of the sources")
+    relabel.add_argument("--task", metavar="TASK", help="new task")
+    relabel.add_argument("--instruction", metavar="TEXT", help="new instruction")
+    relabel.add_argument("--operator", metavar="P", help="new pseudonym of the operator")
+    does = "list, add or remove notes on time ranges of an item"
+    note = _command(commands, (kind,), "note", does, "take-7 --from 2 --to 3.5 --text 'it slips'")
+    note.add_argument("id", metavar="ID", help="of an episode or recording")
+    _add_span(note, "seconds, as of trim")
+    note.add_argument("--text", metavar="TEXT", help="add a note of this text")
+    note.add_argument("--author", metavar="P", help="pseudonym of who writes it")
+    note.add_argument("--remove", type=int, metavar="N", help="remove the note of this number")
+    own = CommandParser(add_help=False)
+    add_json(own)
+    _add_dry_run(own)
+    does = "copy all items of stores into one"
+    merge = _command(
+        commands, (own,), "merge", does, "bench-1/store bench-2/store --into data/store"
+    )
+    merge.add_argument("sources", nargs="+", metavar="STORE", help="to copy from, unchanged")
+    merge.add_argument(
+        "--into", dest="store", required=True, metavar="URL", help="store to copy into"
+    )
+    merge.add_argument(
+        "--rename", action="store_true", help="give items a new id where it is taken"
+    )
+
+
+def _add_dry_run(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--dry-run", action="store_true", help="only say what would happen")
+
+
+def _add_span(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument("--from", dest="from_s", type=_seconds, metavar="S", help=f"start: {what}")
+    command.add_argument("--to", dest="to_s", type=_seconds, metavar="S", help="end, not included")
+
+
 def _command(
     commands: "argparse._SubParsersAction[CommandParser]",
-    shared: CommandParser,
+    shared: CommandParser | tuple[CommandParser, ...],
     name: str,
     does: str,
     usual: str = "",
@@ -92,7 +172,7 @@ def _command(
     """Add a command; `usual` are the arguments of its example."""
     return commands.add_parser(
         name,
-        parents=[shared],
+        parents=shared if isinstance(shared, tuple) else [shared],
         help=does,
         description=f"{does[0].upper()}{does[1:]}.",
         epilog=f"example:\n  dextouch store {name} {usual}".rstrip(),

@@ -99,14 +99,14 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
     max_steps, max_bytes = settings.max_window_steps, settings.max_answer_bytes
 
     @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
-    def attributes(recording_id: str) -> RecordingAttributes:
+    def get_recording_attributes(recording_id: str) -> RecordingAttributes:
         """Attributes of a finished recording."""
         return store.recording(recording_id).attributes
 
     @router.get(
         "/recordings/{recording_id}/streams/{stream}", tags=["recordings"], **_answers(MSGPACK)
     )
-    def recording_samples(
+    def get_recording_samples(
         recording_id: str,
         stream: str,
         span: Annotated[SpanQuery, Query()],
@@ -118,7 +118,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
-    def episode(episode_id: str) -> EpisodeDetail:
+    def get_episode(episode_id: str) -> EpisodeDetail:
         """Attributes of an episode."""
         reader = store.open(episode_id)
         return EpisodeDetail(
@@ -128,7 +128,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         )
 
     @router.get("/episodes/{episode_id}/windows", tags=["episodes"], **_answers(WINDOW_MSGPACK))
-    def window(
+    def get_episode_window(
         episode_id: str, query: Annotated[WindowQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
@@ -139,7 +139,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
 
     @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **_answers(MSGPACK))
-    def episode_samples(
+    def get_episode_samples(
         episode_id: str,
         stream: str,
         span: Annotated[SpanQuery, Query()],
@@ -293,16 +293,13 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
     """Create the routes below /v1/playback; sizes are checked before reading."""
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
 
-    def opened(kind: ItemKind, item_id: str) -> Reader:
-        return store.open(item_id) if kind == "episode" else store.recording(item_id)
-
     @router.get("/{kind}/{item_id}")
-    def about(kind: ItemKind, item_id: str) -> Playback:
+    def get_playback(kind: ItemKind, item_id: str) -> Playback:
         """What can be played of an item: its streams with their extents and longest gaps."""
-        return playback_of(opened(kind, item_id))
+        return playback_of(store.open_item(kind, item_id))
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
-    def images(
+    def get_playback_images(
         kind: ItemKind,
         item_id: str,
         camera: str,
@@ -310,24 +307,24 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         if_none_match: IfNoneMatch = None,
     ) -> Response:
         """JPEG images of a span: arrays `t_ns`, `num_bytes` of each, and `data`, one by one."""
-        reader = opened(kind, item_id)
+        reader = store.open_item(kind, item_id)
         read = partial(_images, reader, camera, query, settings.max_answer_bytes)
         return response(etag_of(reader, f"jpeg {camera}", query), if_none_match, read, MSGPACK)
 
     @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
-    def signals(
+    def get_playback_signals(
         kind: ItemKind,
         item_id: str,
         query: Annotated[SignalsQuery, Query()],
         if_none_match: IfNoneMatch = None,
     ) -> Response:
         """Lowest and highest value per bin of time: arrays `NAME/low`, `NAME/high` [points]."""
-        reader = opened(kind, item_id)
+        reader = store.open_item(kind, item_id)
         read: Callable[[], bytes] = partial(reduce_signals, reader, query)
         return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
 
     @router.get("/episode/{item_id}/robot_hands", **_answers(MSGPACK))
-    def hands(
+    def get_playback_robot_hands(
         item_id: str, query: Annotated[RobotHandsQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Points of both robot hands in the world, from the actions of a span."""
@@ -401,7 +398,8 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
     descriptor = reader.streams[camera]
     if descriptor.kind != "image":
         raise InvalidInputError(f"images: {camera!r} is a stream of kind {descriptor.kind!r}")
-    form = ImageForm(half_size=query.half_size)
+    is_colour = len(descriptor.shape) == 3
+    form = ImageForm(half_size=query.half_size and is_colour)
     image_bytes = int(np.prod(form.shape(descriptor.shape)))
     allowed = max(1, min(MAX_IMAGES, max_bytes // image_bytes))
     text = f"the span holds {count} images, expected at most {allowed}; ask for a shorter time"
@@ -416,7 +414,7 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
         encoded = [images[index - first] for index in indices.tolist()]
     else:
         pictures = reader.images_at(camera, indices, form=form)
-        encoded = [encode_jpeg(picture, quality=QUALITY) for picture in pictures]
+        encoded = [encode_jpeg(_in_colour(picture), quality=QUALITY) for picture in pictures]
     return pack(
         {"camera": camera},
         {
@@ -425,6 +423,16 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
             "data": np.frombuffer(b"".join(encoded), dtype=np.uint8),
         },
     )
+
+
+def _in_colour(picture: np.ndarray) -> np.ndarray:
+    """An image with three channels; one of 16 bits relative to its largest value."""
+    if picture.ndim == 3:
+        return picture
+    if picture.dtype != np.uint8:
+        largest = max(1, int(picture.max()))
+        picture = (picture.astype(np.uint64) * 255 // largest).astype(np.uint8)
+    return np.repeat(picture[..., None], 3, axis=-1)
 
 
 def reduce_signals(reader: Reader, query: SignalsQuery) -> bytes:

@@ -83,7 +83,7 @@ def uploads_router(
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create(given: Attributes, sender: Writer) -> RecordingStatus:
+    def create_recording(given: Attributes, sender: Writer) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
@@ -103,7 +103,7 @@ def uploads_router(
         dependencies=[MAY_WRITE],
     )
     @takes({OCTETS: AS_SET})
-    async def put_batch(
+    async def upload_batch(
         recording_id: str,
         stream: str,
         number: Annotated[int, Path(ge=0)],
@@ -134,7 +134,7 @@ def uploads_router(
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def finish(recording_id: str, body: Finish, sender: Writer) -> RecordingStatus:
+    def finish_recording(recording_id: str, body: Finish, sender: Writer) -> RecordingStatus:
         """Commit a complete upload."""
         started = time.perf_counter()
         with metrics.counting_refusals(), _unless(partial(ingest.is_finished, recording_id)):
@@ -145,7 +145,7 @@ def uploads_router(
         return status
 
     @router.get("/recordings/{recording_id}", tags=["recordings"], dependencies=[MAY_READ])
-    def status(recording_id: str, sender: Reader) -> RecordingStatus:
+    def get_recording(recording_id: str, sender: Reader) -> RecordingStatus:
         """Status of an upload, for those who may continue it, or of a finished recording."""
         return ingest.status(recording_id, sender)
 
@@ -157,12 +157,12 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
     router = APIRouter(prefix="/v1")
 
     @router.get("/uploads", tags=["uploads"], dependencies=[MAY_READ])
-    def listing(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
+    def list_uploads(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
         """List unfinished uploads that have been idle for `idle_s`."""
         return limits.idle(idle_s=idle_s)
 
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
-    def expire(body: ExpireUploads) -> UploadList:
+    def expire_uploads(body: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
         gone = []
         for upload in limits.idle(idle_s=body.idle_s).uploads:
@@ -192,42 +192,44 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings", tags=["recordings"])
-    def recordings(query: Annotated[RecordingQuery, Query()]) -> RecordingList:
+    def list_recordings(query: Annotated[RecordingQuery, Query()]) -> RecordingList:
         """List finished recordings that match all filters."""
         return catalog.recordings(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/episodes", tags=["episodes"])
-    def episodes(query: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
+    def list_episodes(query: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
         """List episodes that match all filters."""
         return catalog.episodes(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/hours", tags=["catalog"])
-    def hours(query: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
+    def get_hours(query: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
         return catalog.hours(query)
 
     @router.get("/catalog/hours/{field}", tags=["catalog"])
-    def hours_by(field: HoursField, query: Annotated[HoursFilter, Query()]) -> HoursByField:
+    def get_hours_by_field(
+        field: HoursField, query: Annotated[HoursFilter, Query()]
+    ) -> HoursByField:
         """Hours of the matching episodes by the values of one field, and by their reviews."""
         return catalog.hours_by(field, query)
 
     @router.get("/catalog/items", tags=["catalog"])
-    def items(query: Annotated[ItemQuery, Query()]) -> CatalogItems:
+    def list_items(query: Annotated[ItemQuery, Query()]) -> CatalogItems:
         """List recordings and episodes in one list; both as takes by default."""
         return catalog.items(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/groups", tags=["catalog"])
-    def groups() -> ComparedGroups:
+    def list_compared_groups() -> ComparedGroups:
         """Groups of items that are compared to find outliers, and whether they are large enough."""
         return catalog.groups()
 
     @router.get("/catalog/values", tags=["catalog"])
-    def values() -> CatalogValues:
+    def list_values() -> CatalogValues:
         """Tasks, operators and stations that occur in the store."""
         return catalog.values()
 
     @router.get("/catalog/lineage/{kind}/{item_id}", tags=["catalog"])
-    def lineage(kind: ItemKind, item_id: str) -> Lineage:
+    def get_lineage(kind: ItemKind, item_id: str) -> Lineage:
         """What an item was made from, and what was made from it."""
         return catalog.lineage(kind, item_id)
 
@@ -240,7 +242,7 @@ def reviews_router(catalog: Catalog) -> APIRouter:
 
     @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def review(body: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+    def review_items(body: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
         """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
         review = None
         if body.verdict is not None:
@@ -262,7 +264,7 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1/trash", tags=["trash"])
 
     @router.get("", dependencies=[MAY_READ])
-    def contents(limit: Annotated[int, Query(ge=1)] = 100) -> TrashContents:
+    def list_trash(limit: Annotated[int, Query(ge=1)] = 100) -> TrashContents:
         """Deleted episodes and recordings, newest first; refused for a store in a bucket."""
         entries = [entry for entry in store.trash_list() if entry.kind in KINDS]
         newest = entries[::-1][: min(limit, max_page)]
@@ -280,13 +282,13 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
         return TrashContents(items=tuple(items), num_items=len(entries))
 
     @router.post("", dependencies=[MAY_DELETE])
-    def delete(body: MoveItems) -> MovedItems:
+    def delete_items(body: MoveItems) -> MovedItems:
         """Move items to the trash; refused for a store in a bucket, which has none."""
         store.require_trash()
         return _move(body, lambda item: store.delete(item.id, kind=item.kind))
 
     @router.post("/restore", dependencies=[MAY_DELETE])
-    def restore(body: MoveItems) -> MovedItems:
+    def restore_items(body: MoveItems) -> MovedItems:
         """Restore items from the trash, each the one that was deleted last."""
         store.require_trash()
         return _move(body, lambda item: store.restore(item.id, kind=item.kind))
@@ -362,7 +364,7 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
         return objects
 
     @router.get("/catalog/clicks", dependencies=[MAY_READ])
-    def queue(
+    def list_episodes_to_click(
         task: Annotated[str | None, Query(max_length=128)] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 20,
     ) -> ClickQueue:
@@ -370,14 +372,14 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
         return _queue(catalog, described(), task, limit)
 
     @router.get("/catalog/clicks/file", dependencies=[MAY_READ])
-    def file() -> ObjectClicks:
+    def get_clicks_file() -> ObjectClicks:
         """The described objects and all clicks in the store, for `train world-model --clicks`."""
         known = described()
         stored = {name: one.clicks for name, one in catalog.clickable().items() if one.clicks}
         return known.model_copy(update={"episodes": known.episodes | stored})
 
     @router.get("/episodes/{episode_id}/clicks", dependencies=[MAY_READ])
-    def clicked(episode_id: str) -> ClickedEpisode:
+    def get_episode_clicks(episode_id: str) -> ClickedEpisode:
         """Clicks on the objects of an episode, and what its first image is."""
         clicks = store.clicks(episode_id) or EpisodeClicks(objects={})
         try:
@@ -388,7 +390,7 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
 
     @router.post("/episodes/{episode_id}/clicks", dependencies=[MAY_DELETE])
     @takes({JSON: 16 * KIB})
-    def click(
+    def save_episode_clicks(
         episode_id: str, clicks: Annotated[EpisodeClicks, Depends(JsonBody(EpisodeClicks))]
     ) -> ClickedEpisode:
         """Keep clicks in place of earlier ones, none to remove them; wrong ones are refused."""
@@ -404,7 +406,7 @@ def _queue(catalog: Catalog, objects: ObjectClicks, task: str | None, limit: int
     chosen = tasks[0] if task is None and tasks else task or ""
     if chosen not in objects.tasks:
         raise NotFoundError(f"clicks: task {chosen!r} has no objects; {', '.join(tasks)} have")
-    found = {name: one for name, one in catalog.clickable().items() if one.item.task == chosen}
+    found = {name: one for name, one in catalog.clickable().items() if one.task == chosen}
     # In the order of recording, the first takes would be those of one person and one day.
     names = sorted(found, key=lambda name: (zlib.crc32(name.encode()), name))
     marked = [name for name in names if found[name].clicks]

@@ -70,3 +70,12 @@ class EpisodeStoreSettings(ServiceSettings):
         default=321, ge=1, le=10_000, description="steps of one window of an episode"
     )
     max_answer_bytes: int = Field(default=64 * 2**20, ge=1024, description="bytes of one response")
+    max_downloads: int = Field(
+        default=2, ge=1, le=64, description="concurrent downloads; more are refused with 429"
+    )
+    max_download_items: int = Field(
+        default=100, ge=1, le=10_000, description="items of one download"
+    )
+    max_download_bytes: int = Field(
+        default=4 * 2**30, ge=1024, description="stored bytes of the items of one download"
+    )

@@ -21,7 +21,10 @@ from dextouch.errors import (
     NotFoundError,
     UnavailableError,
 )
+from dextouch.installation import install_command
 
+# Of the services, which have weights of their own.
+_PACKAGE = Path(__file__).parents[1]
 MAX_FILE_BYTES = 64 * 2**20
 History = TypeVar("History", bound=BaseModel)
 Network = TypeVar("Network", bound=nn.Module)
@@ -104,10 +107,12 @@ def read_history(path: Path, history: type[History], key: str) -> History:
 
 
 def _check_exists(path: Path) -> None:
-    if not path.is_file():
-        raise NotFoundError(
-            f"checkpoint: no file {path.name} in {path.parent}; check the path, or train one first"
-        )
+    if path.is_file():
+        return
+    do = "check the path, or train one first"
+    if path.is_relative_to(_PACKAGE):
+        do = f"these weights are a package of their own: `{install_command('model')}`"
+    raise NotFoundError(f"checkpoint: no file {path.name} in {path.parent}; {do}")
 
 
 def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers, positive
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
+from dextouch.errors import InvalidInputError
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
 from services.twin.names import (
     DEFAULT_MIX,
@@ -26,6 +28,19 @@ from services.world_model.shipped_checkpoints import default_checkpoint
 
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
+# Options of `dextouch export` and `dextouch import` that other formats would ignore.
+_FORMATS_OF = {
+    "append": ("lerobot",),
+    "fps": ("lerobot",),
+    "jpeg_quality": ("mcap",),
+    "k_head": ("lerobot",),
+    "layout": ("mcap",),
+    "license": ("lerobot",),
+    "repo_id": ("lerobot",),
+    "timeline": ("rrd",),
+    "touch_images": ("mcap",),
+    "touch_samples": ("lerobot",),
+}
 _TRAINING_DATA = """\
 Record twin episodes for training and testing networks.
 
@@ -111,25 +126,34 @@ All keys of a study file: docs/studies.md
 """
 _EXPORT_HELP = """\
 formats:
-  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
+  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet, card
   umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
            (cannot be imported)
   mcap     one file per episode or recording, every sample; opens in Foxglove
-  rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
+  rrd      one file per episode or recording, every sample; opens in Rerun
+           (imported as a recording of what it shows)
 
 examples:
   dextouch export --format mcap stand-bottle-0003 --to take.mcap
   dextouch export --format mcap --kind recording --operator p17 --to takes/
+  dextouch export --format mcap --outcome success --after 2026-05-04 --to takes/
   dextouch export --format lerobot --task stand_bottle --to data/lerobot
+  dextouch export --format lerobot --to data/lerobot --append --license cc-by-4.0
   dextouch export --format umi --domain robot --to robot.zarr.zip
   dextouch export --format rrd stand-bottle-0003 --to take.rrd
 """
 _IMPORT_HELP = """\
 examples:
-  dextouch import --format mcap take.mcap
+  dextouch import take.mcap --map camera_head=/camera/color/image_raw/compressed \\
+      --map wrist_left=/tf:left_hand --map tactile_left=/glove/left
   dextouch import --format mcap takes/
-  dextouch import --format lerobot data/lerobot --id-prefix theirs-
+  dextouch import run.rrd --timeline frame_time
+  dextouch import data/lerobot --id-prefix theirs-
+  dextouch import aloha --map camera_head=observation.images.top --k-head 600,600,320,240
 
+Files that DexTouch exported come back as they were. Every other mcap or rrd file becomes a
+recording of the streams that it has, and a report says what was not imported, and why. So does
+every episode of a LeRobot data set (v2 or v3), unless it has our actions and a head camera.
 What each format keeps and loses: docs/bridges.md
 """
 TASKS = ("stand_bottle", "stack_bowls")
@@ -179,6 +203,16 @@ def _whole_fps(text: str) -> int:
             f"got {text!r}, expected a whole number, since LeRobot counts whole frames{near}"
         )
     return round(rate_hz)
+
+
+def _moment(text: str) -> datetime:
+    """A day, which begins at midnight here, or a time, which is that of here if it has no zone."""
+    try:
+        return datetime.fromisoformat(text).astimezone()
+    except (ValueError, OverflowError) as error:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a day or a time such as 2026-05-04 or 2026-05-04T12:30+02:00"
+        ) from error
 
 
 def _keywords(text: str) -> dict[str, Any]:
@@ -377,6 +411,23 @@ def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _add_filters(parser: argparse.ArgumentParser) -> None:
+    """Add the filters of the dashboard's list, by the names that `ItemFilter` has."""
+    about = "only items that match all of them; a DAY may be a time, too"
+    add = parser.add_argument_group("filters", about).add_argument
+    add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
+    add("--task", metavar="TASK", help="of this task")
+    add("--operator", metavar="P", help="of this operator")
+    add("--station", metavar="NAME", help="of this station")
+    add("--domain", choices=("human", "robot"), help="of this domain")
+    add("--outcome", choices=("success", "failure", "not_judged"), help="with this outcome")
+    add("--origin", choices=("recorded", "twin", "imagined"), help="of this origin")
+    reviews = ("accepted", "rejected", "not_reviewed")
+    add("--review", choices=reviews, help="with this review")
+    add("--after", type=_moment, metavar="DAY", help="recorded on this day or later")
+    add("--before", type=_moment, metavar="DAY", help="recorded before this day")
+
+
 def export_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch export`."""
     parser = _bridge_parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
@@ -388,19 +439,59 @@ def export_parser() -> argparse.ArgumentParser:
     add("--to", required=True, type=Path, metavar="PATH", help=to)
     kinds = ("episode", "recording")
     add("--kind", choices=kinds, default="episode", help="kind of the ids (%(default)s)")
-    add("--task", metavar="TASK", help="only episodes of this task")
-    add("--domain", choices=("human", "robot"), help="only episodes of this domain")
-    add("--operator", metavar="P", help="only items of this operator")
+    _add_filters(parser)
     rejected = "also items that were rejected in review; ids that are given always are"
     add("--with-rejected", action="store_true", help=rejected)
-    add("--force", action="store_true", help="replace existing files")
+    old = parser.add_mutually_exclusive_group()
+    old.add_argument("--force", action="store_true", help="replace existing files")
+    grow = "lerobot: add the episodes that an existing data set lacks"
+    old.add_argument("--append", action="store_true", help=grow)
     quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
     add("--jpeg-quality", type=int, metavar="1…100", help=quality)
+    pictures = "mcap: pictures of touch beside the numbers (default: with)"
+    add("--touch-images", action=argparse.BooleanOptionalAction, default=True, help=pictures)
+    layout = "mcap: write a layout for Foxglove there (default: beside the files in a folder)"
+    add("--layout", type=Path, metavar="PATH", help=layout)
     rate = "lerobot: frames per second (default: model rate)"
     add("--fps", type=_whole_fps, metavar="N", help=rate)
     name = "lerobot: name of the data set (%(default)s)"
     add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
+    licence = "lerobot: licence on the data set's card, such as cc-by-4.0"
+    add("--license", metavar="ID", help=licence)
+    touch = "lerobot: also every touch sample between two frames"
+    add("--touch-samples", action="store_true", help=touch)
     return parser
+
+
+def check_format_options(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, form: str
+) -> None:
+    """Raise InvalidInputError for an option that a format of the parser's command has no use of."""
+    is_import = "path" in vars(options)
+    for name, forms in _FORMATS_OF.items():
+        used = (*forms, "rrd") if is_import and name == "layout" else forms
+        given = getattr(options, name, None)
+        if name in vars(options) and given != parser.get_default(name) and form not in used:
+            flag = "--" + name.replace("_", "-")
+            flag = "--no-touch-images" if name == "touch_images" else flag
+            raise InvalidInputError(f"{flag} is for format {' or '.join(used)}, got {form!r}")
+
+
+class _Mapping(argparse.Action):
+    """Collects NAME=SOURCE; a name that comes twice is refused."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        name, found, source = str(values).partition("=")
+        known = getattr(namespace, self.dest)
+        if not (name and found and source) or name in known:
+            parser.error(f"{option_string}: got {values!r}, expected STREAM=SOURCE, each once")
+        setattr(namespace, self.dest, known | {name: source})
 
 
 def import_parser() -> argparse.ArgumentParser:
@@ -408,11 +499,41 @@ def import_parser() -> argparse.ArgumentParser:
     parser = _bridge_parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
-    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
-    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
-    images = "lerobot: unit of stored images (%(default)s)"
-    add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
+    forms = ("lerobot", "mcap", "rrd")
+    add("--format", choices=forms, help="input format (default: that of the content)")
+    prefix = "prefix of every id, but not of our own mcap exports"
+    add("--id-prefix", default="", metavar="TEXT", help=prefix)
+    images = "unit of images (default: as they are, and h264 for video that must be decoded)"
+    add("--images", choices=("h264", "jpeg", "rgb8"), help=images)
+    mapped = "name the stream of a topic, entity or feature; repeat it for more"
+    add("--map", action=_Mapping, default={}, metavar="STREAM=SOURCE", help=mapped)
+    layout = "mcap, rrd: layout of mapped tactile streams (default: that of our own glove)"
+    add("--layout", type=Path, metavar="FILE", help=layout)
+    timeline = "rrd: timeline of the samples (default: the only one with times)"
+    add("--timeline", metavar="NAME", help=timeline)
+    task = "task (default: the data set's, or imported)"
+    add("--task", metavar="TASK", help=task)
+    add("--instruction", default="", metavar="TEXT", help="the task's sentence")
+    domain = "who acts (default: lerobot robot, others human)"
+    add("--domain", choices=("human", "robot"), help=domain)
+    matrix = "lerobot: matrix of camera_head in pixels, CX and CY as OpenCV has them plus 0.5"
+    add("--k-head", type=_camera_matrix, metavar="FX,FY,CX,CY", help=matrix)
+    rate = "lerobot: frames per second instead of the data set's times"
+    add("--fps", type=float, metavar="HZ", help=rate)
     return parser
+
+
+def _camera_matrix(text: str) -> tuple[tuple[float, float, float], ...]:
+    """Parse FX,FY,CX,CY, for argparse."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        fx = fy = cx = cy = math.nan
+    if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected FX,FY,CX,CY such as 600,600,320,240"
+        )
+    return ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,11 @@ import gc
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import uvicorn
 from fastapi import FastAPI
@@ -20,6 +21,8 @@ BACKLOG = 128
 START_TIMEOUT_S = 60.0
 START_CHECK_S = 0.01
 GRACE_S = 10
+
+T = TypeVar("T")
 
 
 class Server(uvicorn.Server):
@@ -79,6 +82,13 @@ def bind(name: str, *, host: str, port: int) -> BoundAddress:
     return BoundAddress(name, listener)
 
 
+def run_on_event_loop(main: Coroutine[Any, Any, T]) -> T:
+    """`asyncio.run` on the event loop that uvicorn selects: uvloop's where it is installed."""
+    loop_factory = uvicorn.Config("", log_config=None).get_loop_factory()
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        return runner.run(main)
+
+
 async def serve_all(
     placed: Sequence[tuple[BoundAddress, FastAPI]],
     *,
@@ -129,6 +139,8 @@ def stop_on_signals(stop: asyncio.Event) -> None:
     def on_signal(number: signal.Signals) -> None:
         stop.set()
         loop.remove_signal_handler(number)
+        # Python's own handler of SIGINT would print what each service was doing.
+        signal.signal(number, signal.SIG_DFL)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, on_signal, number)

@@ -8,6 +8,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from dextouch.errors import UnavailableError
+from dextouch.installation import install_command
 from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.acquisition import app
@@ -38,7 +39,7 @@ def load_robot_check(side: Side, calibration: Mapping[str, Matrix]) -> "RobotHan
         return RobotHandCheck(side, calibration)
     except ModuleNotFoundError as error:
         raise UnavailableError(
-            f"{error.name} is not installed; install it with pip install 'dextouch-wm[align]'"
+            f"{error.name} is not installed; install it with {install_command('align')}"
         ) from error
     finally:
         gc.freeze()

@@ -136,6 +136,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="PATH", help=JSON_HELP)
 
 
+def say(line: str) -> None:
+    """Print a line that may hold text of others."""
+    sys.stdout.write(printable(line) + "\n")
+
+
 def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -> None:
     """Write the result of a command as JSON to a file; `-` is standard output, None writes nothing.
 

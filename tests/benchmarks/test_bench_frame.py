@@ -156,7 +156,7 @@ def test_refusals_are_one_line_without_a_traceback(monkeypatch, capsys):
 
     monkeypatch.setattr(command, "main", without_mujoco)
     assert entry_point.main(["twin"]) == 3
-    assert "dextouch-wm[twin]" in capsys.readouterr().err
+    assert "[twin]" in capsys.readouterr().err
 
 
 def test_a_result_on_standard_output_stands_alone(fake_stage, capsys):

@@ -6,6 +6,7 @@ The table is the intention: it does not come from the routes' own declarations. 
 
 import httpx
 import pytest
+from fastapi.routing import APIRoute
 
 from dextouch.serving.keys import ApiKey
 from dextouch.serving.refusals import WrongKeys
@@ -31,6 +32,8 @@ SCOPES = (
 )
 # Needs no key on any service: probes, and the description of the routes.
 PUBLIC = {"GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json"}
+PUBLIC |= {"GET /docs", "GET /docs/page.js"}
+PUBLIC |= {"GET /docs/swagger-ui.css", "GET /docs/swagger-ui-bundle.js"}
 # Needs a one-time token in place of a key.
 BY_TOKEN = {"episode_store": {"POST /v1/enrolments/exchange"}}
 # An application of its own, with the same keys (tests/unit/acquisition/test_practice.py).
@@ -105,12 +108,18 @@ TABLE = {
         "GET /v1/catalog/clicks/file": "store_read",
         "GET /v1/episodes/{episode_id}/clicks": "store_read",
         "POST /v1/episodes/{episode_id}/clicks": "store_delete",
+        "POST /v1/episodes/{episode_id}/trim": "store_delete",
+        "POST /v1/catalog/relabel": "store_delete",
+        "GET /v1/notes/{kind}/{item_id}": "store_read",
+        "POST /v1/notes/{kind}/{item_id}": "store_delete",
+        "POST /v1/notes/{kind}/{item_id}/remove": "store_delete",
         "GET /v1/catalog/values": "store_read",
         "GET /v1/catalog/lineage/{kind}/{item_id}": "store_read",
         "GET /v1/playback/{kind}/{item_id}": "store_read",
         "GET /v1/playback/{kind}/{item_id}/images/{camera}": "store_read",
         "GET /v1/playback/{kind}/{item_id}/signals": "store_read",
         "GET /v1/playback/episode/{item_id}/robot_hands": "store_read",
+        "POST /v1/downloads": "store_read",
         "GET /v1/trash": "store_read",
         "POST /v1/trash": "store_delete",
         "POST /v1/trash/restore": "store_delete",
@@ -250,6 +259,29 @@ def test_every_route_has_a_scope_or_is_public(keyed):
     pages = RATING_PAGE if service == "rating" else set()
     others = BY_TOKEN.get(service, set()) | MOUNTED.get(service, set())
     assert operations(app) == set(TABLE[service]) | PUBLIC | pages | others
+
+
+@pytest.mark.parametrize("service", APPS)
+async def test_files_without_a_key_are_those_of_the_pages_whatever_is_asked(service, tmp_path):
+    app = APPS[service](tmp_path, api_keys=KEYS)
+    for route in all_routes(app):
+        if isinstance(route, APIRoute) and not route.include_in_schema and "/v1/" not in route.path:
+            assert not route.dependant.query_params, route.path
+    pages = RATING_PAGE if service == "rating" else set()
+    paths = sorted(one.split()[1] for one in (PUBLIC | pages) - {"GET /metrics"})
+    async with client_of(app) as client:
+        for path in paths:
+            whole = await client.get(path)
+            for name in ("name", "path", "folder", "file"):
+                other = await client.get(path, params={name: "/etc/passwd"})
+                assert (other.status_code, other.content) == (whole.status_code, whole.content)
+        for path in ("../guard.py", "%2e%2e/guard.py", "..%2fguard.py", "%2fetc%2fpasswd"):
+            assert (await client.get(f"/docs/{path}")).status_code == 404, path
+        whole = await client.get("/docs")
+        assert "frame-ancestors 'none'" in whole.headers["content-security-policy"]
+        again = await client.get("/docs", headers={"if-none-match": whole.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+        assert (await client.head("/docs")).headers["content-length"] == str(len(whole.content))
 
 
 @pytest.mark.long

@@ -142,7 +142,7 @@ def test_the_policy_runs_in_the_twin_and_in_the_world_model(folder, services, ca
 
 def test_the_environment_of_the_page_runs(folder, services, capsys):
     script = folder / "try_env.py"
-    script.write_text(here(block(POLICIES, "WorldEnv("), services))
+    script.write_text(here(block(POLICIES, "gymnasium.make("), services))
     runpy.run_path(str(script))
     assert "chunks ended at step 80 success: False" in capsys.readouterr().out
 

@@ -1,15 +1,21 @@
 """The wheel, installed outside the checkout, runs `dextouch demo` and `dextouch up` by itself."""
 
 import json
+import os
+import re
 import signal
+import subprocess
+import sys
 import time
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import httpx
 import pytest
 
-from tests.system.wheel_environment import ROOT, build, own_packages
+from tests.system.wheel_environment import MAX_WHEEL_BYTES, NAME, ROOT, build, own_packages
+from tests.unit.test_licences import PROJECT, vendored_licences
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -18,6 +24,23 @@ SERVICES = {
 }
 # Of a machine that is busy with other things; the solver may be compiled first.
 READY_LIMIT_S = 900
+# A program of a user, with one mistake.
+CLIENT = """\
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.clients import RolloutClient
+from dextouch.episodes import EpisodeStore
+from dextouch_services.evaluation.settings import DEFAULT_PROBE
+
+store = EpisodeStore(Path("data/store"))
+images: np.ndarray = store.open("take").images("camera_head")
+probe: Path = DEFAULT_PROBE
+with RolloutClient("http://127.0.0.1:8086") as client:
+    print(client, images, probe)
+wrong: int = store.list()
+"""
 IMPORT_ALL = """
 import importlib, json, pkgutil
 import dextouch, dextouch_services
@@ -46,11 +69,20 @@ def files_below(folder, installed_as):
 
 
 def test_the_wheel_holds_every_file_of_both_packages(installed):
-    with zipfile.ZipFile(installed.wheel) as wheel:
-        names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    found = {}
+    for wheel in (installed.wheel, installed.weights):
+        with zipfile.ZipFile(wheel) as opened:
+            found[wheel] = {name for name in opened.namelist() if ".dist-info/" not in name}
+    names = found[installed.wheel]
     share = next(Path(name).parts[0] for name in names if ".data/" in name) / Path("data/share")
+    services = files_below(ROOT / "services", Path("dextouch_services"))
+    weights = {name for name in services if name.endswith(".safetensors")}
+    assert found[installed.weights] == weights
+    assert len(weights) == 5
+    # Clients and stations have no use for weights.
+    assert installed.wheel.stat().st_size < MAX_WHEEL_BYTES
     assert names == (
-        files_below(ROOT / "services", Path("dextouch_services"))
+        (services - weights)
         | files_below(ROOT / "shared/dextouch", Path("dextouch"))
         | files_below(ROOT / "deploy", share / "dextouch/deploy")
         | files_below(ROOT / "docs", share / "dextouch/docs")
@@ -60,10 +92,48 @@ def test_the_wheel_holds_every_file_of_both_packages(installed):
         assert path.startswith(str(installed.site_packages))
 
 
+def test_types_reach_those_who_check_theirs(installed):
+    client = installed.folder / "client.py"
+    client.write_text(CLIENT)
+    checker = [sys.executable, "-m", "mypy", "--cache-dir", os.devnull, "--python-executable"]
+    done = subprocess.run(
+        [*checker, str(installed.bin / "python"), str(client)],
+        cwd=installed.folder,
+        env={name: v for name, v in os.environ.items() if name not in {"PYTHONPATH", "MYPYPATH"}},
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    wrong = re.findall(r"client\.py:(\d+): error: .*\[([a-z-]+)\]", done.stdout)
+    expected = 1 + CLIENT.splitlines().index("wrong: int = store.list()")
+    assert wrong == [(str(expected), "assignment")], done.stdout
+
+
+def test_licences_of_what_others_wrote_are_in_the_wheel(installed):
+    (own,) = metadata.distributions(name=NAME, path=[str(installed.site_packages)])
+    told = own.metadata
+    assert told["License-Expression"] == PROJECT["license"]
+    wanted = told.get_all("License-File")
+    assert sorted(wanted) == sorted({"LICENSE", *vendored_licences()})
+    folder = next(installed.site_packages.glob("dextouch_wm-*.dist-info")) / "licenses"
+    for name in wanted:
+        assert (folder / name).read_bytes() == (ROOT / name).read_bytes()
+
+
+def test_the_version_is_told(installed):
+    version = installed.run("dextouch", "--version").strip()
+    (own,) = metadata.distributions(name=NAME, path=[str(installed.site_packages)])
+    assert version == f"dextouch {own.version}"
+
+
 def test_the_extras_name_what_every_module_imports(installed):
     absent = json.loads(installed.run("python", "-c", IMPORT_ALL, limit_s=600))
     # The viewer and Ray have extras of their own, which `all` leaves out.
-    apart = [["dextouch.bridges.rerun", "rerun"], ["dextouch_services.pipelines.ray_serve", "ray"]]
+    apart = [
+        ["dextouch.bridges.foreign_rerun", "rerun"],
+        ["dextouch.bridges.rerun", "rerun"],
+        ["dextouch_services.pipelines.ray_serve", "ray"],
+    ]
     assert sorted(absent) == apart
 
 

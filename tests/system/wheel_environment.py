@@ -19,6 +19,9 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 NAME = "dextouch-wm"
+WEIGHTS = "dextouch-wm-weights"
+# It has 3.1 MB: 0.5 MB are Swagger UI, which stations without a network show, too; 0.3 MB pictures.
+MAX_WHEEL_BYTES = 3_300_000
 # Python imports it at every start; paths of the checkout that anything opens or lists are noted.
 WATCH = """
 import os, sys
@@ -40,9 +43,10 @@ sys.addaudithook(watch)
 
 @dataclass(frozen=True)
 class WheelEnvironment:
-    """A virtual environment with the wheel, and the folder in which its commands run."""
+    """A virtual environment with the wheels, and the folder in which its commands run."""
 
     wheel: Path
+    weights: Path
     folder: Path
     notes: Path
 
@@ -80,20 +84,33 @@ class WheelEnvironment:
         return self.notes.read_text().splitlines() if self.notes.exists() else []
 
 
-def build(folder: Path, extras: tuple[str, ...]) -> WheelEnvironment:
-    """Build the wheel and an environment with it and what these extras name."""
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    made = [*pip, "wheel", "--no-deps", "--wheel-dir", str(folder / "dist"), str(ROOT)]
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+
+
+def build_wheels(folder: Path) -> tuple[Path, Path]:
+    """Build the wheels of code and weights."""
+    sources = [str(ROOT), str(ROOT / "weights")]
+    made = [*PIP, "wheel", "--no-deps", "--wheel-dir", str(folder), *sources]
     subprocess.run(made, check=True, timeout=600)
-    (wheel,) = (folder / "dist").glob("*.whl")
+    (wheel,), (weights,) = folder.glob("dextouch_wm-*"), folder.glob("dextouch_wm_weights-*")
+    return wheel, weights
+
+
+def build(folder: Path, extras: tuple[str, ...]) -> WheelEnvironment:
+    """Build the wheels and an environment with them and what these extras name."""
+    wheel, weights = build_wheels(folder / "dist")
     venv.create(folder / "venv", with_pip=False, symlinks=True)
-    found = WheelEnvironment(wheel, folder, folder / "opened.txt")
+    found = WheelEnvironment(wheel, weights, folder, folder / "opened.txt")
     # Compiled, since commands start many processes.
+    wanted = required(wheel, extras)
     install = ["install", "--no-deps", "--no-index", str(wheel)]
+    if WEIGHTS in wanted:
+        install.append(str(weights))
     python = ["--python", str(found.bin / "python")]
-    subprocess.run([*pip, *python, *install], check=True, timeout=600)
-    for name in required(found.site_packages, extras):
-        link(name, found.site_packages)
+    subprocess.run([*PIP, *python, *install], check=True, timeout=600)
+    for name in wanted:
+        if name != WEIGHTS:
+            link(name, found.site_packages)
     text = WATCH.format(
         checkout=f"{ROOT}/", installed=f"{Path(sys.prefix)}/", notes=str(found.notes)
     )
@@ -101,9 +118,9 @@ def build(folder: Path, extras: tuple[str, ...]) -> WheelEnvironment:
     return found
 
 
-def required(site_packages: Path, extras: tuple[str, ...]) -> list[str]:
-    """Names of all distributions that the installed wheel needs with these extras."""
-    (own,) = metadata.distributions(name=NAME, path=[str(site_packages)])
+def required(wheel: Path, extras: tuple[str, ...]) -> list[str]:
+    """Names of all distributions that the wheel needs with these extras."""
+    (own,) = metadata.distributions(name=NAME, path=[str(wheel)])
     wanted = [(own, extras)]
     seen: set[tuple[str, str]] = set()
     while wanted:
@@ -116,7 +133,7 @@ def required(site_packages: Path, extras: tuple[str, ...]) -> list[str]:
                     continue
                 new = tuple(e for e in requirement.extras or {""} if (name, e) not in seen)
                 seen |= {(name, e) for e in new}
-                if new:
+                if new and name != WEIGHTS:
                     found = own if name == NAME else metadata.distribution(name)
                     wanted.append((found, new))
     return sorted({name for name, _ in seen} - {NAME})

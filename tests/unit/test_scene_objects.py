@@ -75,3 +75,9 @@ def test_sizes_of_dictionaries_are_those_of_opencv():
     for name, size in DICTIONARY_SIZES.items():
         kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         assert len(kind.bytesList) == size
+
+
+@pytest.mark.parametrize("q_w", [1e200, 1.1, 0.0])
+def test_a_quaternion_of_another_length_is_refused(tmp_path, q_w):
+    with pytest.raises(InvalidInputError, match=r"got a quaternion .* expected 1"):
+        load(tmp_path, described(tracker_pose=[0, 0, 0, q_w, 0, 0, 0]))

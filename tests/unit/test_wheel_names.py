@@ -1,9 +1,12 @@
-"""Source code as a wheel installs it: `services` has the name `dextouch_services` there."""
+"""Files as a wheel installs them: `services` is `dextouch_services` there, and all are small."""
 
 import importlib.util
+import zlib
 from pathlib import Path
 
 import pytest
+
+from tests.system.wheel_environment import MAX_WHEEL_BYTES
 
 ROOT = Path(__file__).parents[2]
 _SPEC = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
@@ -47,6 +50,19 @@ def test_imports_and_names_in_strings_are_renamed_and_nothing_else():
 def test_an_expression_with_the_package_is_refused():
     with pytest.raises(ValueError, match="line 2"):
         hatch_build.installed_source("import services.twin\nservices.twin.main()\n")
+
+
+def test_the_wheel_stays_small():
+    folders = ("shared/dextouch", "services", "deploy", "docs")
+    paths = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
+    sizes = {
+        path.relative_to(ROOT): len(zlib.compress(path.read_bytes()))
+        for path in paths
+        if path.suffix not in {".pyc", hatch_build.WEIGHTS}
+    }
+    largest = sorted(sizes, key=sizes.__getitem__)[-5:]
+    # Beside the files it has their list, with hashes, and headers.
+    assert 1.06 * sum(sizes.values()) < MAX_WHEEL_BYTES, largest
 
 
 @pytest.mark.long

@@ -25,7 +25,7 @@ from services.acquisition.sdk_bridges.source import (
     station_offset_ns,
 )
 
-INSTALL = "`pip install 'dextouch-wm[bridges]'` or `pip install pylsl`"
+INSTALL = "`pip install pylsl`"
 # Chosen: outlets of the same network answer within half a second, and the bridge tries again.
 RESOLVE_S = 1.0
 CORRECTION_S = 3.0

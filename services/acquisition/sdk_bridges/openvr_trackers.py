@@ -26,7 +26,7 @@ from services.acquisition.sdk_bridges.source import (
 )
 
 Origin = Literal["standing", "raw"]
-INSTALL = "install SteamVR, and `pip install 'dextouch-wm[bridges]'` or `pip install openvr`"
+INSTALL = "install SteamVR, and `pip install openvr`"
 # Devices that are switched on later are looked for so often; asking for all names takes a while.
 SCAN_PERIOD_S = 1.0
 

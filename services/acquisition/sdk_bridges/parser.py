@@ -22,7 +22,7 @@ HANDS: Final = ("left", "right")
 
 _NEEDS: Final = {
     "openvr": """\
-Needs SteamVR, running, and the Python module openvr (pip install 'dextouch-wm[bridges]').
+Needs SteamVR, running, and the Python module openvr (extra `bridges`).
 A device is named by its serial number, such as LHR-1A2B3C4D: it is printed on it, and
 --list shows those that SteamVR knows. Switched off devices may be named, too.""",
     "libsurvive": """\
@@ -38,7 +38,7 @@ Needs the OpenXR loader (Debian: libopenxr-loader1) and an active runtime with t
 XR_EXT_hand_tracking, XR_MND_headless and XR_KHR_convert_timespec_time, such as Monado. Hands
 are distinguished by the runtime.""",
     "lsl": """\
-Needs the Python module pylsl (pip install 'dextouch-wm[bridges]'), which brings liblsl. The
+Needs the Python module pylsl (extra `bridges`), which brings liblsl. The
 outlet is named by its name, type or source_id; --list shows those of the network. The
 station's settings declare what the numbers are: kind, shape, unit and rate.""",
 }

@@ -122,7 +122,7 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
     )
 
     @router.get("")
-    async def everything() -> CalibrationOverview:
+    async def get_calibration() -> CalibrationOverview:
         """What is calibrated, how well and for how long, and the next step for each."""
         return await run_in_threadpool(overview, runs.place)
 
@@ -139,7 +139,7 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
         return await run_in_threadpool(overview, runs.place)
 
     @router.post("/runs", status_code=status.HTTP_202_ACCEPTED)
-    async def start(request: RunRequest) -> RunStatus:
+    async def start_calibration_run(request: RunRequest) -> RunStatus:
         """Begin a guided run; 409 while another one is on."""
         return await run_in_threadpool(runs.start, request)
 
@@ -151,14 +151,14 @@ def _add_run(router: APIRouter, runs: CalibrationRuns) -> None:
     """Routes of the run that is on."""
 
     @router.get("/run")
-    async def run() -> RunStatus | None:
+    async def get_calibration_run() -> RunStatus | None:
         """The run that is on, or the last one; null before the first."""
         return runs.status()
 
     @router.get(
         "/run/image", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}}
     )
-    async def image() -> Response:
+    async def get_calibration_image() -> Response:
         """The newest image of a camera run, to which its corners belong."""
         data = runs.present().image
         if not data:
@@ -166,27 +166,27 @@ def _add_run(router: APIRouter, runs: CalibrationRuns) -> None:
         return Response(data, media_type="image/jpeg")
 
     @router.post("/run/answer")
-    async def answer(answer: Annotated[Answer, ...]) -> RunStatus:
+    async def answer_calibration_run(answer: Annotated[Answer, ...]) -> RunStatus:
         """Answer the question of the run."""
         return runs.present().answer(answer.text)
 
     @router.post("/run/take")
-    async def take() -> RunStatus:
+    async def keep_calibration_place() -> RunStatus:
         """Keep the present place of a mount's run as soon as the camera is still."""
         return runs.present().order("take")
 
     @router.post("/run/drop")
-    async def drop() -> RunStatus:
+    async def drop_calibration_place() -> RunStatus:
         """Forget the last place of a mount's run."""
         return runs.present().order("drop")
 
     @router.post("/run/finish")
-    async def finish() -> RunStatus:
+    async def finish_calibration_run() -> RunStatus:
         """Calibrate a camera or its mount with the views so far."""
         return runs.present().finish()
 
     @router.post("/run/cancel")
-    async def cancel() -> RunStatus:
+    async def cancel_calibration_run() -> RunStatus:
         """End the run without a result; the places of a mount are kept."""
         return await run_in_threadpool(runs.present().cancel)
 

@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import AwareDatetime, Field
 
 from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 
 Order = Literal["take", "drop"]
 RunState = Literal["running", "asking", "done", "failed", "cancelled"]
@@ -21,6 +21,8 @@ class RunRequest(FrozenModel):
     cameras. `is_resumed` goes on with the places of a mount's run that was ended.
     """
 
+    model_config = example(kind="glove", subject="left")
+
     kind: Literal["camera", "mount", "glove", "time"]
     subject: Literal["head", "wrist_left", "wrist_right", "left", "right", "all"]
     board: FreeText = Field(default="", max_length=64)
@@ -29,6 +31,8 @@ class RunRequest(FrozenModel):
 
 class Answer(FrozenModel):
     """What the operator answers to the question of a run."""
+
+    model_config = example(text="yes")
 
     text: FreeText = Field(max_length=200)
 

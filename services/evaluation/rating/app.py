@@ -5,15 +5,21 @@ from pathlib import Path as FilePath
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Request, Response
-from fastapi.responses import FileResponse
 from prometheus_client import Counter, Gauge
 from pydantic import Field
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
 from dextouch.free_text import FreeLines
-from dextouch.frozen_model import FrozenModel
-from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
+from dextouch.frozen_model import FrozenModel, example
+from dextouch.serving import (
+    RequireScope,
+    ServedFolder,
+    create_service_app,
+    file_router,
+    page_headers,
+    serve,
+)
 from services.evaluation.rating.marks import (
     Judgement,
     Mark,
@@ -29,14 +35,6 @@ from services.evaluation.settings import RatingSettings
 STATIC: Final = FilePath(__file__).parent / "static"
 FILES: Final = {"/": "rate.html"} | {
     f"/rate.{kind}": f"rate.{kind}" for kind in ("js", "css", "svg")
-}
-PAGE_HEADERS: Final = {
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
-        "connect-src 'self'; form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
-    ),
-    "x-content-type-options": "nosniff",
-    "cache-control": "no-store",
 }
 Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
 
@@ -66,6 +64,8 @@ class RolloutView(FrozenModel):
 
 class SubmittedMark(Judgement):
     """Body of a mark."""
+
+    model_config = example(rollout="0123456789abcdef0123", rater="p07", holds={"touched": True})
 
     rollout: str = Field(pattern=r"^[0-9a-f]{20}$")
     comment: FreeLines = Field(default="", max_length=2000)
@@ -101,7 +101,8 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     text = "Marks given since the start, with corrections."
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
-    routers = [page_router(), rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
+    page = file_router(STATIC, FILES, page_headers(images="'self' blob:"))
+    routers = [page, rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),
         ServedFolder(settings.marks.parent, "folder of marks"),
@@ -112,18 +113,6 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     to_rate = Gauge("dextouch_rating_rollouts", text, registry=app.state.registry)
     to_rate.set(len(rollouts))
     return app
-
-
-def page_router() -> APIRouter:
-    """Router of the page and its files."""
-    router = APIRouter(include_in_schema=False)
-    for address, name in FILES.items():
-
-        async def file(name: str = name) -> FileResponse:
-            return FileResponse(STATIC / name, headers=PAGE_HEADERS)
-
-        router.add_api_route(address, file)
-    return router
 
 
 def rating_router(
@@ -141,7 +130,7 @@ def rating_router(
     @router.get(
         "/next", response_model=None, responses={200: {"model": RolloutView}, 204: {}, 409: {}}
     )
-    def next_rollout(
+    def get_next_rollout(
         request: Request, rater: RaterName, key: Annotated[str, Depends(needs_rater)]
     ) -> RolloutView | Response:
         """The rollout that a rater should rate next; 204 when nothing is left."""
@@ -170,13 +159,13 @@ def rating_router(
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    def picture(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
+    def get_step_image(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
         """Head image and taxel maps of one step."""
         jpeg = pictures.step(queue.rollout(token).episode_id, step)
         return Response(jpeg, media_type="image/jpeg", headers={"cache-control": "no-store"})
 
     @router.post("/marks", status_code=201)
-    def give(
+    def submit_mark(
         request: Request, given: SubmittedMark, key: Annotated[str, Depends(needs_rater)]
     ) -> SubmittedMarkNumber:
         """Add a mark; a second one for the same presentation corrects the first."""

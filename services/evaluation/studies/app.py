@@ -204,17 +204,17 @@ def study_router(folders: StudyFolders) -> APIRouter:
     router = APIRouter(prefix="/v1/studies", tags=["studies"], dependencies=may_read)
 
     @router.get("")
-    def studies() -> StudyList:
+    def list_studies() -> StudyList:
         """List the studies, those with the newest results first."""
         return StudyList(studies=tuple(folders.summaries()))
 
     @router.get("/{name}")
-    def figures(name: str) -> StudyFigures:
+    def get_study(name: str) -> StudyFigures:
         """Success rates, agreement and progress of a study."""
         return folders.figures(name)
 
     @router.get("/{name}/rollouts")
-    def rollouts(name: str, query: Annotated[RolloutQuery, Query()]) -> StudyRolloutList:
+    def list_study_rollouts(name: str, query: Annotated[RolloutQuery, Query()]) -> StudyRolloutList:
         """List rollouts of a study that have a result."""
         found = [one for one in folders.rollouts(name) if query.matches(one)]
         page = found[query.offset : query.offset + query.limit]

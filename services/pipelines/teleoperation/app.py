@@ -268,7 +268,7 @@ def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
                 await socket.close(_REFUSED, error.message[:MAX_REASON_LETTERS])
 
     @router.post("/{side}/stop", status_code=204, dependencies=[Depends(RequireScope(SCOPE))])
-    async def stop(side: Side) -> None:
+    async def stop_hand(side: Side) -> None:
         """Stop a hand that another program controls; it holds until that program starts it."""
         if side not in controlled:
             raise NotFoundError(f"nobody controls the {side} hand: there is nothing to stop")

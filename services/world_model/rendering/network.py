@@ -126,7 +126,8 @@ def has_fast_bfloat16() -> bool:
 
     False without timing on processors that emulate bfloat16 (neither AMX nor AVX-512 BF16).
     """
-    found = torch.cpu.get_capabilities()
+    # Older versions of torch do not tell; there float32 is right, too.
+    found: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     if not (found.get("amx_bf16", False) or found.get("avx512_bf16", False)):
         return False
     speedup = bfloat16_speedup()

@@ -1,3 +1,12 @@
 """Import and export of episodes and recordings: LeRobot, MCAP, UMI and Rerun formats."""
 
-__all__ = ["lerobot", "mcap", "rerun", "umi"]
+__all__ = [
+    "foreign",
+    "foreign_mcap",
+    "foreign_rerun",
+    "foxglove",
+    "lerobot",
+    "mcap",
+    "rerun",
+    "umi",
+]

@@ -1,8 +1,9 @@
 """Lossless codec between samples of a stream and their MCAP messages.
 
-Messages are Foxglove's for images and poses, arrays for the rest. Every message has two more fields
-than its public schema (https://docs.foxglove.dev/docs/sdk/schemas): the device stamp and counter of
-a recorded sample, for which MCAP's own fields are too narrow.
+Messages are Foxglove's for images, poses and joints, and our own for actions and other numbers.
+Every message has two more fields than its public schema
+(https://docs.foxglove.dev/docs/sdk/schemas): the device stamp and counter of a recorded sample, for
+which MCAP's own fields are too narrow.
 """
 
 import math
@@ -16,6 +17,7 @@ from foxglove_schemas_protobuf import (
     CompressedImage_pb2,
     CompressedVideo_pb2,
     FrameTransform_pb2,
+    JointStates_pb2,
     PosesInFrame_pb2,
     RawImage_pb2,
 )
@@ -31,17 +33,29 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from jaxtyping import Shaped
 
+from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
 from dextouch.errors import CorruptDataError
+from dextouch.hands import actions as act
+from dextouch.hands.robot_hand import SIDES, RobotHand
 from dextouch.streams import StreamDescriptor
 
-T_DEVICE: Final = "dextouch_t_device_ns"
-SEQUENCE: Final = "dextouch_sequence"
 CALIBRATION: Final = "foxglove.CameraCalibration"
 COMPRESSED_IMAGE: Final = "foxglove.CompressedImage"
 COMPRESSED_VIDEO: Final = "foxglove.CompressedVideo"
 RAW_IMAGE: Final = "foxglove.RawImage"
 FRAME_TRANSFORM: Final = "foxglove.FrameTransform"
 POSES_IN_FRAME: Final = "foxglove.PosesInFrame"
+JOINT_STATES: Final = "foxglove.JointStates"
+ACTION: Final = "dextouch.Action"
+ACTIONS: Final = ("action", "action_commanded")
+# Fields of an action, in the order of its numbers.
+ACTION_PARTS: Final = dict(
+    zip(
+        ("wrist_left", "wrist_right", "joints_left", "joints_right", "camera_head"),
+        act.PARTS,
+        strict=True,
+    )
+)
 # The message, element type and dtype on the wire for each dtype of a stream.
 ARRAYS: Final = {
     "float32": ("dextouch.Float32Array", "float", "<f4"),
@@ -53,6 +67,8 @@ ARRAYS: Final = {
 # Any of ARRAYS with `values` as raw bytes. A packed repeated field has the same encoding, so a row
 # is copied verbatim: the lists of the typed messages lose the payload of a NaN and are slow.
 PACKED_ARRAY: Final = "dextouch.PackedArray"
+PACKED_ACTION: Final = "dextouch.PackedAction"
+_PACKED: Final = {ACTION: PACKED_ACTION} | {name: PACKED_ARRAY for name, _, _ in ARRAYS.values()}
 RAW_ENCODINGS: Final = {("uint8", 3): "rgb8", ("uint8", 2): "mono8", ("uint16", 2): "mono16"}
 _TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
 _ONE, _MANY = FieldDescriptorProto.LABEL_OPTIONAL, FieldDescriptorProto.LABEL_REPEATED
@@ -73,18 +89,21 @@ class Sent:
 
 
 class MessageCodec:
-    """Encodes and decodes the samples of one stream."""
+    """Encodes and decodes the samples of one stream.
 
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        self.descriptor, self.message = descriptor, _message_of(descriptor)
+    Without `named`, joints and actions are arrays, as in files of bridge version 1.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, *, named: bool = True) -> None:
+        self.descriptor, self.message = descriptor, _message_of(descriptor, named=named)
         self._num_elements = math.prod(descriptor.shape)
         self._is_encoded = self.message in {COMPRESSED_IMAGE, COMPRESSED_VIDEO}
-        self._is_array = self.message.startswith("dextouch.")
+        self._joints = joint_names(descriptor)
         # Each sample overwrites the fields that change.
         self._sent = self._constant()
 
     def _empty(self) -> Any:  # noqa: ANN401 - protobuf makes its fields at run time
-        return _new_message(PACKED_ARRAY if self._is_array else self.message)
+        return _new_message(_PACKED.get(self.message, self.message))
 
     def _constant(self) -> Any:  # noqa: ANN401
         descriptor, sent = self.descriptor, self._empty()
@@ -93,6 +112,9 @@ class MessageCodec:
             sent.child_frame_id = _frame_of(descriptor)
         elif self.message == POSES_IN_FRAME:
             sent.frame_id = descriptor.frame or "world"
+        elif self.message == JOINT_STATES:
+            for name in self._joints:
+                sent.joints.add(name=name)
         else:
             sent.frame_id = _frame_of(descriptor)
         if self._is_encoded:
@@ -101,7 +123,7 @@ class MessageCodec:
             sent.height, sent.width = descriptor.shape[:2]
             sent.encoding = raw_encoding(descriptor)
             sent.step = math.prod(descriptor.shape[1:]) * descriptor.numpy_dtype().itemsize
-        elif self._is_array:
+        elif _PACKED.get(self.message) == PACKED_ARRAY:
             sent.shape.extend(descriptor.shape)
         return sent
 
@@ -116,16 +138,26 @@ class MessageCodec:
             message.data = value
         elif self.message == RAW_IMAGE:
             message.data = value.tobytes()
-        elif self.message == FRAME_TRANSFORM:
+        else:
+            self._set_numbers(message, value)
+        return cast(bytes, message.SerializeToString())
+
+    def _set_numbers(self, message: Any, value: np.ndarray) -> None:  # noqa: ANN401
+        if self.message == FRAME_TRANSFORM:
             _set_pose(message.translation, message.rotation, value)
         elif self.message == POSES_IN_FRAME:
             del message.poses[:]
             for row in value:
                 pose = message.poses.add()
                 _set_pose(pose.position, pose.orientation, row)
+        elif self.message == JOINT_STATES:
+            for joint, position in zip(message.joints, value.tolist(), strict=True):
+                joint.position = position
+        elif self.message == ACTION:
+            for name, part in ACTION_PARTS.items():
+                setattr(message, name, value[part].astype("<f8").tobytes())
         else:
             message.values = value.astype(self._wire_dtype()).tobytes()
-        return cast(bytes, message.SerializeToString())
 
     def _wire_dtype(self) -> np.dtype[Any]:
         return np.dtype(ARRAYS[self.descriptor.dtype][2])
@@ -169,7 +201,11 @@ class MessageCodec:
             return self._image(message)
         if self.message == RAW_IMAGE:
             return self._array(message.data, self.descriptor.numpy_dtype())
-        if self._is_array:
+        if self.message == ACTION:
+            return self._array(self._action(message), np.dtype("<f8"))
+        if self.message == JOINT_STATES:
+            return self._array(self._positions(message), np.dtype("<f8"))
+        if self.message.startswith("dextouch."):
             return self._array(message.values, self._wire_dtype())
         if self.message == FRAME_TRANSFORM:
             row = self._pose(message, "translation", "rotation")
@@ -177,6 +213,25 @@ class MessageCodec:
             poses = (self._pose(pose, "position", "orientation") for pose in message.poses)
             row = [x for pose in poses for x in pose]
         return self._array(np.array(row, dtype=np.float64).tobytes(), np.dtype(np.float64))
+
+    def _action(self, message: Any) -> bytes:  # noqa: ANN401
+        parts = {name: cast(bytes, getattr(message, name)) for name in ACTION_PARTS}
+        for name, part in ACTION_PARTS.items():
+            if len(parts[name]) != 8 * (part.stop - part.start):
+                raise CorruptDataError(
+                    f"{self.descriptor.name}: got {len(parts[name]) / 8:g} numbers of {name}, "
+                    f"expected {part.stop - part.start}"
+                )
+        return b"".join(parts.values())
+
+    def _positions(self, message: Any) -> bytes:  # noqa: ANN401
+        names = tuple(joint.name for joint in message.joints)
+        if names != self._joints or not all(joint.HasField("position") for joint in message.joints):
+            raise CorruptDataError(
+                f"{self.descriptor.name}: got joints {', '.join(names[:3])} …, expected the "
+                f"positions of {', '.join(self._joints[:3])} … ({len(self._joints)} joints)"
+            )
+        return np.array([joint.position for joint in message.joints], dtype="<f8").tobytes()
 
     def _image(self, message: Any) -> bytes:  # noqa: ANN401
         if message.format != self.descriptor.unit:
@@ -224,10 +279,12 @@ def calibration_message(
 ) -> bytes:
     """A foxglove.CameraCalibration for unrectified images of height and width `shape_px`.
 
-    `K` is the camera matrix in pixels, 3×3; `distortion` is k1 k2 p1 p2 k3, zeros for a pinhole;
-    `t_ns` the start of its validity.
+    `K` is the camera matrix in pixels, 3×3, in our convention: Foxglove counts from the centre of
+    the first pixel, we from its corner, so the message has half a pixel less. `distortion` is k1
+    k2 p1 p2 k3, zeros for a pinhole; `t_ns` the start of its validity.
     """
-    K = np.asarray(K, dtype=np.float64)
+    K = np.array(K, dtype=np.float64)
+    K[:2, 2] -= 0.5
     message = _new_message(CALIBRATION)
     _set_time(message.timestamp, t_ns)
     message.frame_id, message.distortion_model = frame, "plumb_bob"
@@ -239,8 +296,31 @@ def calibration_message(
     return cast(bytes, message.SerializeToString())
 
 
-def _message_of(descriptor: StreamDescriptor) -> str:
+@cache
+def _hand_joints() -> dict[str, tuple[str, ...]]:
+    return {side: RobotHand(side).joint_names for side in SIDES}
+
+
+def joint_names(descriptor: StreamDescriptor) -> tuple[str, ...]:
+    """Names of the joints whose angles a stream holds, left hand first; empty if it holds none."""
+    if (descriptor.kind, descriptor.unit, descriptor.dtype) != ("robot_state", "rad", "float64"):
+        return ()
+    hands = _hand_joints()
+    both = (*hands["left"], *hands["right"])
+    if descriptor.shape == (len(both),):
+        return both
+    side = next((side for side in SIDES if descriptor.name.endswith(f"_{side}")), None)
+    one = hands.get(descriptor.side or side or "", ())
+    return one if descriptor.shape == (len(one),) else ()
+
+
+def _message_of(descriptor: StreamDescriptor, *, named: bool) -> str:
     """The full name of the message that holds one sample of a stream."""
+    if named and joint_names(descriptor):
+        return JOINT_STATES
+    size_and_type = (descriptor.shape, descriptor.dtype)
+    if named and descriptor.name in ACTIONS and size_and_type == ((act.ACTION_DIM,), "float64"):
+        return ACTION
     encoded = {"jpeg": COMPRESSED_IMAGE, "h264": COMPRESSED_VIDEO}
     if descriptor.unit in encoded:
         return encoded[descriptor.unit]
@@ -294,14 +374,17 @@ def _pool() -> Any:  # noqa: ANN401 - not an instance of the class that makes it
         CompressedImage_pb2,
         CompressedVideo_pb2,
         FrameTransform_pb2,
+        JointStates_pb2,
         PosesInFrame_pb2,
         RawImage_pb2,
     ):
         _collect(module.DESCRIPTOR, files)
         _add_device_fields(files[module.DESCRIPTOR.name].message_type[0])
     for message, element, _ in ARRAYS.values():
-        files[message] = _array_file(message, element, repeated=True)
-    files[PACKED_ARRAY] = _array_file(PACKED_ARRAY, "bytes", repeated=False)
+        files[message] = _file(message, {"shape": "fixed32", "values": element})
+    files[PACKED_ARRAY] = _file(PACKED_ARRAY, {"shape": "fixed32", "values": "bytes"})
+    for message, element in ((ACTION, "double"), (PACKED_ACTION, "bytes")):
+        files[message] = _file(message, dict.fromkeys(ACTION_PARTS, element))
     pool = DescriptorPool()
     for file in files.values():
         pool.Add(file)
@@ -313,7 +396,8 @@ def _add_device_fields(message: DescriptorProto) -> None:
         message.field.add(name=name, number=number, label=_ONE, type=_type("sfixed64"))
 
 
-def _array_file(name: str, element: str, *, repeated: bool) -> FileDescriptorProto:
+def _file(name: str, lists: dict[str, str]) -> FileDescriptorProto:
+    """A file with one message: the time, the frame and lists of numbers, or their bytes."""
     package, short = name.split(".")
     file = FileDescriptorProto(
         name=f"{package}/{short}.proto",
@@ -322,10 +406,9 @@ def _array_file(name: str, element: str, *, repeated: bool) -> FileDescriptorPro
         syntax="proto3",
     )
     message = file.message_type.add(name=short)
-    kinds = {"timestamp": "message", "frame_id": "string", "shape": "fixed32", "values": element}
-    many = {"shape", "values"} if repeated else {"shape"}
+    kinds = {"timestamp": "message", "frame_id": "string"} | lists
     for number, (field, kind) in enumerate(kinds.items(), 1):
-        label = _MANY if field in many else _ONE
+        label = _MANY if field in lists and kind != "bytes" else _ONE
         message.field.add(name=field, number=number, label=label, type=_type(kind))
     message.field[0].type_name = ".google.protobuf.Timestamp"
     _add_device_fields(message)

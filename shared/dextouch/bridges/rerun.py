@@ -9,19 +9,22 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import UInt8
 from rerun.components import ImageFormat
 
-from dextouch.bridges.exporting import Block, Reader, blocks, new_file
+from dextouch.bridges.exporting import (
+    Block,
+    Reader,
+    TouchPictures,
+    blocks,
+    new_file,
+    touch_side,
+)
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
-from dextouch.streams import HEAD_CAMERA, TAXEL_UNIT, StreamDescriptor
-from dextouch.tactile import colour
-from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 
 APPLICATION: Final = "dextouch"
-FULL_SCALE_KPA: Final = 40.0
 AXIS_LENGTH_M: Final = 0.05
 POINT_RADIUS_M: Final = 0.004
 # Columns of the entities of a stream.
@@ -91,7 +94,6 @@ def _blueprint(reader: Reader) -> rrb.Blueprint:
 
 
 def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
-    # Rerun's pinhole has no distortion model, so projected entities are off by the distortion.
     camera = reader.streams.get(HEAD_CAMERA)
     K = reader.attributes.calibration.get("K_head")
     if isinstance(reader, EpisodeReader):
@@ -101,13 +103,20 @@ def _log_pinhole(stream: rr.RecordingStream, reader: Reader) -> None:
     height_px, width_px = camera.shape[:2]
     pinhole = rr.Pinhole(image_from_camera=np.array(K), width=width_px, height=height_px)
     stream.log(entity_of(camera), pinhole, static=True)
+    distortion = np.array(reader.attributes.calibration.get("distortion_head", 0.0)).ravel()
+    if distortion.any():
+        # Rerun's pinhole has no distortion model: what is projected is off by the distortion.
+        note = "images are distorted, the pinhole is not: projected entities are off"
+        parts = {"distortion_k1_k2_p1_p2_k3": distortion, "note": note}
+        lens = rr.DynamicArchetype("dextouch.Lens", components=parts)
+        stream.log(entity_of(camera), lens, static=True)
 
 
 def _log(stream: rr.RecordingStream, reader: Reader, descriptor: StreamDescriptor) -> int:
     entity, kind, num_samples = entity_of(descriptor), descriptor.kind, 0
     if kind == "image":
         columns = _images(stream, entity, descriptor)
-    elif kind == "tactile" and _side(descriptor):
+    elif kind == "tactile" and touch_side(descriptor):
         columns = _touch(stream, entity, reader, descriptor)
     elif kind == "pose" and descriptor.shape[-1:] == (7,):
         columns = _poses(stream, entity, descriptor)
@@ -138,46 +147,49 @@ def _images(stream: rr.RecordingStream, entity: str, descriptor: StreamDescripto
                 sample=list(block.values), is_keyframe=[is_keyframe(unit) for unit in block.values]
             )
         }
-    if descriptor.dtype != "uint8" or descriptor.shape[2:] != (3,):
+    shape, dtype = descriptor.shape, descriptor.dtype
+    if dtype == "uint16" and len(shape) == 2:
+        _log_format(stream, entity, shape, rr.DepthImage)
+        if descriptor.unit == "mm":
+            stream.log(entity, rr.DepthImage.from_fields(meter=1000.0), static=True)
+        return lambda block: {entity: _pixels(block.values, rr.DepthImage)}
+    if dtype != "uint8" or (len(shape) != 2 and shape[2:] != (3,)):
         raise InvalidInputError(
-            f"{descriptor.name}: got images of {descriptor.dtype} {descriptor.shape}, "
-            "expected uint8 [h, w, 3] or JPEG or H.264"
+            f"{descriptor.name}: got images of {dtype} {shape}, expected uint8 [h, w, 3], "
+            "uint8 or uint16 [h, w], JPEG or H.264"
         )
-    _log_format(stream, entity, descriptor.shape)
+    _log_format(stream, entity, shape)
     return lambda block: {entity: _pixels(block.values)}
 
 
-def _log_format(stream: rr.RecordingStream, entity: str, shape: tuple[int, ...]) -> None:
+def _log_format(
+    stream: rr.RecordingStream,
+    entity: str,
+    shape: tuple[int, ...],
+    archetype: "type[rr.Image | rr.DepthImage]" = rr.Image,
+) -> None:
+    """The form of images: depths of 16 bits, RGB or gray of 8."""
+    is_depth = archetype is rr.DepthImage
     kind = ImageFormat(
         width=shape[1],
         height=shape[0],
-        color_model=rr.ColorModel.RGB,
-        channel_datatype=rr.ChannelDatatype.U8,
+        color_model=None if is_depth else rr.ColorModel.RGB if shape[2:] else rr.ColorModel.L,
+        channel_datatype=rr.ChannelDatatype.U16 if is_depth else rr.ChannelDatatype.U8,
     )
-    stream.log(entity, rr.Image.from_fields(format=kind), static=True)
+    stream.log(entity, archetype.from_fields(format=kind), static=True)
 
 
-def _pixels(images: np.ndarray) -> Any:  # noqa: ANN401 - the library does not export the type
-    return rr.Image.columns(buffer=np.ascontiguousarray(images).reshape(len(images), -1))
+def _pixels(images: np.ndarray, archetype: "type[rr.Image | rr.DepthImage]" = rr.Image) -> Any:  # noqa: ANN401 - the library does not export the type
+    pixels = np.ascontiguousarray(images).reshape(len(images), -1)
+    return archetype.columns(buffer=pixels.astype(pixels.dtype.newbyteorder("<")).view(np.uint8))
 
 
 def _touch(
     stream: rr.RecordingStream, entity: str, reader: Reader, descriptor: StreamDescriptor
 ) -> _Columns:
-    full_scale = FULL_SCALE_KPA
-    if descriptor.unit != TAXEL_UNIT:
-        # Raw counts have no absolute scale; the strongest reading of the take is the brightest.
-        largest = [block.values.max() for block in blocks(reader, descriptor.name)]
-        full_scale = float(max(largest, default=1)) or 1.0
-    draw = partial(
-        heat_map,
-        side=_side(descriptor) or "left",
-        full_scale=full_scale,
-        layout=descriptor.tactile_layout,
-        is_raw=_is_raw(descriptor),
-    )
-    _log_format(stream, entity, draw(np.zeros(descriptor.shape)).shape)
-    return lambda block: {entity: _pixels(np.stack([draw(row) for row in block.values]))}
+    pictures = TouchPictures(reader, descriptor)
+    _log_format(stream, entity, pictures.shape)
+    return lambda block: {entity: _pixels(pictures.draw(block.values))}
 
 
 def _poses(stream: rr.RecordingStream, entity: str, descriptor: StreamDescriptor) -> _Columns:
@@ -212,40 +224,3 @@ def _numbers(entity: str, block: Block) -> dict[str, Any]:
     rows = block.values.reshape(len(block), -1).astype(np.float64)
     columns = rr.Scalars.columns(scalars=rows.ravel())
     return {entity: columns.partition([rows.shape[1]] * len(block))}
-
-
-def heat_map(
-    row: np.ndarray,
-    *,
-    side: Side,
-    full_scale: float,
-    layout: TactileLayout = DEXTOUCH_V1,
-    is_raw: bool = False,
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    """One reading of a glove as a small RGB picture of the hand.
-
-    Args:
-        row: taxels, or the raw cells.
-        side: of the hand.
-        full_scale: reading shown at full brightness, in the unit of the row.
-        layout: of the glove.
-        is_raw: whether the row holds raw cells.
-    """
-    taxels = layout.select(row, side=side) if is_raw else row
-    return colour(layout.hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
-
-
-def _is_raw(descriptor: StreamDescriptor) -> bool:
-    return descriptor.unit != TAXEL_UNIT and descriptor.shape == (
-        descriptor.tactile_layout.num_raw_cells,
-    )
-
-
-def _side(descriptor: StreamDescriptor) -> Side | None:
-    """Side of a tactile stream; None if it cannot be drawn as a hand."""
-    if not (_is_raw(descriptor) or descriptor.shape == (descriptor.tactile_layout.num_taxels,)):
-        return None
-    if descriptor.side is not None:
-        return descriptor.side
-    sides: tuple[Side, Side] = ("left", "right")
-    return next((side for side in sides if descriptor.name.endswith(f"_{side}")), None)

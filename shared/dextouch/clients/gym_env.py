@@ -1,33 +1,41 @@
 """Gymnasium environments of a served world, single and vector; one step is one action chunk.
 
-    env = WorldEnv(RolloutClient(url), world="twin", task="stand_bottle", instruction="…")
+    name = "dextouch.clients.gym_env:dextouch/Rollout-v0"
+    env = gymnasium.make(name, url=url, world="twin", task=…, instruction=…)
     observation, info = env.reset(seed=3)
     observation, reward, terminated, truncated, info = env.step(actions)  # [chunk_steps, 67]
 
+Importing this module, as the first part of the name does, registers the rest of it. `WorldEnv` is
+the same for a client of your own.
 `WorldVectorEnv` steps several at the same time, so that the service computes them in batches.
 Gymnasium's autoreset would draw new starts by itself, but policies are compared from matched ones;
-so it is disabled there, and every reset has its seeds.
+so it is disabled there, and every reset has its seeds. `gymnasium.make_vec` makes one, too.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar, cast
+from contextlib import ExitStack, closing
+from typing import Any, Final, TypeVar, cast
 
 import gymnasium
 import numpy as np
+import structlog
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from jaxtyping import Bool, Float, Float64
 
 from dextouch.clients.rollouts import Rollout, RolloutClient
-from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
+from dextouch.errors import EndedError, InvalidInputError, UnavailableError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, POSE_SLICES
 from dextouch.schemas import Observation, WorldDescription
+
+logger = structlog.get_logger(__name__)
 
 # Bounds of the action space. They limit its samples, not what worlds accept.
 MAX_REACH_M = 2.0
 MAX_JOINT_RAD = np.pi
+ENV_ID: Final = "dextouch/Rollout-v0"
 # Gymnasium requires finite bounds; no sensor comes near these.
 MAX_TACTILE_KPA = 1e6
 MAX_REACHED = 1e6
@@ -46,9 +54,18 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
     `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far, and the numbers that the
     world reports about the chunk.
+
+    With the render mode `rgb_array`, `render` returns the newest image of each camera side by side,
+    [h, w, 3]; with `rgb_array_list`, all of the newest chunk, and none the second time.
     """
 
-    def __init__(
+    # Of the usual chunk; an instance has the rate of its own world and chunks.
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as gymnasium declares it
+        "render_modes": ["rgb_array", "rgb_array_list"],
+        "render_fps": 15 / 16,
+    }
+
+    def __init__(  # noqa: PLR0913 - all by name
         self,
         client: RolloutClient,
         *,
@@ -57,8 +74,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         instruction: str,
         chunk_steps: int = 16,
         max_chunks: int = 5,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": []}
         self.client = client
         self._rollout: Rollout | None = None
         self._task = task
@@ -73,6 +90,16 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
                 f"chunk_steps: got {chunk_steps}, expected a positive multiple of "
                 f"{self.description.chunk_multiple}"
             )
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise UnknownNameError("render mode", render_mode, modes)
+        if render_mode is not None and not self.description.cameras:
+            raise InvalidInputError(f"render_mode: world {world} has no camera, expected None")
+        self.render_mode = render_mode
+        rate_hz = self.description.model_rate_hz
+        per_image = 1 if render_mode == "rgb_array_list" else chunk_steps
+        self.metadata = {**self.metadata, "render_fps": rate_hz / per_image}
+        self._rendered: Observation | None = None
         self.observation_space = _observation_space(self.description)
         self.action_space = _action_space(chunk_steps)
 
@@ -88,7 +115,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         if unknown:
             raise UnknownNameError("reset option", unknown[0], ["init"])
         start_seed = int(self.np_random.integers(2**31)) if seed is None else seed
-        self.close()
+        self._end()
         init = (options or {}).get("init")
         self._rollout = self.client.start(
             world=self.description.name,
@@ -113,11 +140,31 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         info = self._info(self._rollout)
         return _seen_now(observation), float(success), success, truncated, info
 
+    def render(self) -> Any:  # noqa: ANN401 - an image or a list of images, by the mode
+        """The newest images as the render mode says; None without one."""
+        if self.render_mode is None:
+            return None
+        if self._rollout is None:
+            raise InvalidInputError("render: there is no episode; call reset first")
+        seen = self._rollout.observation
+        images = np.concatenate([seen.images[name] for name in self.description.cameras], axis=2)
+        if self.render_mode == "rgb_array":
+            return images[-1]
+        is_shown, self._rendered = seen is self._rendered, seen
+        return [] if is_shown else list(images)
+
     def close(self) -> None:
         """End the running rollout; the client stays open."""
-        if self._rollout is not None:
-            self._rollout.close()
-            self._rollout = None
+        self._end()
+
+    def _end(self) -> None:
+        rollout, self._rollout = self._rollout, None
+        if rollout is not None:
+            try:
+                rollout.close()
+            except UnavailableError as error:
+                # The service ends rollouts that nobody uses, or is gone with them.
+                logger.warning("rollout_not_closed", rollout=rollout.id, error=error.message)
 
     @staticmethod
     def _info(rollout: Rollout) -> dict[str, Any]:
@@ -131,14 +178,55 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         }
 
 
+class RolloutEnv(WorldEnv):
+    """`WorldEnv` with a client of its own, as `gymnasium.make("dextouch/Rollout-v0")` makes it."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        api_key: str | None = None,
+        **options: Any,  # noqa: ANN401 - as WorldEnv
+    ) -> None:
+        with ExitStack() as opened:
+            super().__init__(opened.enter_context(RolloutClient(url, api_key=api_key)), **options)
+            opened.pop_all()
+
+    def close(self) -> None:
+        """End the running rollout, and close the client."""
+        with self.client:
+            super().close()
+
+
+def make_vector(
+    *,
+    num_envs: int,
+    **options: Any,  # noqa: ANN401 - as RolloutEnv
+) -> "WorldVectorEnv":
+    """Environments with clients of their own, as `gymnasium.make_vec` makes them."""
+    with ExitStack() as opened:
+        envs = [opened.enter_context(closing(RolloutEnv(**options))) for _ in range(num_envs)]
+        vector = WorldVectorEnv(envs)
+        opened.pop_all()
+    return vector
+
+
+if ENV_ID not in gymnasium.registry:
+    gymnasium.register(
+        ENV_ID,
+        entry_point=f"{__name__}:{RolloutEnv.__name__}",
+        vector_entry_point=f"{__name__}:{make_vector.__name__}",
+    )
+
+
 class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
     """Several environments of a served world that step at the same time.
 
     Autoreset is disabled: once an episode has ended, its environment must be reset before the next
     step, by `options={"reset_mask": terminations | truncations}`. If a reset or a step raises, some
     environments may have done it and others not; reset all of them. Spaces are equal, and each has
-    a client of its own, which is not thread-safe; they are closed with this one, their clients are
-    not.
+    a client of its own, which is not thread-safe; they are closed with this one, clients of a
+    `WorldEnv` are not.
     """
 
     def __init__(self, envs: Sequence[WorldEnv]) -> None:
@@ -151,7 +239,8 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
                 first.action_space,
             ):
                 raise InvalidInputError("envs: their spaces differ, expected equal ones")
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}
+        self.metadata = {**first.metadata, "autoreset_mode": AutoresetMode.DISABLED}
+        self.render_mode = first.render_mode
         self.num_envs = len(envs)
         self.single_observation_space = first.observation_space
         self.single_action_space = first.action_space
@@ -210,6 +299,8 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
                 f"step: environments {np.flatnonzero(self._needs_reset).tolist()} have no episode; "
                 "reset them first, with options={'reset_mask': …}"
             )
+        if len(actions) != self.num_envs:
+            raise InvalidInputError(f"actions: got {len(actions)} chunks, expected {self.num_envs}")
         self._needs_reset[:] = True
         every = range(self.num_envs)
         results = self._together(lambda i: self._envs[i].step(actions[i]), every)
@@ -220,10 +311,14 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         self._needs_reset = np.logical_or(terminated, truncated)
         return self._batch(), np.array(rewards), np.array(terminated), np.array(truncated), infos
 
+    def render(self) -> tuple[Any, ...]:
+        """What each environment renders."""
+        return tuple(env.render() for env in self._envs)
+
     def close_extras(self) -> None:
         """End the running rollouts."""
-        self._together(lambda i: self._envs[i].close(), range(self.num_envs))
-        self._threads.shutdown()
+        with self._threads:
+            self._together(lambda i: self._envs[i].close(), range(self.num_envs))
 
     def _chosen(self, mask: object) -> list[int]:
         if mask is None:

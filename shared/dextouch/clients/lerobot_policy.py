@@ -1,6 +1,6 @@
 """Policies trained with LeRobot, from the folders of their checkpoints; needs the extra `lerobot`.
 
-LeRobot asks for older packages than the services, so it gets an environment of its own, where
+LeRobot asks for older packages than some of the services, so in an environment of its own
 
     python -m dextouch.clients.lerobot_policy outputs/train/…/pretrained_model --port 8000
 

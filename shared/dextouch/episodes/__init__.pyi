@@ -1,10 +1,13 @@
 from . import care as care
+from . import editing as editing
 from . import needs as needs
 from . import spool as spool
 from .files import GroupFiles as GroupFiles
 from .files import LocalGroup as LocalGroup
+from .files import Stamps as Stamps
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
+from .files import make_held_folder as make_held_folder
 from .files import replace_file as replace_file
 from .format import COMMIT_FILE as COMMIT_FILE
 from .format import GOP_IMAGES as GOP_IMAGES
@@ -17,6 +20,8 @@ from .format import kind_of as kind_of
 from .format import shard_path as shard_path
 from .format import stream_arrays as stream_arrays
 from .image_codecs import FULL_FORM as FULL_FORM
+from .image_codecs import MOST_STEPS as MOST_STEPS
+from .image_codecs import FrameNumbers as FrameNumbers
 from .image_codecs import GopEncoder as GopEncoder
 from .image_codecs import ImageForm as ImageForm
 from .image_codecs import VideoSettings as VideoSettings
@@ -70,5 +75,6 @@ from .validity import interpolated_actions as interpolated_actions
 from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions
 from .validity import measured_taxels as measured_taxels
+from .writer import DOWNLOADS as DOWNLOADS
 from .writer import ContentDigest as ContentDigest
 from .writer import EpisodeWriter as EpisodeWriter

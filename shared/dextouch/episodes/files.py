@@ -14,16 +14,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
+from dextouch.data_folder import is_system_file
+from dextouch.episodes.format import COMMIT_FILE
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError, StorageFullError
 
 _SYNC_THREADS = 16
+# End of the name of a file that is being replaced; one that was interrupted is left.
+PARTIAL = ".partial"
+_COPY_BYTES = 1 << 22
 # EFBIG: the file size limit of the process or file system; handled like a full disk.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
 MAX_METADATA_BYTES = 1 << 24
+# Earlier releases wrote larger records of long takes.
+MAX_COMMIT_BYTES = 1 << 28
 
 
 @contextmanager
@@ -81,6 +88,17 @@ def try_lock(folder: Path) -> int | None:
     return descriptor
 
 
+@contextmanager
+def held_folder(folder: Path) -> Iterator[None]:
+    """Wait for the lock of a folder, and hold it."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def is_folder_at(descriptor: int, path: Path) -> bool:
     """Whether an open folder is still the one at `path`."""
     try:
@@ -88,6 +106,25 @@ def is_folder_at(descriptor: int, path: Path) -> bool:
     except FileNotFoundError:
         return False
     return there.st_ino == os.fstat(descriptor).st_ino
+
+
+def unheld_folders(parent: Path) -> Iterator[Path]:
+    """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
+    for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
+        if is_system_file(folder.name):
+            continue
+        try:
+            lock = try_lock(folder)
+        except FileNotFoundError:
+            continue  # committed since we listed
+        if lock is None:
+            continue
+        try:
+            # Its writer may have committed and unlocked it before we locked it.
+            if is_folder_at(lock, folder):
+                yield folder
+        finally:
+            os.close(lock)
 
 
 def write_file(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o644) -> None:
@@ -121,7 +158,7 @@ def _sync(path: Path, how: Callable[[int], None]) -> None:
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o644) -> None:
     """Replace the contents of a file atomically; `mode` are its permissions."""
-    unfinished = path.with_name(path.name + ".partial")
+    unfinished = path.with_name(path.name + PARTIAL)
     unfinished.unlink(missing_ok=True)
     write_file(unfinished, data, mode=mode)
     unfinished.replace(path)
@@ -139,6 +176,14 @@ def folder_bytes(folder: Path) -> int:
                 except FileNotFoundError:
                     continue
     return total
+
+
+class Stamps(NamedTuple):
+    """What changes when a group is replaced or edited: its folder, its content and its remarks."""
+
+    folder: int
+    content: str
+    remarks: str
 
 
 @runtime_checkable
@@ -170,6 +215,10 @@ class GroupFiles(Protocol):
 
     def source(self, name: str) -> ByteSource:
         """A file that is read in parts."""
+        ...
+
+    def names(self) -> list[str]:
+        """Sorted names of all files of the group, with those beside its content."""
         ...
 
 
@@ -238,6 +287,40 @@ class LocalFile:
                 raise
 
 
+def copy_files(files: GroupFiles, names: Iterable[str], folder: Path, *, link: bool) -> None:
+    """Copy files of a group to a folder, durably; with `link` as hard links where that is possible.
+
+    Raises CorruptDataError for a file that is missing or ends early.
+    """
+    with disk_errors(f"copy {files.item_id}"):
+        for name in names:
+            place = folder / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if link and isinstance(files, LocalGroup):
+                try:
+                    os.link(files.path(name), place, follow_symlinks=False)
+                    continue
+                except OSError as error:
+                    # Another file system, or one without hard links.
+                    if error.errno in _FULL:
+                        raise
+            _copy(files, name, place)
+
+
+def _copy(files: GroupFiles, name: str, place: Path) -> None:
+    source = files.source(name)
+    size = source.size()
+    with place.open("xb") as file:
+        for offset in range(0, size or 0, _COPY_BYTES):
+            file.write(source.read(offset, min(_COPY_BYTES, (size or 0) - offset)))
+        file.flush()
+        os.fdatasync(file.fileno())
+        if file.tell() != size:
+            raise CorruptDataError(
+                f"{files.item_id}: {name} has {file.tell()} bytes, expected {size}; verify the item"
+            )
+
+
 class LocalGroup:
     """The files of a group in a local folder.
 
@@ -250,16 +333,17 @@ class LocalGroup:
 
     def get(self, name: str) -> bytes | None:
         """All bytes of a small file; None where there is no such file."""
-        path = self._path(name)
+        path = self.path(name)
         with disk_errors(f"read {path}"):
             if not path.is_file():
                 return None
             try:
                 size = path.stat().st_size
-                if size > MAX_METADATA_BYTES:
+                most = MAX_COMMIT_BYTES if name == COMMIT_FILE else MAX_METADATA_BYTES
+                if size > most:
                     raise CorruptDataError(
-                        f"{self.item_id}: {name} holds {size} bytes, expected at most "
-                        f"{MAX_METADATA_BYTES}"
+                        f"{self.item_id}: {name} holds {size} bytes, expected at most {most}",
+                        too_large=size,
                     )
                 return path.read_bytes()
             except FileNotFoundError:
@@ -271,9 +355,17 @@ class LocalGroup:
 
     def source(self, name: str) -> LocalFile:
         """A file that is read in parts."""
-        return LocalFile(self._path(name))
+        return LocalFile(self.path(name))
 
-    def _path(self, name: str) -> Path:
+    def names(self) -> list[str]:
+        """Sorted names of all files of the group, with those beside its content."""
+        with disk_errors(f"look through {self.item_id}"):
+            found = (path for path in self.folder.rglob("*") if path.is_file())
+            names = (path.relative_to(self.folder).as_posix() for path in found)
+            return sorted(n for n in names if not (is_system_file(n) or n.endswith(PARTIAL)))
+
+    def path(self, name: str) -> Path:
+        """Path of a file; raises CorruptDataError for a symbolic link on the way."""
         path = self.folder
         for part in ("", *name.split("/")):
             path = path / part

@@ -7,11 +7,13 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
 
+from dextouch.episodes.encoded_images import EncodedImages, GroupChunks, IndexedBytes
 from dextouch.episodes.files import GroupFiles, OpenedGroup
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -20,17 +22,26 @@ from dextouch.episodes.format import (
     STAMPS,
     ArrayEntry,
     Kind,
+    Version,
     array_metadata,
     attributes_id,
-    codec_of,
     decode_commit,
     group_attributes,
+    image_codec,
+    index_name,
     sha256_hex,
     shard_path,
     stream_arrays,
 )
-from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks, ImageForm, transform_pixels
-from dextouch.episodes.shards import ShardReader, decode_rows
+from dextouch.episodes.image_codecs import (
+    FULL_FORM,
+    ImageForm,
+    ImageGroups,
+    transform_pixels,
+)
+from dextouch.episodes.inspection import inspect_chunks, inspect_images
+from dextouch.episodes.shards import ShardReader
+from dextouch.episodes.trash import NOTES_FILE, read_remark
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -39,7 +50,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.geometry import nearest_index
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
+from dextouch.schemas import EpisodeAttributes, ItemNotes, RecordingAttributes, Verification
 from dextouch.streams import StreamDescriptor
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
@@ -58,7 +69,9 @@ class GroupContents(Generic[A]):
     content_sha256: str
     what: str
     opened: OpenedGroup
+    version: Version
     _shards: dict[str, ShardReader] = field(default_factory=dict)
+    _images: dict[str, EncodedImages | None] = field(default_factory=dict)
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
@@ -68,13 +81,30 @@ class GroupContents(Generic[A]):
             self._shards[name] = ShardReader(source, entry, what=what, group=self.opened)
         return self._shards[name]
 
+    def images(self, descriptor: StreamDescriptor) -> EncodedImages | None:
+        """The encoded images of a stream, and what was cached of them; None of other streams."""
+        name = descriptor.name
+        if name not in self._images:
+            self._images[name] = self._images_of(name, descriptor)
+        return self._images[name]
+
+    def _images_of(self, name: str, descriptor: StreamDescriptor) -> EncodedImages | None:
+        codec = image_codec(descriptor)
+        if codec is None:
+            return None
+        groups = ImageGroups(codec, descriptor.shape, f"{self.what}: array {name!r}")
+        if self.version == 2:
+            return GroupChunks(groups, self.shard(name))
+        return IndexedBytes(groups, self.shard(name), self.shard(index_name(name)))
+
     def inspect_array(
         self, name: str, *, progress: Callable[[int], None] = lambda _: None
     ) -> Iterator[tuple[int | None, StorageError]]:
         """Iterate over the damage of an array: number of a storage chunk (None for all) and error.
 
-        `progress` gets the size of every intact storage chunk, encoded, in bytes. Raises
-        NotFoundError if the group was deleted or replaced since it was opened.
+        `image` in the details of an error is the damaged image. `progress` gets the size of every
+        intact storage chunk, encoded, in bytes. Raises NotFoundError if the group was deleted or
+        replaced since it was opened.
         """
         for number, error in self._inspect_array(name, progress):
             self.opened.check_present(error)
@@ -84,47 +114,31 @@ class GroupContents(Generic[A]):
         self, name: str, progress: Callable[[int], None]
     ) -> Iterator[tuple[int | None, StorageError]]:
         entry, what = self.entries[name], f"{self.what}: array {name!r}"
-        digest, is_whole = hashlib.sha256(), True
+        is_whole = True
         try:
             metadata = self.files.get(f"{name}/{METADATA_FILE}")
             if metadata != array_metadata(entry):
                 is_whole = False
                 yield None, CorruptDataError(f"{what}: {METADATA_FILE} is damaged")
-            shard = self.shard(name)
-            num_chunks = len(shard.check_index())
+            self.shard(name).check_index()
         except StorageError as error:
             yield None, error
             return
-        for number in range(num_chunks):
-            try:
-                payload = shard.payload(number)
-                digest.update(hashed_bytes(payload, entry, number, what))
-            except StorageError as error:
-                is_whole = False
-                yield number, error
-            else:
-                progress(len(payload))
+        digest = hashlib.sha256()
+        stream = next((s for s in self.attributes.streams if s.name == name), None)
+        images = None if stream is None else self.images(stream)
+        if isinstance(images, IndexedBytes):
+            # Without its index, whose damage is another finding, the hash cannot be computed.
+            is_whole &= images.has_index()
+            found = inspect_images(self.shard(name), images, digest.update, progress)
+        else:
+            found = inspect_chunks(self.shard(name), images, digest.update, progress)
+        for number, damage in found:
+            is_whole = False
+            yield number, damage
         # Also detects damage for which a forger has adapted the checksums.
         if is_whole and digest.hexdigest() != entry.sha256:
             yield None, CorruptDataError(f"{what}: sha256 does not match")
-
-
-def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes | memoryview:
-    """Bytes of a storage chunk that enter its array's hash.
-
-    Images are decoded, since intact bytes of a damaged image are damage, too. Raises
-    CorruptDataError for other rows than expected, or an image that cannot be decoded.
-    """
-    where = f"{what}: storage chunk {number}"
-    num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
-    if entry.codec == "zstd":
-        return decode_rows(payload, entry, what=where)[:num_rows].data
-    chunks = ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
-    images = chunks.unpack(payload, number)
-    if len(images) != num_rows:
-        raise CorruptDataError(f"{where} holds {len(images)} images, expected {num_rows}")
-    chunks.check(payload, number)
-    return payload
 
 
 def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
@@ -158,11 +172,22 @@ def _read_group(opened: OpenedGroup, commit: bytes, kind: Kind, model: type[A]) 
         raise CorruptDataError(f"{what}: attributes do not match their sha256")
     try:
         attributes = group_attributes(group, model)
-        expected = {stream.name: stream_arrays(stream, kind) for stream in attributes.streams}
+        expected = {
+            stream.name: _arrays_of(stream, kind, record.format_version)
+            for stream in attributes.streams
+        }
     except MALFORMED as error:
         raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
-    return GroupContents(files, kind, attributes, record.arrays, content_sha256, what, opened)
+    for stream in attributes.streams:
+        if image_codec(stream) and math.prod(stream.shape[:2]) > MAX_IMAGE_PIXELS:
+            raise CorruptDataError(
+                f"{what}: images of {stream.name!r} are {stream.shape[0]} x {stream.shape[1]} "
+                f"pixels, expected at most {MAX_IMAGE_PIXELS} in all"
+            )
+    return GroupContents(
+        files, kind, attributes, record.arrays, content_sha256, what, opened, record.format_version
+    )
 
 
 def _check_arrays(
@@ -177,15 +202,12 @@ def _check_arrays(
             raise CorruptDataError(f"{what}: arrays {missing} are not in the commit record")
         for name, entry in wanted.items():
             got = arrays[name]
-            if _layout(got) != _layout(entry) or len({arrays[n].shape[0] for n in wanted}) != 1:
+            # Encoded images of v3 have one row for each byte.
+            lengths = {arrays[n].shape[0] for n, one in wanted.items() if one.codec != "bytes"}
+            if _layout(got) != _layout(entry) or len(lengths) != 1:
                 raise CorruptDataError(
                     f"{what}: commit record says {got.dtype} {got.shape} {got.codec} of array "
                     f"{name!r}, which is not what the attributes say of stream {stream!r}"
-                )
-            if got.codec != "zstd" and math.prod(got.shape[1:3]) > MAX_IMAGE_PIXELS:
-                raise CorruptDataError(
-                    f"{what}: images of {name!r} are {got.shape[1]} x {got.shape[2]} pixels, "
-                    f"expected at most {MAX_IMAGE_PIXELS} in all"
                 )
     foreign = sorted(set(arrays) - set(names))
     if foreign or len(set(names)) != len(names):
@@ -195,8 +217,14 @@ def _check_arrays(
         )
 
 
+# Most episodes of a store have the same streams.
+_arrays_of = lru_cache(1024)(stream_arrays)
+
+
 def _layout(entry: ArrayEntry) -> tuple[object, ...]:
-    return entry.dtype, entry.shape[1:], entry.codec
+    # Bytes of encoded images lie at places that follow from the size of their storage chunks.
+    rows = entry.chunk_rows if entry.codec == "bytes" else None
+    return entry.dtype, entry.shape[1:], entry.codec, rows
 
 
 class GroupReader(Generic[A]):
@@ -214,12 +242,11 @@ class GroupReader(Generic[A]):
         self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
         self._whole: dict[str, np.ndarray] = {}
-        # By stream and storage chunk: how many of its first images can be decoded.
+        # By stream and group: how many of its first images can be decoded.
         self._num_decodable: dict[tuple[str, int], int] = {}
-        # Names and codecs of the streams, cached since every window needs them.
+        # Cached since every window needs them.
         stamp = STAMPS[self._kind][0]
         self._stamps = {name: f"{name}_{stamp}" for name in self.streams}
-        self._codecs = {name: codec_of(stream) for name, stream in self.streams.items()}
 
     def num_samples(self, name: str) -> int:
         """Number of samples of a stream, without reading it."""
@@ -251,7 +278,8 @@ class GroupReader(Generic[A]):
         stop = self.num_samples(name) if stop is None else stop
         self._check_span("images", name, start, stop)
         # A forged length must not be expanded to a list of numbers.
-        self._contents.shard(name).check_index()
+        stored = self._contents.images(self.streams[name])
+        (self._contents.shard(name).check_index if stored is None else stored.check_claim)()
         return self.images_at(name, np.arange(start, stop))
 
     def images_at(
@@ -263,7 +291,8 @@ class GroupReader(Generic[A]):
             raise InvalidInputError(f"{self._what}: {name!r} holds no images")
         if len(indices):
             self._check_span("images", name, int(indices[0]), int(indices[-1]) + 1)
-        if codec_of(descriptor) == "zstd":
+        stored = self._contents.images(descriptor)
+        if stored is None:
             first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
             images = self._contents.shard(name).read(first, stop)
             if not np.array_equal(indices, np.arange(first, stop)):
@@ -271,7 +300,7 @@ class GroupReader(Generic[A]):
             return images if form == FULL_FORM else transform_pixels(images, form)
         unique, places = np.unique(indices, return_inverse=True)
         images = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
-        self._decode_images(descriptor, unique, form, images)
+        _decode_images(stored, unique, form, images)
         return images if len(unique) == len(indices) else images[places]
 
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
@@ -281,29 +310,23 @@ class GroupReader(Generic[A]):
         damage.
         """
         descriptor = self._stream(name)
-        if codec_of(descriptor) == "zstd":
+        stored = self._contents.images(descriptor)
+        if stored is None:
             raise InvalidInputError(
                 f"{self._what}: {name!r} has the unit {descriptor.unit!r}, not 'jpeg' or 'h264'"
             )
         self._check_span("images", name, start, stop)
-        chunks, shard = self._image_chunks(descriptor), self._contents.shard(name)
-        first = start // chunks.rows
+        size = stored.groups.size
+        first = start // size
         images: list[bytes] = []
-        for number in range(first, -(-stop // chunks.rows) if stop > start else first):
-            group = chunks.unpack(shard.payload(number), number)
-            expected = min(chunks.rows, self.num_samples(name) - number * chunks.rows)
-            if len(group) != expected:
-                raise CorruptDataError(
-                    f"{self._what}: array {name!r}: storage chunk {number} holds {len(group)} "
-                    f"images, expected {expected}"
-                )
-            images += group
-        return images[start - first * chunks.rows : stop - first * chunks.rows]
+        for number in range(first, -(-stop // size) if stop > start else first):
+            images += stored.read_group(number, stop - number * size)
+        return images[start - first * size :]
 
     def damaged_images(
         self, name: str, indices: np.ndarray | None = None
     ) -> Int64[np.ndarray, " damaged"]:
-        """Those of a camera's images (None for all) that cannot be decoded: decodes their chunks.
+        """Those of a camera's images (None for all) that cannot be decoded: decodes their groups.
 
         What a decoder would fill in is no image: readers by time treat such an image, and those of
         its H.264 group that depend on it, as images that were never recorded. A stream without
@@ -313,15 +336,16 @@ class GroupReader(Generic[A]):
         descriptor = self._stream(name)
         if indices is None:
             indices = np.arange(self.num_samples(name))
-        if descriptor.kind != "image" or self._codecs[name] == "zstd":
+        stored = self._contents.images(descriptor)
+        if descriptor.kind != "image" or stored is None:
             return np.zeros(0, dtype=np.int64)
-        chunks = self._image_chunks(descriptor)
-        numbers, inverse = np.unique(indices // chunks.rows, return_inverse=True)
+        size = stored.groups.size
+        numbers, inverse = np.unique(indices // size, return_inverse=True)
         num_decodable = [
-            self._num_decodable_in(chunks, name, number) for number in numbers.tolist()
+            self._num_decodable_in(stored, name, number) for number in numbers.tolist()
         ]
         limits = np.array(num_decodable, dtype=np.int64)[inverse]
-        return indices[indices % chunks.rows >= limits].astype(np.int64)
+        return indices[indices % size >= limits].astype(np.int64)
 
     def nearest_images(self, name: str, t_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
         """Index of the image nearest to each time, of those that can be decoded.
@@ -336,6 +360,11 @@ class GroupReader(Generic[A]):
                 return nearest
             usable = np.setdiff1d(usable, damaged)
         raise NotFoundError(f"{self._what}: {name!r} holds no image that can be decoded")
+
+    def notes(self) -> ItemNotes:
+        """Notes of people on time ranges, as they are now; raises CorruptDataError for others."""
+        files = self._contents.files
+        return read_remark(files, NOTES_FILE, ItemNotes, what=self._what) or ItemNotes()
 
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record, up to the first damage.
@@ -381,16 +410,13 @@ class GroupReader(Generic[A]):
         high = len(stamps) if stop_ns is None else int(stamps.searchsorted(stop_ns))
         return low, max(low, high)
 
-    def _num_decodable_in(self, chunks: ImageChunks, name: str, number: int) -> int:
+    def _num_decodable_in(self, stored: EncodedImages, name: str, number: int) -> int:
         if (name, number) not in self._num_decodable:
-            payload, found = self._contents.shard(name).payload(number), chunks.rows
+            images, found = stored.read_group(number), stored.groups.size
             try:
-                chunks.check(payload, number)
+                stored.groups.check(images, number)
             except CorruptDataError as error:
-                # Without a place it is the storage chunk that is invalid.
-                if not isinstance(place := error.details.get("place"), int):
-                    raise
-                found = place
+                found = int(str(error.details["place"]))
             self._num_decodable[name, number] = found
         return self._num_decodable[name, number]
 
@@ -408,22 +434,19 @@ class GroupReader(Generic[A]):
             return kept, self.images_at(name, kept, form=form)
 
     def _values(self, name: str, start: int, stop: int) -> np.ndarray:
-        if self._codecs[name] == "zstd":
+        if self._contents.images(self.streams[name]) is None:
             return self._contents.shard(name).read(start, stop)
         return self.images_at(name, np.arange(start, stop))
 
-    def _image_chunks(self, descriptor: StreamDescriptor) -> ImageChunks:
-        entry = self._contents.entries[descriptor.name]
-        what = f"{self._what}: array {descriptor.name!r}"
-        return ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
 
-    def _decode_images(
-        self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm, out: np.ndarray
-    ) -> None:
-        chunks, shard = self._image_chunks(descriptor), self._contents.shard(descriptor.name)
-        numbers, starts = np.unique(indices // chunks.rows, return_index=True)
-        bounds: list[int] = np.append(starts, len(indices)).tolist()
-        for place, number in enumerate(numbers.tolist()):
-            low, high = bounds[place], bounds[place + 1]
-            places = (indices[low:high] - number * chunks.rows).tolist()
-            chunks.decode(shard.payload(number), number, places, form, out[low:high])
+def _decode_images(
+    stored: EncodedImages, indices: np.ndarray, form: ImageForm, out: np.ndarray
+) -> None:
+    size = stored.groups.size
+    numbers, starts = np.unique(indices // size, return_index=True)
+    bounds: list[int] = np.append(starts, len(indices)).tolist()
+    for place, number in enumerate(numbers.tolist()):
+        low, high = bounds[place], bounds[place + 1]
+        places = (indices[low:high] - number * size).tolist()
+        images = stored.read_group(number, places[-1] + 1)
+        stored.groups.decode(images, number, places, form, out[low:high])

@@ -1,9 +1,8 @@
 """Image codecs of the store: JPEG, and H.264 in closed groups of pictures through PyAV.
 
-A `jpeg` storage chunk is the bytes of one JPEG image. An `h264` one is a closed group of pictures:
-u32 number of images, u32 length of each access unit, the access units; little endian. One access
-unit is one image; without B-frames their order is that of the input, so image k of a group needs
-exactly its first k + 1 access units. No other module of the store uses PyAV.
+A `jpeg` group is one image, an `h264` one a closed group of pictures. One access unit is one image;
+without B-frames their order is that of the input, so image k of a group needs exactly its first
+k + 1 access units. No other module of the store uses PyAV.
 
 A decoder fills in what is missing of a damaged image, and the place of a lost reference picture;
 such an image is refused here, and so are the images of its group that depend on it. The headers of
@@ -16,13 +15,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
 
-from dextouch.episodes.format import GOP_IMAGES, Codec
+from dextouch.episodes.format import GOP_IMAGES, GROUP_IMAGES, ImageCodec
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import check_jpeg, decode_jpeg
@@ -35,6 +35,14 @@ if TYPE_CHECKING:
 # path, which takes little more than half the time at the same PSNR.
 _TO_YUV = 0x20 | 0x4000
 _TO_RGB = "BICUBIC"
+
+
+@cache
+def _one_thread() -> dict[str, Any]:
+    """Arguments by which PyAV converts images in this thread: from 17 on it starts others."""
+    import av
+
+    return {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
 
 
 class VideoSettings(FrozenModel):
@@ -145,7 +153,9 @@ class GopEncoder:
                 f"H.264: got {image.dtype} {image.shape}, expected uint8 {self._shape}"
             )
         rgb = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(image), format="rgb24")
-        frame = self._reformatter.reformat(rgb, format="yuv420p", interpolation=_TO_YUV, threads=1)
+        frame = self._reformatter.reformat(
+            rgb, format="yuv420p", interpolation=_TO_YUV, **_one_thread()
+        )
         frame.pts = self._index
         packets = self._context.encode(frame)
         if len(packets) != 1:
@@ -263,7 +273,7 @@ class GopDecoder:
             format="gray" if form.gray else "rgb24",
             # Area scaling averages each 2×2 pixels, as the other codecs do.
             interpolation="AREA" if form.half_size else _TO_RGB,
-            threads=1,
+            **_one_thread(),
         )
         plane = converted.planes[0]
         rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
@@ -290,76 +300,73 @@ def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None
         pass
 
 
-def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:
-    """Pack one JPEG image, or the access units of one group of pictures, into a storage chunk."""
+def pack_group(codec: ImageCodec, images: Sequence[bytes]) -> bytes:
+    """Bytes of a group in hashes, and in storage chunks of v2.
+
+    Of `jpeg` the image; of `h264` u32 number of images, u32 length of each, the images; little
+    endian.
+    """
     if codec == "jpeg":
         return images[0]
     return struct.pack(f"<{1 + len(images)}I", len(images), *map(len, images)) + b"".join(images)
 
 
-@dataclass(frozen=True)
-class ImageChunks:
-    """Decoder for the storage chunks of one image array.
+def unpack_group(codec: ImageCodec, payload: bytes, what: str) -> list[bytes]:
+    """Inverse of `pack_group`; raises CorruptDataError, `what` names the storage chunk in it."""
+    if codec == "jpeg":
+        return [payload]
+    count, most = int.from_bytes(payload[:4], "little"), GROUP_IMAGES[codec]
+    if not 1 <= count <= most or len(payload) < 4 * (1 + count):
+        raise CorruptDataError(f"{what}: got {count} images, expected 1 … {most}")
+    lengths = struct.unpack_from(f"<{count}I", payload, 4)
+    bounds = list(accumulate(lengths, initial=4 * (1 + count)))
+    if bounds[-1] != len(payload):
+        raise CorruptDataError(f"{what}: images end at byte {bounds[-1]} of {len(payload)}")
+    return [payload[start:stop] for start, stop in pairwise(bounds)]
 
-    `shape` is [h, w, 3] of an image, `rows` the number of images per storage chunk, `what` the
-    array's name in errors.
+
+@dataclass(frozen=True)
+class ImageGroups:
+    """Decoder for the groups of one stream of encoded images.
+
+    `shape` is [h, w, 3] of an image, `what` the array's name in errors.
     """
 
-    codec: Codec
+    codec: ImageCodec
     shape: tuple[int, ...]
-    rows: int
     what: str
 
-    def unpack(self, payload: bytes, number: int) -> list[bytes]:
-        """Split storage chunk `number` into its encoded images, the inverse of `pack_chunk`.
-
-        Raises CorruptDataError if it is invalid.
-        """
-        if self.codec == "jpeg":
-            return [payload]
-        what = f"{self.what}: storage chunk {number}"
-        count = int.from_bytes(payload[:4], "little") if len(payload) >= 4 else 0
-        if not 1 <= count <= self.rows or len(payload) < 4 * (1 + count):
-            raise CorruptDataError(f"{what}: got {count} images, expected 1 … {self.rows}")
-        lengths = struct.unpack_from(f"<{count}I", payload, 4)
-        bounds = list(accumulate(lengths, initial=4 * (1 + count)))
-        if bounds[-1] != len(payload):
-            raise CorruptDataError(f"{what}: images end at byte {bounds[-1]} of {len(payload)}")
-        return [payload[start:stop] for start, stop in pairwise(bounds)]
+    @property
+    def size(self) -> int:
+        """Images of a group; the last one may have fewer."""
+        return GROUP_IMAGES[self.codec]
 
     def decode(
-        self, payload: bytes, number: int, places: list[int], form: ImageForm, out: np.ndarray
+        self, images: list[bytes], number: int, places: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
+        """Decode images of group `number` into `out`.
 
-        `places` are the ascending indices of the requested images in the chunk, `out` is uint8
-        [len(places), *form.shape(shape)]. Raises CorruptDataError for invalid image data.
+        `images` are those of the group up to the last requested one, `places` the ascending indices
+        of the requested ones in the group, `out` is uint8 [len(places), *form.shape(shape)]. Raises
+        CorruptDataError for invalid image data.
         """
-        images = self.unpack(payload, number)
-        if places[-1] >= len(images):
-            raise CorruptDataError(
-                f"{self.what}: storage chunk {number} holds {len(images)} images, "
-                f"expected image {places[-1]}"
-            )
         with self._located(number):
             if self.codec == "jpeg":
                 self._decode_jpeg(images[0], form, out[0])
             else:
-                decoder = decoder_of_this_thread(*self.shape[:2])
-                decoder.decode(images[: places[-1] + 1], places, form, out)
+                decoder_of_this_thread(*self.shape[:2]).decode(images, places, form, out)
 
-    def check(self, payload: bytes, number: int) -> None:
-        """Decode storage chunk `number` by the rule of `decode`, and discard the images.
+    def check(self, images: list[bytes], number: int) -> None:
+        """Decode group `number` by the rule of `decode`, and discard the images.
 
-        Raises CorruptDataError if it is invalid, or for an image that cannot be decoded: then
-        `place` in the details is the first such image of the chunk.
+        Raises CorruptDataError for an image that cannot be decoded; `place` in the details is the
+        first such image of the group.
         """
-        images, size_px = self.unpack(payload, number), (self.shape[0], self.shape[1])
         with self._located(number):
             if self.codec == "jpeg":
-                check_jpeg(images[0], size_px)
+                check_jpeg(images[0], (self.shape[0], self.shape[1]))
             else:
-                check_group(images, size_px)
+                check_group(images, (self.shape[0], self.shape[1]))
 
     @contextmanager
     def _located(self, number: int) -> Iterator[None]:
@@ -369,10 +376,11 @@ class ImageChunks:
         except CorruptDataError as error:
             place = int(str(error.details.get("place", 0)))
             raise CorruptDataError(
-                f"{self.what}: storage chunk {number}: image {number * self.rows + place}: "
+                f"{self.what}: image {number * self.size + place}: "
                 f"{error.message}; readers by time leave out such images, and "
                 "`dextouch store repair` writes the item without them",
                 place=place,
+                image=number * self.size + place,
             ) from error
 
     def _decode_jpeg(self, data: bytes, form: ImageForm, out: np.ndarray) -> None:
@@ -404,6 +412,8 @@ START_CODE = b"\x00\x00\x01"
 SLICE, IDR_SLICE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS = 1, 5, 7, 8
 # Profiles whose parameter sets begin with the chroma format (7.3.2.1.1).
 _CHROMA_PROFILES = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
+# Times from one image to the next after which one is missing, where only they tell.
+MOST_STEPS = 2.5
 # More than enough for the fields of a slice header up to its frame number.
 _HEADER_BYTES = 32
 
@@ -486,6 +496,42 @@ def first_gap(access_units: Sequence[bytes]) -> int | None:
         if nal[0] & 0x60:
             last_reference = number
     return None
+
+
+class FrameNumbers:
+    """The numbers of a video's pictures, access unit by access unit (see `first_gap`)."""
+
+    def __init__(self) -> None:
+        self._parameters: _SequenceParameters | None = None
+        self._last_reference = 0
+        self._is_whole = True
+
+    def is_whole(self, access_unit: bytes, num_steps: float) -> bool:
+        """Whether no reference picture is missing since the last IDR picture.
+
+        `num_steps` is the time since the access unit before, in those from one image to the next:
+        numbers repeat, and some encoders skip them. Raises CorruptDataError without a readable
+        header; what follows is not whole then.
+        """
+        was_whole, self._is_whole = self._is_whole, False
+        if any(nal[0] & 0x1F == SEQUENCE_PARAMETERS for nal in nal_units(access_unit)):
+            self._parameters = _parameters(access_unit)
+        nal = _first_slice(access_unit)
+        is_first, parameters = nal[0] & 0x1F == IDR_SLICE, self._parameters
+        if parameters is None:
+            self._is_whole = was_whole
+            return was_whole
+        number, size = _frame_number(nal, parameters), 1 << parameters.number_bits
+        follows = parameters.may_skip_numbers or number == (self._last_reference + 1) % size
+        most = MOST_STEPS if parameters.may_skip_numbers else max(MOST_STEPS, size / 2)
+        if nal[0] & 0x60:
+            self._last_reference = number
+        self._is_whole = is_first or (was_whole and follows and num_steps < most)
+        return self._is_whole
+
+    def lose(self) -> None:
+        """Say that a picture could not be decoded."""
+        self._is_whole = False
 
 
 def _first_slice(access_unit: bytes) -> bytes:

@@ -3,6 +3,7 @@
 Errors of obstore, which no other module uses, are mapped to DexTouch errors.
 """
 
+import builtins
 import hashlib
 import os
 import re
@@ -281,6 +282,12 @@ class Bucket:
             for some in obstore.list(self._store, prefix=folder):
                 for found in some:
                     yield _facts(found)
+
+    def folders(self, folder: str) -> builtins.list[str]:
+        """Names of the prefixes directly below one; takes one request per 1000."""
+        with self._errors("list", folder):
+            found = obstore.list_with_delimiter(self._store, prefix=folder)["common_prefixes"]
+        return [prefix.rpartition("/")[2] for prefix in found]
 
     def remove(self, keys: Sequence[str]) -> None:
         """Delete objects; missing ones are ignored."""

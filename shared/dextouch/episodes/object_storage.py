@@ -7,29 +7,31 @@ they overwrite anything.
 """
 
 import builtins
-import hashlib
 import shutil
 import threading
 import uuid
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import structlog
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.files import disk_errors, write_file
+from dextouch.episodes.files import Stamps, disk_errors, unheld_folders, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
     KINDS,
+    METADATA_FILE,
     Attributes,
     Kind,
     attributes_id,
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages, unheld_folders
+from dextouch.episodes.trash import REMARK_FILES
+from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
 from dextouch.errors import (
     ConflictError,
     DexTouchError,
@@ -56,6 +58,8 @@ _DELETING = b"deleting"
 # Uploads older than this count as abandoned.
 ORPHAN_AGE = timedelta(days=1)
 _PARALLEL_REQUESTS = 8
+# Listing one group takes a request, listing all of them one per 1000 objects.
+_MAX_ONE_BY_ONE = 20
 
 
 class ObjectFile:
@@ -158,6 +162,12 @@ class ObjectGroup:
         """A file for range reads."""
         return ObjectFile(self._bucket, f"{self._folder}/{name}")
 
+    def names(self) -> list[str]:
+        """Sorted names of all files of the group, with those beside its content."""
+        keys = (facts.key for facts in self._bucket.list(self._folder))
+        names = (key.removeprefix(f"{self._folder}/") for key in keys)
+        return sorted(name for name in names if name != CLAIM_FILE)
+
 
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
@@ -223,15 +233,7 @@ class ObjectStorage:
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         """Whether an id is committed."""
-        return self._commit_facts(kind, item_id) is not None
-
-    def revision(self, kind: Kind, item_id: str) -> int:
-        """A 63-bit hash of the commit record's entity tag and modification time."""
-        facts = self._commit_facts(kind, item_id)
-        if facts is None:
-            raise self._missing(kind, item_id)
-        text = f"{facts.etag} {facts.modified.isoformat()}"
-        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}") is not None
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         """Size of a committed group in the bucket."""
@@ -243,6 +245,28 @@ class ObjectStorage:
         """Sorted committed ids; takes one request per 1000 objects in the bucket."""
         keys = (facts.key.split("/") for facts in self._bucket.list(f"{kind}s"))
         return sorted(parts[1] for parts in keys if len(parts) == 3 and parts[2] == COMMIT_FILE)
+
+    def folder_numbers(self, kind: Kind) -> dict[str, int]:
+        """Ids of a kind; takes one request per 1000 of them."""
+        return dict.fromkeys(self._bucket.folders(f"{kind}s"), 0)
+
+    def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
+        """Entity tags of what a catalog is made of: of few ids one by one, of many from a list."""
+        is_few = len(numbers) <= _MAX_ONE_BY_ONE
+        folders = [group_key(kind, name) for name in numbers] if is_few else [f"{kind}s"]
+        tags: dict[str, dict[str, str]] = {}
+        for facts in (one for folder in folders for one in self._bucket.list(folder)):
+            _, name, *rest = facts.key.split("/")
+            tags.setdefault(name, {})["/".join(rest)] = facts.etag
+        return {
+            name: Stamps(
+                number,
+                f"{tags[name][COMMIT_FILE]} {tags[name].get(METADATA_FILE, '')}",
+                " ".join(tags[name].get(file, "") for file in REMARK_FILES),
+            )
+            for name, number in numbers.items()
+            if COMMIT_FILE in tags.get(name, {})
+        }
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
@@ -258,6 +282,11 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
+
+    def held(self, kind: Kind, item_id: str, *, waits: bool) -> AbstractContextManager[None]:
+        """Nothing: a bucket has no locks; only that the group exists."""
+        self.group(kind, item_id)
+        return nullcontext()
 
     def complete_uploads(self) -> builtins.list[tuple[Kind, str]]:
         """Upload what waits in the outbox; see `EpisodeStore.complete_uploads`."""
@@ -333,9 +362,6 @@ class ObjectStorage:
                     f"{self._address}: work folder {self.root} belongs to another address; "
                     "give each its own"
                 )
-
-    def _commit_facts(self, kind: Kind, item_id: str) -> ObjectFacts | None:
-        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}")
 
     def _missing(self, kind: Kind, item_id: str) -> NotFoundError:
         return NotFoundError(f"{kind} {item_id!r}: not in the store {self._address}")

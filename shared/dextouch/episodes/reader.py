@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, get_args, overload
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
-from dextouch.episodes.format import MALFORMED, STAMPS, stream_arrays, stream_content
+from dextouch.episodes.format import MALFORMED, STAMPS, stream_content
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
 from dextouch.episodes.validity import measured_actions, measured_taxels
@@ -271,9 +271,10 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         """Number of samples and digest of each stream, as committed; nothing is read for it."""
         found = {}
         for stream in self.attributes.streams:
-            arrays = [self._contents.entries[name] for name in stream_arrays(stream, "recording")]
+            names = [stream.name, *(f"{stream.name}_{stamp}" for stamp in STAMPS["recording"])]
+            arrays = [self._contents.entries[name] for name in names]
             digests = [array.sha256 for array in arrays]
-            found[stream.name] = stream_content(arrays[0].shape[0], digests)
+            found[stream.name] = stream_content(arrays[-1].shape[0], digests)
         return found
 
     def stamps(self, name: str) -> SampleBatch:

@@ -1,10 +1,12 @@
-"""Zarr v3 shard files: reader and writer of rows or encoded storage chunks.
+"""Zarr v3 shard files: reader and writer of rows, encoded storage chunks or bytes.
 
 A shard has the standard `sharding_indexed` layout: concatenated encoded storage chunks, then
 (offset, length) of each as uint64, then crc32c of that index. Every storage chunk ends in its own
 crc32c, so a flipped bit or a truncated file is always detected.
 """
 
+import base64
+import binascii
 import hashlib
 import math
 import os
@@ -31,6 +33,10 @@ _H264_MIN_BYTES = 4 + 3 + 1
 # Adjacent storage chunks are fetched together up to this many bytes: enough for most windows in one
 # request, while whole arrays are still read in pieces.
 _SPAN_BYTES = 1 << 21
+# A writer collects small storage chunks, such as those of stamps, up to this many bytes.
+_WRITE_BYTES = 1 << 16
+# At most IOV_MAX of Linux, 1024.
+_WRITE_PARTS = 512
 # Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
 # earlier releases wrote.
 MAX_CHUNK_BYTES = 1 << 29
@@ -69,13 +75,23 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
         raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
 
 
+def crc_of(data: bytes) -> bytes:
+    """The crc32c of bytes as it is stored."""
+    return google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
+
+
 def with_crc(data: bytes) -> bytes:
     """Append the crc32c to bytes."""
-    return data + google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
+    return data + crc_of(data)
 
 
-def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -> bytes:
-    """Verify the checksum of `length` bytes from `start` on, and return the bytes without it."""
+def _without_crc(
+    data: memoryview | bytes, start: int, length: int, what: str, expected: bytes | None = None
+) -> bytes:
+    """Verify the checksum of `length` bytes from `start` on, and return the bytes without it.
+
+    `expected` is the checksum that the commit record says they have.
+    """
     stop = start + length
     if len(data) < stop:
         raise CorruptDataError(
@@ -88,6 +104,11 @@ def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -
         raise CorruptDataError(
             f"{what}: checksum mismatch ({length} bytes read); "
             "the file is damaged or truncated, restore it from a copy"
+        )
+    if expected is not None and expected != crc:
+        raise CorruptDataError(
+            f"{what}: is intact, but its checksum is not that in the commit record; the file is "
+            "another one of the same size, restore the right one from a copy"
         )
     return body
 
@@ -111,10 +132,11 @@ class ShardReader:
         self._source, self._entry, self._what = source, entry, what
         self._dtype, self._row_bytes = _row_layout(entry)
         self._chunk_bytes = entry.chunk_rows * self._row_bytes
-        self._num_rows, self._rows_each = entry.shape[0], entry.chunk_rows
-        self._num_chunks = -(-entry.shape[0] // entry.chunk_rows)
+        self.num_rows, self.chunk_rows = entry.shape[0], entry.chunk_rows
+        self.num_chunks = -(-entry.shape[0] // entry.chunk_rows)
         self._index = index
         self._group = group
+        self._crcs = _committed_crcs(entry, self.num_chunks, what)
 
     def read(self, start: int = 0, stop: int | None = None) -> Shaped[np.ndarray, "n ..."]:
         """Rows start … stop-1; only the storage chunks that contain them are read and decoded.
@@ -129,7 +151,7 @@ class ShardReader:
             raise
 
     def _read(self, start: int, stop: int | None) -> Shaped[np.ndarray, "n ..."]:
-        num_rows, rows_each = self._num_rows, self._rows_each
+        num_rows, rows_each = self.num_rows, self.chunk_rows
         stop = num_rows if stop is None else stop
         if not 0 <= start <= stop <= num_rows:
             raise InvalidInputError(
@@ -152,15 +174,51 @@ class ShardReader:
             )
         return rows.view(self._dtype).reshape(stop - start, *self._entry.shape[1:])
 
+    def rows_of(self, payload: bytes, number: int) -> Shaped[np.ndarray, "n ..."]:
+        """The rows of a storage chunk of numbers, without padding; raises as `decompress`."""
+        rows = decode_rows(payload, self._entry, what=f"{self._what}: storage chunk {number}")
+        return rows[: self.num_rows - number * self.chunk_rows]
+
     def payload(self, number: int) -> bytes:
         """The encoded bytes of one storage chunk, verified, without checksum; raises as `read`."""
         what = f"{self._what}: storage chunk {number}"
         try:
             offset, length = self._checked_index()[number].tolist()
-            return _without_crc(self._source.read(offset, length), 0, length, what)
+            data = self._source.read(offset, length)
+            return _without_crc(data, 0, length, what, self._crc(number))
         except StorageError as error:
             self._check_present(error)
             raise
+
+    def read_bytes(self, start: int, stop: int) -> bytes:
+        """Bytes start … stop−1 of a `bytes` array, which the caller verifies.
+
+        The checksums of the storage chunks are not looked at, since an index has those of images.
+        Raises as `read`.
+        """
+        rows, step = self.chunk_rows, self.chunk_rows + CRC_BYTES
+        first, last = start // rows, (stop - 1) // rows
+        begin, end = start + first * CRC_BYTES, stop + last * CRC_BYTES
+        try:
+            self._checked_index()
+            data = self._source.read(begin, end - begin)
+            if len(data) != end - begin:
+                raise CorruptDataError(
+                    f"{self._what}: bytes {start} … {stop - 1} lie outside the file; the file is "
+                    "truncated, restore it from a copy"
+                )
+        except StorageError as error:
+            self._check_present(error)
+            raise
+        head = (first + 1) * rows - start
+        if first == last:
+            return bytes(data)
+        later = range(head + CRC_BYTES, len(data), step)
+        return b"".join([data[:head], *(data[place : place + rows] for place in later)])
+
+    def _crc(self, number: int) -> bytes | None:
+        place = number * CRC_BYTES
+        return None if self._crcs is None else self._crcs[place : place + CRC_BYTES]
 
     def _payloads(self, number: int, places: list[list[int]]) -> Iterator[tuple[str, bytes]]:
         """Error label and payload of storage chunks from `number` on, by offset and length.
@@ -176,7 +234,7 @@ class ShardReader:
             data = self._source.read(begin, end - begin)
             for offset, length in places[:count]:
                 what = f"{self._what}: storage chunk {number}"
-                yield what, _without_crc(data, offset - begin, length, what)
+                yield what, _without_crc(data, offset - begin, length, what, self._crc(number))
                 number += 1
             places = places[count:]
 
@@ -200,7 +258,7 @@ class ShardReader:
             size = self._source.size()
             if size is None:
                 raise CorruptDataError(f"{self._what}: its shard file is missing")
-            index_bytes = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
+            index_bytes = self.num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
             if size < index_bytes:
                 raise CorruptDataError(
                     f"{self._what}: file is too short for its index of {index_bytes} bytes"
@@ -229,13 +287,30 @@ class ShardReader:
         rows = np.full(len(lengths), entry.chunk_rows)
         rows[-1:] = entry.shape[0] - (len(lengths) - 1) * entry.chunk_rows
         needed = rows * (_H264_MIN_BYTES if entry.codec == "h264" else 1)
-        if entry.codec == "zstd":
+        if entry.codec == "bytes":
+            needed[:] = entry.chunk_rows + CRC_BYTES
+        elif entry.codec == "zstd":
             needed[:] = -(-self._chunk_bytes // _ZSTD_MAX_RATIO)
         if len(bad := np.flatnonzero(lengths < needed)):
             raise CorruptDataError(
                 f"{self._what}: storage chunks of {entry.chunk_rows} rows need at least "
                 f"{needed[bad[0]]} bytes, got one of {lengths[bad[0]]}"
             )
+
+
+def _committed_crcs(entry: ArrayEntry, num_chunks: int, what: str) -> bytes | None:
+    if entry.crc32c is None:
+        return None
+    try:
+        crcs = base64.b64decode(entry.crc32c, validate=True)
+    except binascii.Error as error:
+        raise CorruptDataError(f"{what}: checksums in the commit record: {error}") from error
+    if len(crcs) != num_chunks * CRC_BYTES:
+        raise CorruptDataError(
+            f"{what}: commit record has {len(crcs)} bytes of checksums, expected {CRC_BYTES} for "
+            f"each of {num_chunks} storage chunks"
+        )
+    return crcs
 
 
 def _row_layout(entry: ArrayEntry) -> tuple[np.dtype[Any], int]:
@@ -251,7 +326,7 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 
 
 class ShardWriter:
-    """Appends rows to a new shard of a stage; buffers at most one storage chunk.
+    """Appends rows to a new shard of a stage; buffers at most one storage chunk and 64 KiB.
 
     The entry of the array has 0 rows and no hash yet. Raises StorageError if a file cannot be
     created, StorageFullError without space; nothing can be appended afterwards.
@@ -267,6 +342,12 @@ class ShardWriter:
             else np.zeros(0, dtype=self._dtype)
         )
         self._num_pending = 0
+        # Of a `bytes` array, what does not fill a storage chunk yet.
+        self._rest = b""
+        self._crcs = bytearray()
+        # Not written yet.
+        self._parts: list[bytes] = []
+        self._num_waiting = 0
         self._sha256 = hashlib.sha256()
         # Offset and length of each storage chunk.
         self._index: list[tuple[int, int]] = []
@@ -286,22 +367,36 @@ class ShardWriter:
             if self._num_pending == len(self._chunk):
                 self._write_rows()
 
-    def append_encoded(self, payload: bytes, num_rows: int) -> None:
-        """Append one encoded storage chunk of an image codec."""
-        self.num_rows += num_rows
-        self._sha256.update(payload)
-        self._write_chunk(payload)
+    def append_bytes(self, data: bytes) -> None:
+        """Append to a `bytes` array, whose sha256 is the caller's to compute."""
+        self.num_rows += len(data)
+        size = self._entry.chunk_rows
+        place = min(len(data), size - len(self._rest))
+        self._rest += data[:place]
+        while len(self._rest) == size:
+            self._write(self._rest, crc_of(self._rest))
+            self._rest = data[place : place + size]
+            place += size
 
     def finish(self) -> ArrayEntry:
         """Complete the shard and return the array's entry of the commit record."""
         if self._num_pending:
             self._chunk[self._num_pending :] = 0
             self._write_rows()
-        index = np.array(self._index, dtype="<u8").reshape(-1, 2).tobytes()
-        self._write(with_crc(index))
+        if self._rest:
+            self._write(with_crc(self._rest.ljust(self._entry.chunk_rows, b"\0")))
+        index = np.array(self._index, dtype="<u8").reshape(-1, 2)
+        if self._entry.codec == "bytes":
+            step = self._entry.chunk_rows + CRC_BYTES
+            numbers = np.arange(-(-self.num_rows // self._entry.chunk_rows), dtype="<u8")
+            index = np.stack([numbers * step, np.full_like(numbers, step)], axis=1)
+        self._write(with_crc(index.tobytes()))
+        self._flush()
         self.close()
-        entry = with_rows(self._entry, self.num_rows)
-        return entry.model_copy(update={"sha256": self._sha256.hexdigest()})
+        update: dict[str, object] = {"sha256": self._sha256.hexdigest()}
+        if self._entry.codec == "zstd":
+            update["crc32c"] = base64.b64encode(self._crcs).decode()
+        return with_rows(self._entry, self.num_rows).model_copy(update=update)
 
     def close(self) -> None:
         """Close the file; without a prior `finish` it is no shard."""
@@ -314,15 +409,24 @@ class ShardWriter:
     def _write_rows(self) -> None:
         data = self._chunk.tobytes()
         num_rows = self._num_pending
-        self._write_chunk(compress(data))
+        self._write(self._indexed(compress(data)))
         self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
         self._num_pending = 0
 
-    def _write_chunk(self, payload: bytes) -> None:
+    def _indexed(self, payload: bytes) -> bytes:
+        """The next storage chunk with its checksum, entered in the index."""
         data = with_crc(payload)
-        self._write(data)
+        self._crcs += data[-CRC_BYTES:]
         self._index.append((sum(self._index[-1]) if self._index else 0, len(data)))
+        return data
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
+        self._parts += parts
+        self._num_waiting += sum(map(len, parts))
+        if self._num_waiting >= _WRITE_BYTES or len(self._parts) >= _WRITE_PARTS:
+            self._flush()
+
+    def _flush(self) -> None:
+        parts, self._parts, self._num_waiting = self._parts, [], 0
         with disk_errors(f"write array {self._name}", advice="free space on the disk of the store"):
-            write_parts(self._file, data)
+            write_parts(self._file, *parts)

@@ -5,7 +5,8 @@ select episodes here and read them through `EpisodeGrid`, so that they agree on 
 """
 
 import hashlib
-from collections import Counter
+import math
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Final
@@ -14,7 +15,7 @@ import numpy as np
 import structlog
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes.format import KINDS
+from dextouch.episodes.format import KINDS, Attributes, attributes_id, kind_of
 from dextouch.episodes.needs import ACTIONS, OUTCOME, Need
 from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
@@ -29,31 +30,36 @@ from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation,
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile.layout import TactileLayout
 
+Span = tuple[float, float]
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 
 logger = structlog.get_logger(__name__)
 
 
 def is_rejected(
-    store: EpisodeStore, about: EpisodeAttributes, *, others: Iterable[EpisodeStore] = ()
+    store: EpisodeStore, about: Attributes, *, others: Iterable[EpisodeStore] = ()
 ) -> bool:
-    """Whether an episode must not be trained on, by its own review.
+    """Whether an episode or recording must not be trained on, by its own review.
 
     One without a review is rejected with a recording or episode that it was made from, if that is
-    in the same store or in one of `others`.
+    in the same store or in one of `others`. An item that was edited is rejected as long as one
+    of the results is in one of these stores, and the results are not rejected with it.
     """
-    own = store.review(about.episode_id)
-    if own is not None:
-        return own.verdict == "rejected"
-    places = (store, *others)
-    sources = [(one.id, kind) for one in about.lineage for kind in KINDS if one.kind == kind]
-    reviews = (
-        place.review(name, kind=kind)
-        for name, kind in sources
-        for place in places
-        if place.exists(name, kind=kind)
+    places, own_kind = (store, *others), kind_of(about)
+    own = store.review(attributes_id(about), kind=own_kind)
+    own = own and own.standing(
+        lambda name: any(place.exists(name, kind=own_kind) for place in places)
     )
-    return any(review is not None and review.verdict == "rejected" for review in reviews)
+    if own is not None or not isinstance(about, EpisodeAttributes):
+        return own is not None and own.verdict == "rejected"
+    return any(
+        (review := place.review(source.id, kind=kind)) is not None and review.spreads
+        for source in about.lineage
+        for kind in KINDS
+        if source.kind == kind
+        for place in places
+        if place.has_source(source)
+    )
 
 
 def select_episodes(
@@ -95,7 +101,7 @@ def select_episodes(
                 counts = passed_over if lacking.is_choice else unfit
                 counts[f"{lacking.lack} ({lacking.remedy})"] += 1
             else:
-                chosen.add(about)
+                chosen.add(reader)
                 yield reader
     for reason, count in unfit.items():
         logger.warning("skipped_episodes", reason=reason, count=count)
@@ -131,21 +137,29 @@ class _Chosen:
 
     def __init__(self) -> None:
         self.names: set[str] = set()
-        self._of_recording: dict[str, str] = {}
+        # Ids and time spans (ns) by recording.
+        self._of_recording: defaultdict[str, list[tuple[str, Span]]] = defaultdict(list)
         self._first: EpisodeAttributes | None = None
 
-    def add(self, about: EpisodeAttributes) -> None:
+    def add(self, reader: EpisodeReader) -> None:
         """Add an episode; raises ConflictError if it is there already, or at another rate."""
+        about = reader.attributes
         name, first = about.episode_id, self._first or about
-        recording = recording_of(about) if about.origin == "recorded" else None
-        other = name if recording is None else self._of_recording.setdefault(recording, name)
         if name in self.names:
             raise ConflictError(f"episode {name!r}: in two stores; pass only one of them")
-        if other != name:
-            raise ConflictError(
-                f"episodes {other!r} and {name!r}: are of one recording, aligned with different "
-                "options; expected one; delete the other with `dextouch store delete`"
+        recording = recording_of(about) if about.origin == "recorded" else None
+        if recording is not None:
+            span, same = _span_ns(reader), self._of_recording[recording]
+            other = next(
+                (one for one, (low, high) in same if low <= span[1] and span[0] <= high), ""
             )
+            if other:
+                raise ConflictError(
+                    f"episodes {other!r} and {name!r}: are of one recording, aligned with "
+                    "different options, or edited; expected one, or parts without common steps; "
+                    "delete the other with `dextouch store delete`"
+                )
+            same.append((name, span))
         if about.model_rate_hz != first.model_rate_hz:
             raise ConflictError(
                 f"episodes {first.episode_id!r} and {name!r}: have model rates of "
@@ -154,6 +168,15 @@ class _Chosen:
             )
         self.names.add(name)
         self._first = first
+
+
+def _span_ns(reader: EpisodeReader) -> Span:
+    """When the steps begin and end, after the start of the recording; all time if unknown."""
+    about = reader.attributes
+    origin_ns = about.quality.get("origin_after_start_ns")
+    if origin_ns is None:
+        return -math.inf, math.inf
+    return origin_ns, origin_ns + (reader.num_steps - 0.5) * 1e9 / about.model_rate_hz
 
 
 def data_hash(contents: Iterable[str], **options: object) -> str:

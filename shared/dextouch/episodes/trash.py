@@ -8,15 +8,24 @@ import contextlib
 import re
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.files import GroupFiles, disk_errors, folder_bytes, sync_folder
-from dextouch.episodes.format import COMMIT_FILE, KINDS
+from dextouch.episodes.files import (
+    GroupFiles,
+    LocalGroup,
+    disk_errors,
+    folder_bytes,
+    replace_file,
+    sync_folder,
+)
+from dextouch.episodes.format import COMMIT_FILE, KINDS, stated_sha256
 from dextouch.errors import ConflictError, CorruptDataError, NotFoundError, UnknownNameError
+from dextouch.schemas import LineageEntry, Review
 
 TRASH = ".trash"
 # Besides groups: unfinished uploads that were damaged.
@@ -31,7 +40,8 @@ HOMES: dict[TrashKind, str] = {
 # may change, and they go where the item goes: to the trash, back, and away for good.
 REVIEW_FILE: Final = "review.json"
 CLICKS_FILE: Final = "clicks.json"
-REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
+NOTES_FILE: Final = "notes.json"
+REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE, NOTES_FILE)
 Remark = TypeVar("Remark", bound=BaseModel)
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 
@@ -153,3 +163,19 @@ def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) 
             f"{what}: {name} is no {name.removesuffix('.json')} ({error.error_count()} fields do "
             "not fit); delete the file, and enter it again"
         ) from error
+
+
+def change_trashed_review(
+    root: Path, source: LineageEntry, change: Callable[[Review | None], Review | None]
+) -> None:
+    """Change the reviews of a source's groups in the trash, for when they are restored."""
+    for folder in sorted((root / TRASH).glob(f"{source.kind}.{source.id}.*")):
+        files, what = LocalGroup(folder), f"{source.kind} {source.id!r} in the trash"
+        commit = files.get(COMMIT_FILE)
+        if commit is None or not source.is_of(stated_sha256(commit)):
+            continue
+        review = read_remark(files, REVIEW_FILE, Review, what=what)
+        changed = change(review)
+        if changed is not None and changed != review:
+            with disk_errors(f"write {REVIEW_FILE} of {what}"):
+                replace_file(folder / REVIEW_FILE, changed.model_dump_json().encode())

@@ -10,36 +10,45 @@ import os
 import shutil
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import accumulate
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
+from pydantic import BaseModel
 
-from dextouch.data_folder import is_system_file
 from dextouch.episodes.files import (
+    MAX_METADATA_BYTES,
+    GroupFiles,
+    copy_files,
     disk_errors,
-    is_folder_at,
     make_held_folder,
     sync_files,
     sync_folder,
-    try_lock,
+    unheld_folders,
     write_file,
 )
 from dextouch.episodes.format import (
     COMMIT_FILE,
     GOP_IMAGES,
+    GROUP_IMAGES,
     METADATA_FILE,
     STAMPS,
     ArrayEntry,
     Attributes,
     CommitRecord,
+    ImageCodec,
     Kind,
+    array_files,
     array_metadata,
     attributes_id,
-    codec_of,
+    decode_commit,
     encode_commit,
     group_metadata,
+    image_codec,
+    index_name,
     kind_of,
     sha256_hex,
     shard_path,
@@ -51,7 +60,7 @@ from dextouch.episodes.image_codecs import (
     VideoSettings,
     check_video_size,
     is_keyframe,
-    pack_chunk,
+    pack_group,
 )
 from dextouch.episodes.shards import ShardWriter
 from dextouch.errors import (
@@ -75,6 +84,8 @@ from dextouch.streams import (
 )
 
 STAGING = ".staging"
+# Folders of running downloads, each with the ids of its items.
+DOWNLOADS = ".downloads"
 
 
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
@@ -82,30 +93,20 @@ def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
     return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
 
 
-def unheld_folders(parent: Path) -> Iterator[Path]:
-    """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
-    for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
-        if is_system_file(folder.name):
-            continue
-        try:
-            lock = try_lock(folder)
-        except FileNotFoundError:
-            continue  # committed since we listed
-        if lock is None:
-            continue
-        try:
-            # Its writer may have committed and unlocked it before we locked it.
-            if is_folder_at(lock, folder):
-                yield folder
-        finally:
-            os.close(lock)
-
-
 def sweep_stages(root: Path) -> int:
-    """Remove abandoned stages, which killed writers have left, and return their number."""
+    """Remove abandoned stages and downloads, which a kill has left, and return their number."""
+    return _sweep(root / STAGING) + sweep_downloads(root)
+
+
+def sweep_downloads(root: Path) -> int:
+    """Remove abandoned downloads, and return their number."""
+    return _sweep(root / DOWNLOADS)
+
+
+def _sweep(parent: Path) -> int:
     removed = 0
-    for stage in unheld_folders(root / STAGING):
-        shutil.rmtree(stage)
+    for folder in unheld_folders(parent):
+        shutil.rmtree(folder)
         removed += 1
     return removed
 
@@ -115,15 +116,22 @@ def commit_stage(
 ) -> None:
     """Write metadata and commit record of finished arrays and rename the stage to its target.
 
-    Raises ConflictError if the target exists.
+    Raises ConflictError if the target exists, StorageError if it could not be read again.
     """
-    group = group_metadata(json_ready(attributes))
+    group = group_metadata(json_ready(attributes), entries)
     record = CommitRecord(
         kind=kind_of(attributes),
         id=attributes_id(attributes),
         attributes_sha256=sha256_hex(group),
         arrays=dict(entries),
     )
+    commit = encoded_record(record)
+    if max(len(group), len(commit)) > MAX_METADATA_BYTES:
+        raise StorageError(
+            f"{record.kind} {record.id!r}: {METADATA_FILE} and {COMMIT_FILE} hold {len(group)} and "
+            f"{len(commit)} bytes, expected at most {MAX_METADATA_BYTES} each; "
+            "record it in parts, or with fewer streams"
+        )
     with disk_errors(f"commit {record.id}"):
         for name, entry in entries.items():
             write_file(stage / name / METADATA_FILE, array_metadata(entry), sync=False)
@@ -132,10 +140,34 @@ def commit_stage(
         shards = [stage / name / shard_path(len(entry.shape)) for name, entry in entries.items()]
         metadata = [stage / name / METADATA_FILE for name in entries]
         sync_files([*shards, *metadata, stage / METADATA_FILE])
-        write_file(stage / COMMIT_FILE, encode_commit(record)[0])
+        write_file(stage / COMMIT_FILE, commit)
+    _publish(stage, target)
+
+
+def encoded_record(record: CommitRecord) -> bytes:
+    """Bytes of a commit record.
+
+    Where it would be too large, as of takes of many hours, without checksums of the longest arrays.
+    Their sha256 stays, by which a verification still finds exchanged files.
+    """
+    data, arrays = encode_commit(record)[0], dict(record.arrays)
+    size = len(data)
+    for name in sorted(arrays, key=lambda name: -len(arrays[name].crc32c or "")):
+        crcs = arrays[name].crc32c
+        if size <= MAX_METADATA_BYTES or not crcs:
+            break
+        arrays[name] = arrays[name].model_copy(update={"crc32c": None})
+        size -= len(crcs) - len("null")
+    if arrays == record.arrays:
+        return data
+    return encode_commit(record.model_copy(update={"arrays": arrays}))[0]
+
+
+def _publish(stage: Path, target: Path) -> None:
+    """Rename a complete stage to its target; raises ConflictError if that exists."""
     if target.exists():
         raise _taken(target)
-    with disk_errors(f"commit {record.id}"):
+    with disk_errors(f"commit {target.name}"):
         sync_folder(stage)
         target.parent.mkdir(parents=True, exist_ok=True)
         # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
@@ -167,6 +199,7 @@ class EpisodeWriter:
         self._stage, self._target = stage, target
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
+        self._taken: bytes | None = None
         with disk_errors(f"create {stage}"):
             # Locked as long as the writer lives, so that no sweep takes the stage for abandoned.
             self._lock = make_held_folder(stage)
@@ -262,6 +295,23 @@ class EpisodeWriter:
             )
         self._attributes = attributes
 
+    def add_remark(self, name: str, remark: BaseModel) -> None:
+        """Put a remark, such as `review.json`, beside the content: it appears with the item."""
+        with disk_errors(f"write {name} of {self._target.name}"):
+            write_file(self._stage / name, remark.model_dump_json().encode())
+
+    def take_files(self, source: GroupFiles, *, metadata: bytes, commit: bytes, link: bool) -> None:
+        """Take the arrays of a committed group as they are, in place of streams.
+
+        `metadata` and `commit` are the files of these names. With `link` the files of a local group
+        are shared with it, where the file system can: committed ones are never written again.
+        """
+        record, _ = decode_commit(commit, what=source.item_id)
+        copy_files(source, sorted(array_files(record.arrays)), self._stage, link=link)
+        with disk_errors(f"copy {source.item_id}"):
+            write_file(self._stage / METADATA_FILE, metadata)
+        self._taken = commit
+
     def __enter__(self) -> "EpisodeWriter":
         return self
 
@@ -284,6 +334,11 @@ class EpisodeWriter:
                 os.close(self._lock)
 
     def _commit(self) -> None:
+        if self._taken is not None:
+            with disk_errors(f"commit {self._target.name}"):
+                write_file(self._stage / COMMIT_FILE, self._taken)
+            _publish(self._stage, self._target)
+            return
         if not self._streams:
             raise InvalidInputError(f"{attributes_id(self._attributes)}: has no stream")
         entries = {
@@ -297,8 +352,6 @@ class EpisodeWriter:
 
 
 MAX_WAITING_IMAGES = 32
-# Images of a storage chunk.
-_CHUNK_IMAGES = {"jpeg": 1, "h264": GOP_IMAGES}
 Stamps = Mapping[str, np.ndarray]
 
 
@@ -317,9 +370,9 @@ class StreamWriter:
         self._plain: bool | None = None
         # Whether a block was interrupted, after which arrays are misaligned.
         self._is_broken = False
-        self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
-        self._images = _EncodedImages(descriptor)
+        codec = image_codec(descriptor)
+        self._images = None if codec is None else _EncodedImages(descriptor, codec)
         self._queue: _ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
         self.arrays = {name: ShardWriter(stage, name, entry) for name, entry in entries.items()}
@@ -336,19 +389,19 @@ class StreamWriter:
         if not len(values):
             return
         # All checks come before the first write, so that a refused block has no effect.
-        plain = self._codec == "zstd" or values.dtype != object
+        plain = self._images is None or values.dtype != object
         if self._plain is not None and self._plain != plain:
             raise InvalidInputError(
                 f"{name}: got {'plain' if plain else 'encoded'} images after "
                 f"{'encoded' if plain else 'plain'} ones, expected one kind in a stream"
             )
-        if plain:
+        if self._images is None or plain:
             self._check_values(values)
         else:
             self._images.check(values)
         self._check_order(stamps[STAMPS[self._kind][0]])
         self._plain = plain
-        if self._codec == "zstd" or (self._queue is None and values.dtype == object):
+        if self._images is None or (self._queue is None and values.dtype == object):
             self._write(values, stamps)
         else:
             # Once there is a queue, everything goes through it to keep the order.
@@ -392,14 +445,16 @@ class StreamWriter:
     def _write(self, values: np.ndarray, stamps: Stamps) -> None:
         self._check_unbroken()
         self._is_broken = True
-        array = self.arrays[self.descriptor.name]
-        if self._codec == "zstd":
-            array.append(values)
+        name = self.descriptor.name
+        if self._images is None:
+            self.arrays[name].append(values)
         else:
-            for payload, num_images in self._images.chunks(values):
-                array.append_encoded(payload, num_images)
+            images = [self._images.encoded(image) for image in values]
+            for image in images:
+                self.arrays[name].append_bytes(image)
+            self.arrays[index_name(name)].append(self._images.index_rows(images))
         for stamp, column in stamps.items():
-            self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
+            self.arrays[f"{name}_{stamp}"].append(column)
         self._is_broken = False
 
     def _check_unbroken(self) -> None:
@@ -418,11 +473,12 @@ class StreamWriter:
             self._queue.drain()
         self._check_unbroken()
         name = self.descriptor.name
-        for payload, num_images in self._images.rest():
-            self.arrays[name].append_encoded(payload, num_images)
         entries = {name: array.finish() for name, array in self.arrays.items()}
-        entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
         counts = {array: entry.shape[0] for array, entry in entries.items()}
+        if self._images is not None:
+            update = {"encoder": self._images.encoder, "sha256": self._images.digest.hexdigest()}
+            entries[name] = entries[name].model_copy(update=update)
+            del counts[name]  # of bytes
         if len(set(counts.values())) != 1:
             raise StorageError(f"{name}: a block was written partially ({counts}); write it again")
         return entries
@@ -435,17 +491,36 @@ class StreamWriter:
             array.close()
 
 
-class _EncodedImages:
-    """Groups the images of a `jpeg` or `h264` stream into storage chunks."""
+class _GroupDigest:
+    """Digest of the encoded images of a stream, group by group."""
 
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        self._descriptor = descriptor
-        self._codec = codec_of(descriptor)
-        self._num_given = 0
-        self._video: GopEncoder | None = None
+    def __init__(self, codec: ImageCodec) -> None:
+        self._codec, self._sha256 = codec, hashlib.sha256()
         self._group: list[bytes] = []
+
+    def add(self, image: bytes) -> None:
+        self._group.append(image)
+        if len(self._group) == GROUP_IMAGES[self._codec]:
+            self._sha256.update(pack_group(self._codec, self._group))
+            self._group = []
+
+    def hexdigest(self) -> str:
+        sha256 = self._sha256.copy()
+        if self._group:
+            sha256.update(pack_group(self._codec, self._group))
+        return sha256.hexdigest()
+
+
+class _EncodedImages:
+    """Checks or encodes the images of a `jpeg` or `h264` stream, and says where each lies."""
+
+    def __init__(self, descriptor: StreamDescriptor, codec: ImageCodec) -> None:
+        self._descriptor, self._codec = descriptor, codec
+        self._num_given = self._num_bytes = 0
+        self._video: GopEncoder | None = None
+        self.digest = _GroupDigest(codec)
         self.encoder: str | None = None
-        if self._codec == "h264":
+        if codec == "h264":
             check_video_size(*descriptor.shape[:2])
 
     def check(self, values: np.ndarray) -> None:
@@ -462,19 +537,18 @@ class _EncodedImages:
                 )
         self._num_given += len(values)
 
-    def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
-        """Add images; returns the completed storage chunks with their number of images."""
-        images = list(values) if values.dtype == object else [self._encode(v) for v in values]
-        complete = []
-        for data in images:
-            self._group.append(data)
-            if len(self._group) == _CHUNK_IMAGES[self._codec]:
-                complete += self.rest()
-        return complete
+    def encoded(self, image: np.ndarray | bytes) -> bytes:
+        """The bytes of the next image, encoded here unless the caller gave them."""
+        data = image if isinstance(image, bytes) else self._encode(image)
+        self.digest.add(data)
+        return data
 
-    def rest(self) -> list[tuple[bytes, int]]:
-        group, self._group = self._group, []
-        return [(pack_chunk(self._codec, group), len(group))] if group else []
+    def index_rows(self, images: list[bytes]) -> np.ndarray:
+        """Rows of the index for the next images."""
+        bounds = list(accumulate(map(len, images), initial=self._num_bytes))
+        self._num_bytes = bounds[-1]
+        crcs = map(google_crc32c.value, images)
+        return np.array(list(zip(bounds[:-1], bounds[1:], crcs, strict=True)), dtype=np.int64)
 
     def _encode(self, image: np.ndarray) -> bytes:
         if self._codec == "jpeg":
@@ -549,31 +623,25 @@ class ContentDigest:
     """
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
-        self._codec = codec_of(descriptor)
+        codec = image_codec(descriptor)
         self._dtype = descriptor.numpy_dtype().newbyteorder("<")
-        # As in `stream_arrays`: values first.
-        self._columns = [hashlib.sha256() for _ in range(1 + len(STAMPS["recording"]))]
-        self._group: list[bytes] = []
+        self._images = None if codec is None else _GroupDigest(codec)
+        self._numbers = hashlib.sha256()
+        self._stamps = [hashlib.sha256() for _ in STAMPS["recording"]]
         self._num_samples = 0
 
     def add(self, batch: SampleBatch) -> None:
         """Add the next samples of the stream."""
-        values, *stamps = self._columns
         self._num_samples += len(batch)
-        for column, stamp in zip(stamps, STAMPS["recording"], strict=True):
+        for column, stamp in zip(self._stamps, STAMPS["recording"], strict=True):
             column.update(getattr(batch, stamp).astype("<i8").tobytes())
-        if self._codec == "zstd":
-            values.update(batch.values.astype(self._dtype, order="C", copy=False).data)
+        if self._images is None:
+            self._numbers.update(batch.values.astype(self._dtype, order="C", copy=False).data)
             return
         for image in batch.values:
-            self._group.append(image)
-            if len(self._group) == _CHUNK_IMAGES[self._codec]:
-                values.update(pack_chunk(self._codec, self._group))
-                self._group = []
+            self._images.add(image)
 
     def content(self) -> StreamContent:
         """What was added so far."""
-        values, *stamps = (column.copy() for column in self._columns)
-        if self._group:
-            values.update(pack_chunk(self._codec, self._group))
-        return stream_content(self._num_samples, [c.hexdigest() for c in (values, *stamps)])
+        columns = (self._numbers if self._images is None else self._images, *self._stamps)
+        return stream_content(self._num_samples, [column.hexdigest() for column in columns])

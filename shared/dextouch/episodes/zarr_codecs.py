@@ -1,4 +1,4 @@
-"""Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for reading image arrays.
+"""Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for image arrays of format v2.
 
 zarr-python finds them by this package's entry points. They only decode: `EpisodeWriter` writes.
 """
@@ -11,8 +11,8 @@ from zarr.abc.codec import ArrayBytesCodec
 from zarr.core.array_spec import ArraySpec
 from zarr.core.buffer import Buffer, NDBuffer
 
-from dextouch.episodes.format import ZARR_CODECS, Codec
-from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks
+from dextouch.episodes.format import ZARR_CODECS, ImageCodec
+from dextouch.episodes.image_codecs import FULL_FORM, ImageGroups, unpack_group
 from dextouch.errors import InvalidInputError
 
 
@@ -21,7 +21,7 @@ class _ImageCodec(ArrayBytesCodec):
     """Decodes image chunks to uint8 [n, h, w, 3]; padding rows are zero."""
 
     is_fixed_size = False
-    codec: Codec = "jpeg"
+    codec: ImageCodec = "jpeg"
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "_ImageCodec":
@@ -41,12 +41,11 @@ class _ImageCodec(ArrayBytesCodec):
         )
 
     async def _decode_single(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
-        shape = chunk_spec.shape
-        chunks = ImageChunks(self.codec, shape[1:], shape[0], ZARR_CODECS[self.codec])
-        payload = chunk_bytes.to_bytes()
+        shape, name = chunk_spec.shape, ZARR_CODECS[self.codec]
         images = np.zeros(shape, dtype=np.uint8)
-        count = len(chunks.unpack(payload, 0))
-        chunks.decode(payload, 0, list(range(count)), FULL_FORM, images[:count])
+        encoded = unpack_group(self.codec, chunk_bytes.to_bytes(), name)
+        places, out = list(range(len(encoded))), images[: len(encoded)]
+        ImageGroups(self.codec, shape[1:], name).decode(encoded, 0, places, FULL_FORM, out)
         return chunk_spec.prototype.nd_buffer.from_numpy_array(images)
 
 
@@ -54,11 +53,11 @@ class _ImageCodec(ArrayBytesCodec):
 class JpegCodec(_ImageCodec):
     """`dextouch.jpeg`."""
 
-    codec: Codec = "jpeg"
+    codec: ImageCodec = "jpeg"
 
 
 @dataclass(frozen=True)
 class H264Codec(_ImageCodec):
     """`dextouch.h264`."""
 
-    codec: Codec = "h264"
+    codec: ImageCodec = "h264"

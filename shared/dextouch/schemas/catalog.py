@@ -1,19 +1,27 @@
-"""Schemas of the store's catalog: items of both kinds, lineage, the trash, reviews, hours."""
+"""Schemas of the store's catalog: items, lineage, the trash, reviews, notes, edits, hours."""
 
+from collections.abc import Callable
+from datetime import UTC, datetime
 from operator import not_
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AfterValidator, AwareDatetime, Field, StringConstraints, model_validator
 
-from dextouch.free_text import FreeLines, FreeText
-from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.common import Domain, Origin, StoreId
+from dextouch.free_text import FreeLines, FreeText, check_lines
+from dextouch.frozen_model import FrozenModel, example
+from dextouch.schemas.common import MAX_INSTRUCTION, Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
 from dextouch.tactile import LayoutDescription
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
+EditedOutcome = Literal["keep", "success", "failure", "unknown"]
 MAX_MOVED = 500
+# Of an item. Chosen: a take of minutes has tens of notes of a sentence; the file stays below 2 MB.
+MAX_NOTES = 500
+MAX_NOTE = 1000
+# A century: of stamps that differ, no sum overflows.
+MAX_TIME_NS = 4 * 10**18
 
 
 class CatalogValues(FrozenModel):
@@ -54,6 +62,8 @@ class StoredItem(FrozenModel):
 class MoveItems(FrozenModel):
     """Request to move items to the trash, or back."""
 
+    model_config = example(items=[{"kind": "episode", "id": "take-20260301-1"}])
+
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
 
 
@@ -91,17 +101,166 @@ class TrashContents(FrozenModel):
 class Review(FrozenModel):
     """Verdict of a person on an item; rejected ones are not trained on.
 
-    `reviewer` is a pseudonym.
+    `reviewer` is a pseudonym. An edit of the item rejects it as `superseded_by` its results, as
+    long as one of them is in the store; `earlier` is the review that the item had before.
     """
 
     verdict: Verdict
     reason: str = Field(default="", max_length=500)
     reviewer: str | None = Field(default=None, max_length=128)
     reviewed_at: AwareDatetime
+    superseded_by: tuple[StoreId, ...] = Field(default=(), max_length=MAX_MOVED, exclude_if=not_)
+    earlier: "Review | None" = Field(default=None, exclude_if=lambda review: review is None)
+
+    def standing(self, is_stored: Callable[[str], bool]) -> "Review | None":
+        """The review that counts: the earlier one where no result of an edit is stored any more."""
+        if self.superseded_by and not any(map(is_stored, self.superseded_by)):
+            return self.earlier
+        return self
+
+    @property
+    def spreads(self) -> bool:
+        """Whether what was made from the item is rejected, too: not by an edit of the item."""
+        review = self.earlier if self.superseded_by else self
+        return review is not None and review.verdict == "rejected"
+
+
+def superseded(review: Review | None, by: str) -> Review:
+    """The review of an item, from an earlier one, once an edit made another one of it."""
+    marked = () if review is None else review.superseded_by
+    if review is not None and by in marked:
+        return review
+    results = (*marked, by)[-MAX_MOVED:]
+    return Review(
+        verdict="rejected",
+        reason=f"superseded by {', '.join(results)}"[:500],
+        reviewed_at=datetime.now(UTC),
+        superseded_by=results,
+        earlier=review.earlier if marked and review is not None else review,
+    )
+
+
+class TimedNote(FrozenModel):
+    """What a person says of a time range of an item, on the clock of its streams (`Playback`).
+
+    `number` names it among the notes of its item; `author` is a pseudonym.
+    """
+
+    number: int = Field(ge=1)
+    start_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
+    stop_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
+    text: str = Field(min_length=1, max_length=MAX_NOTE)
+    author: str | None = Field(default=None, max_length=128)
+    written_at: AwareDatetime
+
+    @model_validator(mode="after")
+    def _ends_after_its_start(self) -> "TimedNote":
+        if self.stop_ns < self.start_ns:
+            raise ValueError(
+                f"got a note from {self.start_ns} to {self.stop_ns} ns, expected a "
+                "time range that does not end before it begins"
+            )
+        return self
+
+
+class ItemNotes(FrozenModel):
+    """Notes on time ranges of an item, in the order of their starts."""
+
+    notes: tuple[TimedNote, ...] = Field(default=(), max_length=MAX_NOTES)
+
+
+class NewNote(FrozenModel):
+    """Request to add a note to an item."""
+
+    model_config = example(
+        start_ns=1_000_000_000, stop_ns=2_500_000_000, text="the bottle slips", author="p17"
+    )
+
+    start_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
+    stop_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
+    text: Annotated[
+        str,
+        StringConstraints(strip_whitespace=True, min_length=1, max_length=MAX_NOTE),
+        AfterValidator(check_lines),
+    ]
+    author: FreeText | None = Field(default=None, max_length=128)
+
+
+class RemoveNote(FrozenModel):
+    """Request to remove a note."""
+
+    model_config = example(number=1)
+
+    number: int = Field(ge=1)
+
+
+class TrimEpisode(FrozenModel):
+    """Request to trim an episode to its steps `first_step` … `stop_step` − 1.
+
+    `outcome` is that of the result, which must be given where the end of a judged episode is cut
+    off. `exact` encodes H.264 images anew from the cut on. The source goes to the trash unless
+    `keep`. With `dry_run` nothing is written.
+    """
+
+    model_config = example(first_step=30, stop_step=120, dry_run=True)
+
+    first_step: int = Field(ge=0)
+    stop_step: int = Field(ge=1)
+    outcome: EditedOutcome | None = None
+    exact: bool = False
+    keep: bool = False
+    dry_run: bool = False
+
+
+class RelabelItems(FrozenModel):
+    """Request to change attributes of items; those that are None stay. Otherwise as a trim."""
+
+    model_config = example(
+        items=[{"kind": "episode", "id": "take-20260301-1"}], task="stand_bottle", dry_run=True
+    )
+
+    items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
+    task: FreeText | None = Field(default=None, min_length=1, max_length=128)
+    instruction: FreeText | None = Field(default=None, max_length=MAX_INSTRUCTION)
+    operator: FreeText | None = Field(default=None, min_length=1, max_length=128)
+    outcome: EditedOutcome | None = None
+    keep: bool = False
+    dry_run: bool = False
+
+
+class EditedItem(FrozenModel):
+    """Result of an edit: a new item, what is in it, and what is not.
+
+    `sha256` is its content hash, None of a dry run; `num_samples` those of its streams;
+    `messages` say what could not be kept; `source_is` where the source is now.
+    """
+
+    kind: ItemKind
+    source_id: str
+    source_sha256: str
+    id: str
+    sha256: str | None
+    operation: str
+    num_samples: dict[str, int]
+    messages: tuple[str, ...] = ()
+    source_is: Literal["superseded", "in the trash"]
+
+
+class EditedItems(FrozenModel):
+    """Results of edits: every item is in one of the lists."""
+
+    edited: tuple[EditedItem, ...]
+    refused: tuple[RefusedItem, ...] = ()
 
 
 class ReviewItems(FrozenModel):
     """Request to review items; a `verdict` of None removes their reviews."""
+
+    model_config = example(
+        items=[{"kind": "episode", "id": "take-20260301-1"}],
+        verdict="rejected",
+        reason="hand occluded",
+    )
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
     verdict: Verdict | None

@@ -9,7 +9,7 @@ from pydantic import AwareDatetime, BaseModel, Field, FiniteFloat, field_validat
 
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import check_texts
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.common import (
@@ -29,6 +29,8 @@ from dextouch.streams import StreamDescriptor
 FORMAT_VERSION: Final = 1
 # Characters of the reason why a take is incomplete.
 MAX_CAUSE = 500
+# Characters of the parameters of an edit: room for two instructions, quoted.
+MAX_OPERATION = 8000
 RIGID_TOLERANCE: Final = 1e-6
 # Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"
@@ -73,12 +75,30 @@ class StoredAnchor(FrozenModel):
         return AnchorPoses(**{name: np.array(rows) for name, rows in self})
 
 
+# The operation of a copy that a merge of stores gave a new id.
+MERGED: Final = "merge --rename"
+
+
 class LineageEntry(FrozenModel):
-    """A source of derived data, by id and content hash."""
+    """A source of derived data, by id and content hash.
+
+    `operation` of an edited item is the edit of this source, with its parameters, as on the command
+    line (`trim --steps 15 90`); empty of all other data, and then not written.
+    """
 
     kind: Literal["recording", "episode", "checkpoint", "rollout"]
     id: str
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
+    operation: str = Field(default="", max_length=MAX_OPERATION, exclude_if=not_)
+
+    def is_of(self, sha256: str | None) -> bool:
+        """Whether an item of this kind and id is the source, by its hash, if both are known."""
+        return self.sha256 is None or sha256 in {None, self.sha256}
+
+    @property
+    def is_edit(self) -> bool:
+        """Whether this source was edited, not merely copied under a new id."""
+        return self.operation not in {"", MERGED}
 
 
 class ClockReport(FrozenModel):
@@ -257,6 +277,17 @@ class LedgerEntry(FrozenModel):
     first_t_host_ns: int | None = None
 
 
+class ImportedFile(FrozenModel):
+    """The file of another tool that a recording was made of, and what read it.
+
+    `name` is the file's own, without folders; `importer` names format and release.
+    """
+
+    name: str = Field(min_length=1, max_length=255)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    importer: str = Field(min_length=1, max_length=128)
+
+
 class RecordingAttributes(FrozenModel):
     """Metadata of a raw take.
 
@@ -266,7 +297,8 @@ class RecordingAttributes(FrozenModel):
     `complete` is False of a take that was saved although its check found it incomplete, for the
     reason `incomplete_cause`; both are only written then.
     `trace_id` is that of the request that saved the take, or else began its upload; `num_batches`
-    the batches of each stream in the upload, which the store notes. Neither is written if empty.
+    the batches of each stream in the upload, which the store notes; `imported_from` the file of
+    another tool that the recording was made of. None of these is written if empty.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -289,6 +321,7 @@ class RecordingAttributes(FrozenModel):
     quality: dict[str, FiniteFloat] = Field(default={})
     trace_id: TraceId | None = Field(default=None, exclude_if=not_)
     num_batches: dict[str, int] = Field(default={}, exclude_if=not_)
+    imported_from: ImportedFile | None = Field(default=None, exclude_if=not_)
     streams: Annotated[tuple[StreamDescriptor, ...], Field(fail_fast=True)] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":
@@ -299,6 +332,25 @@ class RecordingAttributes(FrozenModel):
 
 class NewRecording(RecordingAttributes):
     """Attributes with which an upload begins; texts of earlier recordings are not checked again."""
+
+    model_config = example(
+        recording_id="take-20260301-1",
+        domain="human",
+        station="bench-1",
+        task="stand_bottle",
+        instruction="Stand the bottle upright.",
+        streams=[
+            {
+                "name": "tactile_left",
+                "kind": "tactile",
+                "shape": [320],
+                "dtype": "float32",
+                "unit": "kPa",
+                "nominal_rate_hz": 60.0,
+                "side": "left",
+            }
+        ],
+    )
 
     @model_validator(mode="after")
     def _is_visible(self) -> "NewRecording":
@@ -348,6 +400,8 @@ class FinishRecording(FrozenModel):
 
     Without `content`, as older stations send it, the answer proves nothing about the samples.
     """
+
+    model_config = example(num_batches={"tactile_left": 12}, success=True)
 
     num_batches: dict[str, int]
     content: dict[str, StreamContent] = Field(default={})
@@ -410,5 +464,7 @@ class UploadList(FrozenModel):
 
 class ExpireUploads(FrozenModel):
     """Request to drop every upload that has been idle for at least `idle_s`."""
+
+    model_config = example(idle_s=86400.0)
 
     idle_s: float = Field(ge=MIN_EXPIRE_IDLE_S, allow_inf_nan=False)

@@ -9,7 +9,6 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
@@ -56,9 +55,12 @@ CHANNELS: Final = 3
 class ReturnSelector(FrozenModel):
     """Requested part of an observation.
 
-    `cameras` None means all cameras of the world, an empty list none; in a query, where an empty
-    list cannot be written, none is `cameras=`. `images` is how they are sent: JPEG takes a tenth of
-    the bytes, but is not exact.
+    Attributes:
+        cameras: names of cameras; all of the world if omitted, an empty list means none. In a
+            query, where an empty list cannot be written, none is `cameras=`.
+        steps: all steps of the chunk, or only its last one.
+        tactile: whether touch is sent.
+        images: how images are sent; JPEG takes a tenth of the bytes, but is not exact.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -156,6 +158,11 @@ class RolloutStart:
     K_head: Float64[np.ndarray, "3 3"] | None = None
 
 
+_UINT8: Final = np.dtype(np.uint8)
+_FLOAT32: Final = np.dtype(np.float32)
+_FLOAT64: Final = np.dtype(np.float64)
+
+
 def check_observation_arrays(
     *,
     images: Mapping[str, np.ndarray],
@@ -176,11 +183,11 @@ def check_observation_arrays(
     num_taxels = tactile_kpa.shape[-1] if tactile_kpa.ndim == 3 else NUM_TAXELS
     if not 1 <= num_taxels <= MAX_CELLS:
         raise ShapeError(f"{where}: got {num_taxels} taxels, expected 1 … {MAX_CELLS}")
-    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, num_taxels)), where)
-    _check_array("action_reached", action_reached, ("float64", (num_steps, ACTION_DIM)), where)
+    _check_array("tactile_kpa", tactile_kpa, (_FLOAT32, (num_steps, 2, num_taxels)), where)
+    _check_array("action_reached", action_reached, (_FLOAT64, (num_steps, ACTION_DIM)), where)
     size_px = next((array.shape[1:3] for array in images.values() if array.ndim == 4), (0, 0))
     for camera, array in images.items():
-        _check_array(f"images of {camera}", array, ("uint8", (num_steps, *size_px, 3)), where)
+        _check_array(f"images of {camera}", array, (_UINT8, (num_steps, *size_px, 3)), where)
     if object_poses is not None:
         _check_object_poses(object_poses, num_steps, where)
 
@@ -189,7 +196,7 @@ def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
     num_objects = poses.shape[1] if poses.ndim == 3 else 1
     if num_objects == 0:
         raise ShapeError(f"{where}: object_poses got 0 objects, expected at least 1 or no poses")
-    _check_array("object_poses", poses, ("float32", (num_steps, num_objects, 7)), where)
+    _check_array("object_poses", poses, (_FLOAT32, (num_steps, num_objects, 7)), where)
     off = np.abs(np.linalg.norm(poses[:, :, 3:], axis=2) - 1.0)
     if off.max() > QUATERNION_TOLERANCE:
         step, index = np.unravel_index(off.argmax(), off.shape)
@@ -200,21 +207,15 @@ def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
 
 
 def _check_array(
-    name: str, array: np.ndarray, expected: tuple[str, tuple[int, ...]], where: str
+    name: str, array: np.ndarray, expected: "tuple[np.dtype[Any], tuple[int, ...]]", where: str
 ) -> None:
-    if (_name_of(array.dtype), array.shape) != expected:
+    dtype, shape = expected
+    if array.dtype != dtype or array.shape != shape:
         raise ShapeError(
-            f"{where}: {name} got {array.dtype.name} {list(array.shape)}, "
-            f"expected {expected[0]} {list(expected[1])}"
+            f"{where}: {name} got {array.dtype} {list(array.shape)}, expected {dtype} {list(shape)}"
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise NonFiniteError(f"{where}: {name} holds NaN or infinity, expected finite numbers")
-
-
-# numpy puts the name together anew each time, which takes longer than the rest of the check.
-@lru_cache(maxsize=32)
-def _name_of(dtype: "np.dtype[Any]") -> str:
-    return dtype.name
 
 
 class ObservationFields(FrozenModel):
@@ -236,6 +237,34 @@ class AnswerFields(FrozenModel):
     rollout: RolloutInfo
     observation: ObservationFields
     info: dict[str, float] = Field(default={})
+
+
+class JsonArray(FrozenModel):
+    """An array within JSON.
+
+    Attributes:
+        dtype: of numpy, such as `uint8` or `float32`.
+        shape: the number of entries along each axis.
+        data: its bytes in C order, little endian, as base64.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    data: str
+
+
+class JsonAnswer(FrozenModel):
+    """A response with an observation as JSON; MessagePack holds the same without base64.
+
+    Attributes:
+        arrays: of n steps, by name: `image/CAMERA` uint8 [n, h, w, 3], or `jpeg/CAMERA` with
+            `jpeg_bytes/CAMERA`; `tactile_kpa` float32 [n, 2, taxels], left hand first;
+            `action_reached` float64 [n, 67]; with the first observation `K_head` [3, 3] and the
+            poses `T_world_wrist_left`, `T_world_wrist_right`, `T_world_camera_head` [4, 4].
+    """
+
+    fields: AnswerFields
+    arrays: dict[str, JsonArray]
 
 
 class StartFields(FrozenModel):
@@ -330,7 +359,13 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
     """Decode a start request of an untrusted source; raises InvalidInputError if it is invalid."""
-    raw, arrays = unpack(data, max_bytes=max_bytes)
+    return start_of_parts(*unpack(data, max_bytes=max_bytes))
+
+
+def start_of_parts(
+    raw: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> tuple[StartRequest, RolloutStart]:
+    """A start request of fields and arrays of an untrusted source; raises as `decode_start`."""
     fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
         return fields.start, start_from(fields.start)

@@ -7,7 +7,7 @@ from typing import Final, Literal
 from pydantic import ConfigDict, Field, model_validator
 
 from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import MAX_INSTRUCTION
 from dextouch.tactile import LayoutDescription
 
@@ -52,11 +52,23 @@ def _is_none(value: object) -> bool:
 class WorldDescription(FrozenModel):
     """Capabilities of a world, exchanged before a rollout.
 
-    `object_names` lists, by task, the objects whose poses are in its observations; empty for a
-    world without object poses. Touch is zero in observations of a world that does not predict it.
-    If it `scales_images`, those of a start may have another size: the middle square is scaled to
-    the world's size, and the rollout's `K_head` is of the scaled image. `tactile_layout` is that of
-    the taxels in all observations, None of `dextouch_v1`.
+    Attributes:
+        name: by which rollouts are started in it.
+        kind: a simulation, a learned model, a trivial baseline, or a robot.
+        digest: of everything that decides its responses; equal digests respond alike.
+        tasks: names of tasks that it can start.
+        model_rate_hz: steps a second; a row of an action chunk is one step.
+        action_kinds: which poses it takes as actions: those sent to hands, or those they reached.
+        starts_from: a task and seed, or an observation, which is sent as MessagePack.
+        chunk_multiple: the number of rows of a chunk is a multiple of it.
+        max_chunk_steps: the largest number of rows of a chunk.
+        knows_success: whether observations say if the task is done.
+        object_names: by task, the objects whose poses are in its observations; empty for a world
+            without object poses.
+        predicts_touch: if false, touch is zero in its observations.
+        scales_images: if true, images of a start may have another size: the middle square is
+            scaled to the world's size, and the rollout's `K_head` is of the scaled image.
+        tactile_layout: of the taxels in all observations; without it, that of `dextouch_v1`.
     """
 
     name: str
@@ -92,7 +104,19 @@ class WorldList(FrozenModel):
 
 
 class StartRequest(FrozenModel):
-    """The fields of POST /v1/rollouts; an observation to start from is sent as arrays."""
+    """The fields of POST /v1/rollouts; an observation to start from is sent as arrays.
+
+    Attributes:
+        world: one of `list_worlds`.
+        task: one of the world's tasks.
+        seed: of the start where the world places its objects, and of the noise of a model.
+        instruction: sentence that describes the task.
+        action_kind: whether actions are poses to be reached, or poses that were reached.
+    """
+
+    model_config = example(
+        world="twin", task="stand_bottle", seed=3, instruction="Stand the bottle upright."
+    )
 
     world: FreeText
     task: FreeText
@@ -103,6 +127,8 @@ class StartRequest(FrozenModel):
 
 class ForkRequest(FrozenModel):
     """The body of POST /v1/rollouts/{id}/fork; a new seed gives the branch its own noise."""
+
+    model_config = example(seed=7)
 
     seed: int | None = Field(default=None, ge=0, le=MAX_SEED)
 
@@ -191,10 +217,14 @@ class RolloutUncertainty(FrozenModel):
 
 
 class RolloutInfo(FrozenModel):
-    """State of a rollout; `next_chunk` is the only chunk number accepted next.
+    """State of a rollout.
 
-    `ended` is why its world cannot continue it, omitted while it can; `rollout_uncertainty` that of
-    all chunks so far, omitted while the world reports none.
+    Attributes:
+        next_chunk: the only chunk number accepted next.
+        last_step: of the newest observation; 0 is the start.
+        ttl_s: seconds without a chunk after which it expires.
+        ended: why its world cannot continue it; omitted while it can.
+        rollout_uncertainty: of all chunks so far; omitted while the world reports none.
     """
 
     model_config = WIRE_NAMES

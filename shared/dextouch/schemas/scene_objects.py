@@ -1,12 +1,13 @@
 """Schemas of the files that describe the objects of tasks, and say where they were clicked."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import Box, StoreId, first_problems
 
 # Position x y z (m), then the quaternion w x y z.
@@ -37,7 +38,7 @@ _UNIT = 1e-3
 
 
 def _is_turned(pose: Pose) -> Pose:
-    norm = sum(value**2 for value in pose[3:]) ** 0.5
+    norm = math.hypot(*pose[3:])
     if abs(norm - 1.0) > _UNIT:
         raise ValueError(f"got a quaternion (w x y z) of length {norm:.4g}, expected 1")
     return pose
@@ -251,6 +252,10 @@ class ObjectClick(FrozenModel):
 
 class EpisodeClicks(FrozenModel):
     """Clicks on the objects of one episode, by their names."""
+
+    model_config = example(
+        objects={"bottle": {"point_px": [31.5, 40.0], "heading_px": [36.0, 40.0]}}
+    )
 
     objects: dict[ObjectName, ObjectClick] = Field(max_length=MAX_OBJECTS)
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 
 from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
 from dextouch.tactile import LayoutDescription, LayoutText
 
@@ -33,6 +33,10 @@ StationName = Annotated[str, Field(min_length=1, max_length=128)]
 class TakePrompt(FrozenModel):
     """What is going to be recorded; given before the start."""
 
+    model_config = example(
+        task="stand_bottle", instruction="Stand the bottle upright.", operator="p07", consent=True
+    )
+
     task: FreeText = Field(min_length=1, max_length=128)
     instruction: FreeText = Field(min_length=1, max_length=MAX_INSTRUCTION)
     domain: Domain = "human"
@@ -47,11 +51,15 @@ class TakeName(FrozenModel):
     its take this id.
     """
 
+    model_config = example(recording_id="take-20260301-1")
+
     recording_id: StoreId | None = None
 
 
 class SaveTake(TakeName):
     """How a take ended; an incomplete one is only saved when `accept_incomplete` says so."""
+
+    model_config = example(recording_id="take-20260301-1", success=True)
 
     success: bool | None = None
     accept_incomplete: bool = False
@@ -363,6 +371,8 @@ class HealthHistory(FrozenModel):
 class EnrolStation(FrozenModel):
     """Request for a token; the station's key will have the station's name."""
 
+    model_config = example(station="bench-1")
+
     station: KeyName
 
 
@@ -376,6 +386,8 @@ class EnrolmentToken(FrozenModel):
 
 class UseToken(FrozenModel):
     """A station's request for a key."""
+
+    model_config = example(token="…")  # noqa: S106 - an example
 
     token: SecretStr = Field(max_length=256)
 
@@ -428,6 +440,10 @@ class SpooledTake(FrozenModel):
 class CheckTakes(FrozenModel):
     """A part of a station's spool, and all operators that its session names."""
 
+    model_config = example(
+        station="bench-1", takes=[{"recording_id": "take-20260301-1", "operator": "p07"}]
+    )
+
     station: StationName
     takes: Annotated[tuple[SpooledTake, ...], Field(max_length=MAX_CHECKED_TAKES)] = ()
     operators: Annotated[tuple[str, ...], Field(max_length=MAX_OPERATORS)] = ()
@@ -456,6 +472,8 @@ class DeletionsRevision(FrozenModel):
 
 class ConfirmRemoval(FrozenModel):
     """A station has worked off all deletions of a revision, except the takes it still holds."""
+
+    model_config = example(station="bench-1", revision="12")
 
     station: StationName
     revision: str

@@ -1,3 +1,5 @@
+from .api_page import file_router as file_router
+from .api_page import page_headers as page_headers
 from .app import create_service_app as create_service_app
 from .child_process import Answer as Answer
 from .child_process import ChildProcess as ChildProcess
@@ -10,6 +12,7 @@ from .configuration_file import file_source as file_source
 from .configuration_file import line_of as line_of
 from .configuration_file import read_configuration as read_configuration
 from .configuration_file import section_of as section_of
+from .connections import accept_messages_of as accept_messages_of
 from .connections import timed as timed
 from .guard import AS_SET as AS_SET
 from .guard import FORM as FORM
@@ -19,6 +22,7 @@ from .guard import MSGPACK as MSGPACK
 from .guard import OCTETS as OCTETS
 from .guard import JsonBody as JsonBody
 from .guard import RequireScope as RequireScope
+from .guard import decoded as decoded
 from .guard import media_type as media_type
 from .guard import takes as takes
 from .keys import AccessControl as AccessControl
@@ -42,4 +46,5 @@ from .spans import SPANS as SPANS
 from .state import StateStore as StateStore
 from .state import Versioned as Versioned
 from .state import open_state as open_state
+from .streams import StreamedResponse as StreamedResponse
 from .workers import run_workers as run_workers

@@ -1,20 +1,14 @@
-"""Factory of service applications: middleware, problem+json errors, health, metrics, OpenAPI.
+"""Factory of service applications: middleware, problem+json errors, health and metrics."""
 
-FastAPI documents parameters, models and successful responses. The rest follows from the routes:
-`RequireScope` the security scheme, `takes` the request body, method and parameters the refusals.
-"""
-
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from functools import partial
 from http import HTTPStatus
-from typing import Any, TypeVar
+from operator import attrgetter
 
 import structlog
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
-from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import APIRoute
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
@@ -36,20 +30,12 @@ from dextouch.schemas import (
     problem_from_error,
     status_of,
 )
+from dextouch.serving.api_page import api_page_router
 from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
-from dextouch.serving.guard import (
-    JSON,
-    SAFE_METHODS,
-    Admits,
-    BodyRules,
-    GuardMiddleware,
-    JsonBody,
-    RequireScope,
-    SitePolicy,
-    body_rule,
-)
+from dextouch.serving.guard import Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.keys import AccessControl
 from dextouch.serving.logs import hide_secrets, masked
+from dextouch.serving.openapi import DESCRIPTION, document_service
 from dextouch.serving.refusals import REFUSED, RefusalLog, WrongKeys
 from dextouch.serving.served_folder import ServedFolder
 from dextouch.serving.settings import ServiceSettings
@@ -88,6 +74,9 @@ def create_service_app(  # noqa: PLR0913 - all by name
     app = FastAPI(
         title=name,
         version=__version__,
+        description=DESCRIPTION,
+        # Operation ids, by which generated clients name their functions.
+        generate_unique_id_function=attrgetter("name"),
         docs_url=None,
         redoc_url=None,
         lifespan=_started(lifespan, folders),
@@ -124,6 +113,7 @@ def create_service_app(  # noqa: PLR0913 - all by name
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.trusted_proxies))
     _add_error_handlers(app)
     app.include_router(_health_router(name, readiness, folders))
+    app.include_router(api_page_router())
     for router in routers:
         app.include_router(router, dependencies=[Depends(folder.required) for folder in folders])
     app.openapi = partial(  # type: ignore[method-assign]
@@ -161,12 +151,12 @@ def _health_router(
     router = APIRouter(tags=["health"])
 
     @router.get("/healthz")
-    async def healthz() -> Health:
+    async def check_liveness() -> Health:
         """Liveness probe."""
         return Health(service=name, version=__version__)
 
     @router.get("/readyz", responses={503: {"model": Readiness}})
-    async def readyz(request: Request, response: Response) -> Readiness:
+    async def check_readiness(request: Request, response: Response) -> Readiness:
         """Readiness probe."""
         waiting = [] if request.app.state.running else ["start"]
         if not waiting:
@@ -177,7 +167,7 @@ def _health_router(
         return Readiness(ready=not waiting, service=name, waiting_for=tuple(waiting))
 
     @router.get("/metrics", include_in_schema=False)
-    def metrics(request: Request) -> Response:
+    def get_metrics(request: Request) -> Response:
         """Metrics in Prometheus text format, made in a thread since some ask the disk."""
         text = generate_latest(request.app.state.registry)
         return Response(text, headers={"content-type": CONTENT_TYPE_LATEST})
@@ -257,93 +247,3 @@ def _problem_response(
         headers=headers,
         media_type=PROBLEM_MEDIA_TYPE,
     )
-
-
-CallT = TypeVar("CallT")
-KEY_SCHEME = "api_key"
-BEARER = {"type": "http", "scheme": "bearer", "description": "A key of the service's settings."}
-BINARY = {"type": "string", "format": "binary"}
-PROBLEM_CONTENT = {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-
-# The server, the guard and the error handlers can give these on any route (413 and 415 also where a
-# GET has a body), and on those that change something.
-OF_ANY = frozenset({408, 413, 415, 421, 429, 431, 500, 503})
-OF_CHANGES = frozenset({403, 404, 409, 422, 507})
-
-
-def document_service(
-    app: FastAPI, routers: Sequence[APIRouter], *, needs_key: bool
-) -> dict[str, Any]:
-    """The OpenAPI document of a service, made once; without keys of the service a key is optional.
-
-    A route declares further refusals by `responses={406: {}}`.
-    """
-    if app.openapi_schema is not None:
-        return app.openapi_schema
-    document = FastAPI.openapi(app)
-    schemas = document.setdefault("components", {}).setdefault("schemas", {})
-    schemas["Problem"] = Problem.model_json_schema()
-    # Of FastAPI's own 422, which no service gives.
-    schemas.pop("HTTPValidationError", None)
-    schemas.pop("ValidationError", None)
-    for operation, route, method in _operations(document, routers):
-        needed = _dependencies(route.dependant, RequireScope)
-        scopes = list(dict.fromkeys(one.scope for one in needed))
-        if scopes:
-            document["components"].setdefault("securitySchemes", {})[KEY_SCHEME] = BEARER
-            keyed = {KEY_SCHEME: scopes}
-            operation["security"] = [keyed] if needs_key else [keyed, {}]
-        for body in _dependencies(route.dependant, JsonBody):
-            schema = body.model.model_json_schema(ref_template="#/components/schemas/{model}")
-            schemas |= schema.pop("$defs", {})
-            operation["requestBody"] = {"required": True, "content": {JSON: {"schema": schema}}}
-        rule = body_rule(route.endpoint)
-        if rule is not None and rule.max_bytes:
-            # Media types that the route takes and reads by itself.
-            body_of = operation.setdefault("requestBody", {"required": True})
-            for kind in rule.max_bytes:
-                schema = {} if kind == JSON else {"schema": BINARY}
-                body_of.setdefault("content", {}).setdefault(kind, schema)
-        _document_refusals(operation, method, has_scope=bool(scopes))
-    return document
-
-
-def _operations(
-    document: dict[str, Any], routers: Sequence[APIRouter]
-) -> Iterator[tuple[dict[str, Any], APIRoute, str]]:
-    """Operations of the document with their routes and methods."""
-    for router in routers:
-        for route in router.routes:
-            if isinstance(route, APIRoute) and route.include_in_schema and router.include_in_schema:
-                for method in route.methods or ():
-                    yield document["paths"][route.path_format][method.lower()], route, method
-
-
-def _dependencies(dependant: Dependant, kind: type[CallT]) -> Iterator[CallT]:
-    for dependency in dependant.dependencies:
-        if isinstance(dependency.call, kind):
-            yield dependency.call
-        yield from _dependencies(dependency, kind)
-
-
-def _document_refusals(operation: dict[str, Any], method: str, *, has_scope: bool) -> None:
-    responses = operation.setdefault("responses", {})
-    statuses = set(OF_ANY)
-    if "security" in operation:
-        statuses.add(401)
-    if has_scope:
-        statuses.add(403)
-    if method not in SAFE_METHODS:
-        statuses |= OF_CHANGES
-    if "requestBody" in operation:
-        statuses.add(400)
-    if operation.get("parameters"):
-        statuses.add(422)
-    if any(parameter["in"] == "path" for parameter in operation.get("parameters", ())):
-        statuses.add(404)
-    statuses |= {int(status) for status in responses if int(status) >= 400}
-    for status in statuses:
-        responses[str(status)] = {
-            "description": HTTPStatus(status).phrase,
-            "content": PROBLEM_CONTENT,
-        }

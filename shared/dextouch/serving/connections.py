@@ -23,6 +23,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -49,6 +50,9 @@ OWN_HEADERS = frozenset({b"x-request-id", b"server-timing"})
 KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 
+# Of a WebSocket's scope: sets the largest message that its client may send.
+MESSAGE_LIMIT = "dextouch.message_limit"
+
 # Finds the ASGI application that answers a request in place of its route, which takes some 0.4 ms
 # of FastAPI's time; None leaves the request to the route. It checks the scope of the key itself,
 # sets `scope["route"]`, raises DexTouch errors like a route, and sends nothing before it succeeds.
@@ -63,8 +67,8 @@ def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[
     """Options of uvicorn for a limited number of connections with clients that are not too slow.
 
     A connection without a request makes room for a new one, the oldest first; if there is none, new
-    ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
-    the response; only time at less than 16 KiB/s counts.
+    ones get status 503. A client may take `client_timeout_s` in all to send a request, or a message
+    of a WebSocket, and to read the response; only time at less than 16 KiB/s counts.
     """
     limits = _Limits(max_connections, client_timeout_s)
     return {
@@ -108,7 +112,7 @@ class _Watched(asyncio.Protocol):
         self._moved_bytes = 0
         self._unsent_bytes = 0
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+    def connection_made(self, transport: Any) -> None:  # noqa: ANN401 - of asyncio or uvloop
         super().connection_made(transport)
         self._check_later()
 
@@ -144,7 +148,61 @@ class _Watched(asyncio.Protocol):
 
 
 class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
-    """WebSocket whose client must read; uvicorn's pings find those that are gone."""
+    """WebSocket whose client must read, and end each message that it begins.
+
+    uvicorn's pings find clients that are gone.
+    """
+
+    def __init__(self, *, limits: _Limits, **given: Any) -> None:  # noqa: ANN401 - uvicorn's
+        super().__init__(limits=limits, **given)
+        # Frames of a message that has not ended, joined: each by itself may be a single byte.
+        self._begun = bytearray()
+        self._unfinished_bytes = 0
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        buffered = len(self.conn.reader.buffer)
+        unfinished = buffered + len(self._begun) + sum(len(frame) for frame in self.frames)
+        # Only what is of a message counts: pings could be sent for ever.
+        if not self.transport.get_write_buffer_size():
+            self._moved_bytes += max(0, unfinished - self._unfinished_bytes)
+        self._unfinished_bytes = unfinished
+
+    def handle_cont(self, event: Any) -> None:  # noqa: ANN401 - of websockets
+        self._begun += b"".join([*self.frames, event.data])
+        self.frames = []
+        if event.fin:
+            self.frames = [bytes(self._begun)]
+            self._begun.clear()
+            self.send_receive_event_to_app()
+
+    def send_receive_event_to_app(self) -> None:
+        super().send_receive_event_to_app()
+        if not self.transport.get_write_buffer_size():
+            self._left_s = self._limits.client_timeout_s
+
+    def _waits_for_request(self) -> bool:
+        return self._unfinished_bytes > 0 and not self.read_paused
+
+    def handle_connect(self, event: Any) -> None:  # noqa: ANN401 - of websockets
+        super().handle_connect(event)
+        # The application begins later; a handshake that was refused has none, and no scope.
+        if not self.handshake_complete:
+            extensions: dict[str, Any] = self.scope.setdefault("extensions", {})
+            extensions[MESSAGE_LIMIT] = self._accept_messages_of
+
+    def _accept_messages_of(self, num_bytes: int) -> None:
+        self.conn.max_message_size = num_bytes
+
+
+def accept_messages_of(socket: WebSocket, num_bytes: int) -> None:
+    """Let the client of a WebSocket send messages of `num_bytes`, once its key is known.
+
+    Others may send 64 KiB (`MAX_WEBSOCKET_BYTES`); another server than ours keeps its own limit.
+    """
+    limit = socket.scope.get("extensions", {}).get(MESSAGE_LIMIT)
+    if limit is not None:
+        limit(num_bytes)
 
 
 class _LimitedHttp(_Watched, HttpToolsProtocol):
@@ -157,7 +215,7 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._is_refused = False
         self._received_bytes = self._header_bytes = 0
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+    def connection_made(self, transport: Any) -> None:  # noqa: ANN401 - of asyncio or uvloop
         super().connection_made(transport)
         idle, limit = self._limits.idle, self._limits.max_connections
         num_open = len(self.connections)

@@ -131,10 +131,14 @@ def _foreign_origin(got: str, own: str) -> AccessDeniedError:
 
 @dataclass(frozen=True)
 class BodyRule:
-    """Maximum body size in bytes by media type; `needs_key` is False only for signing in."""
+    """Maximum body size in bytes by media type; `needs_key` is False only for signing in.
+
+    `model` documents a JSON body that the route decodes by itself.
+    """
 
     max_bytes: Mapping[str, int]
     needs_key: bool = True
+    model: type[BaseModel] | None = None
 
 
 # Default limit: room for names and options, not for data.
@@ -144,17 +148,18 @@ NO_ROUTE = BodyRule({})
 
 
 def takes(
-    max_bytes: Mapping[str, int], *, needs_key: bool = True
+    max_bytes: Mapping[str, int], *, needs_key: bool = True, model: type[BaseModel] | None = None
 ) -> Callable[[EndpointT], EndpointT]:
     """Decorator that declares the bodies a route accepts, placed directly above the function.
 
     Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, bodies
     larger than `max_bytes` of their type (such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`) with 413,
     both before the body is read. `needs_key` is False if the route can be called without a key.
+    `model` documents a JSON body that the route decodes by itself.
     """
 
     def mark(endpoint: EndpointT) -> EndpointT:
-        setattr(endpoint, RULE_ATTRIBUTE, BodyRule(max_bytes, needs_key))
+        setattr(endpoint, RULE_ATTRIBUTE, BodyRule(max_bytes, needs_key, model))
         return endpoint
 
     return mark
@@ -325,8 +330,17 @@ class GuardMiddleware:
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
-# Bodies above it are decoded in a thread, so that others need not wait.
+DecodedT = TypeVar("DecodedT")
+
+# What is larger is decoded in a thread, so that others need not wait.
 MAX_INLINE_BYTES = 64 * KIB
+
+
+async def decoded(decode: Callable[[bytes], DecodedT], body: bytes) -> DecodedT:
+    """What `decode` makes of a body or message, in a thread for one of more than 64 KiB."""
+    if len(body) <= MAX_INLINE_BYTES:
+        return decode(body)
+    return await run_in_threadpool(decode, body)
 
 
 @dataclass(frozen=True)
@@ -340,10 +354,7 @@ class JsonBody(Generic[ModelT]):
 
     async def __call__(self, request: Request) -> ModelT:
         """The body; raises RequestValidationError, or InvalidInputError for too many mistakes."""
-        body = await request.body()
-        if len(body) <= MAX_INLINE_BYTES:
-            return self._decode(body)
-        return await run_in_threadpool(self._decode, body)
+        return await decoded(self._decode, await request.body())
 
     def _decode(self, body: bytes) -> ModelT:
         try:

@@ -119,6 +119,8 @@ def server_options(settings: ServiceSettings, *, grace_s: int) -> dict[str, Any]
         "proxy_headers": False,
         "timeout_keep_alive": KEEP_ALIVE_S,
         "ws_max_size": MAX_WEBSOCKET_BYTES,
+        # A small compressed message may be large in memory; images and touch hardly shrink.
+        "ws_per_message_deflate": False,
         "timeout_graceful_shutdown": grace_s,
     }
 

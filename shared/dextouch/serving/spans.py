@@ -17,6 +17,7 @@ from fastapi import FastAPI
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
+from dextouch.installation import install_command
 from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class Spans:
             resources = import_module("opentelemetry.sdk.resources")
             otlp = import_module("opentelemetry.exporter.otlp.proto.http.trace_exporter")
         except ModuleNotFoundError:
-            logger.warning("spans_not_exported", reason="pip install 'dextouch-wm[tracing]'")
+            logger.warning("spans_not_exported", reason=install_command("tracing"))
             return
         resource = resources.Resource.create({"service.name": service})
         # Its own handler at exit would wait half a minute, and does not run after a signal.

@@ -128,21 +128,23 @@ def array_of(
     Raises InvalidInputError for a shape that is none, too many elements, or another number of
     bytes; `what` names the array.
     """
-    if (
-        not isinstance(shape, list)
-        or len(shape) > MAX_DIMENSIONS
-        or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
-        or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
-    ):
+    counts: list[Any] | None = None
+    if isinstance(shape, list) and len(shape) <= MAX_DIMENSIONS:
+        counts = shape
+    num_numbers = 1
+    for n in counts or ():
+        # Exactly int, since a bool is none.
+        num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
+    if counts is None or num_numbers > MAX_NUMBERS:
         raise InvalidInputError(
             f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "
             f"at most {MAX_NUMBERS}"
         )
-    expected = math.prod(shape) * dtype.itemsize
+    expected = math.prod(counts) * dtype.itemsize
     if not isinstance(data, bytes) or len(data) != expected:
         got = len(data) if isinstance(data, bytes) else type(data).__name__
-        raise InvalidInputError(f"{what}: got {got} bytes, expected {expected} for {shape}")
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+        raise InvalidInputError(f"{what}: got {got} bytes, expected {expected} for {counts}")
+    return np.frombuffer(data, dtype=dtype).reshape(counts)
 
 
 def pack_openpi(message: Mapping[str, Any]) -> bytes:

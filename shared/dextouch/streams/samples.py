@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import not_
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -54,7 +55,8 @@ class StreamDescriptor(FrozenModel):
 
     `shape` is that of one sample's payload, at most MAX_SAMPLE_BYTES; `unit` that of its values
     (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` their coordinate system, if
-    any. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`.
+    any. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`; `names` are
+    those of the numbers along the last axis, where they have any.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
@@ -69,6 +71,7 @@ class StreamDescriptor(FrozenModel):
     capabilities: ClockCapabilities = ClockCapabilities()
     # None is not written, so that older releases can read the streams of our own glove.
     layout: TactileLayout | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    names: tuple[Annotated[str, Field(max_length=128)], ...] = Field(default=(), exclude_if=not_)
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> "StreamDescriptor":
@@ -76,6 +79,15 @@ class StreamDescriptor(FrozenModel):
             raise ValueError(
                 f"{self.name}: a sample of shape {self.shape} takes {self.sample_bytes()} bytes, "
                 f"expected at most {MAX_SAMPLE_BYTES}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _names_each_number(self) -> "StreamDescriptor":
+        if self.names and (len(self.names),) != self.shape[-1:]:
+            raise ValueError(
+                f"{self.name}: got {len(self.names)} names for samples of shape {self.shape}, "
+                "expected one for each number of the last axis"
             )
         return self
 

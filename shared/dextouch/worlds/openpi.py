@@ -3,7 +3,8 @@
 The server first sends what it serves. Then every message of the client has one of these forms, and
 is answered with a map, or with text that says why it was refused (docs/rollout_api.md):
 
-- {"start": {"world", "task", "seed", "instruction"}}: begin a rollout
+- {"start": {"world", "task", "seed", "instruction"}}: begin a rollout; from an observation with
+  {"first_step", "reached_is_measured"} as "observation" and its arrays beside it
 - {"resume": ID}: continue a rollout that was begun here or over HTTP
 - {"actions": [K, 67]}: advance; with "chunk": N as the route of chunks, so that it may be repeated
 - {"end": true}: end the rollout
@@ -11,7 +12,9 @@ is answered with a map, or with text that says why it was refused (docs/rollout_
 "return": {"steps", "cameras", "tactile"} beside them selects what later answers hold.
 """
 
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -20,8 +23,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.hands.actions import ACTION_DIM
-from dextouch.schemas import EVERYTHING, ReturnSelector, StartRequest, start_from, validate_fields
-from dextouch.serving import MAX_WEBSOCKET_BYTES
+from dextouch.schemas import (
+    EVERYTHING,
+    ReturnSelector,
+    WorldDescription,
+    start_of_parts,
+    validate_fields,
+)
+from dextouch.serving import MAX_WEBSOCKET_BYTES, accept_messages_of, decoded
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
@@ -32,6 +41,22 @@ CLIENT: Final = "openpi"
 _REFUSED: Final = 1008
 _FORMS: Final = ("start", "resume", "actions", "end")
 _KNOWN: Final = {*_FORMS, "chunk", "return"}
+
+
+def largest_message(worlds: Sequence[WorldDescription], *, max_body_bytes: int) -> int:
+    """Bytes of the largest message that a start in one of these worlds needs.
+
+    A world that starts from an observation needs one step of its images, touch and poses; one that
+    scales images takes them of any size, up to `max_body_bytes`.
+    """
+    needed = MAX_WEBSOCKET_BYTES
+    for world in worlds:
+        if "observation" in world.starts_from:
+            area_px = world.image_height_px * world.image_width_px
+            images = max_body_bytes if world.scales_images else 3 * area_px * len(world.cameras)
+            touch = 2 * 4 * world.num_taxels
+            needed = max(needed, images + touch + MAX_WEBSOCKET_BYTES)
+    return min(needed, max(max_body_bytes, MAX_WEBSOCKET_BYTES))
 
 
 def openpi_router(service: RolloutService) -> APIRouter:
@@ -47,8 +72,12 @@ def openpi_router(service: RolloutService) -> APIRouter:
             await socket.close(_REFUSED, error.message[:120])
             return
         await socket.accept()
-        worlds = [world.model_dump(mode="json") for world in service.worlds()]
-        session = _Session(service, owner)
+        described = service.worlds()
+        worlds = [world.model_dump(mode="json") for world in described]
+        max_body_bytes = socket.app.state.settings.max_body_bytes
+        max_bytes = largest_message(described, max_body_bytes=max_body_bytes)
+        accept_messages_of(socket, max_bytes)
+        session = _Session(service, owner, max_bytes)
         with suppress(WebSocketDisconnect):
             await socket.send_bytes(pack_openpi({"worlds": worlds, "action_dim": ACTION_DIM}))
             while (message := await socket.receive())["type"] == "websocket.receive":
@@ -63,9 +92,10 @@ def openpi_router(service: RolloutService) -> APIRouter:
 
 
 class _Session:
-    def __init__(self, service: RolloutService, owner: str) -> None:
+    def __init__(self, service: RolloutService, owner: str, max_bytes: int) -> None:
         self._service = service
         self._owner = owner
+        self._max_bytes = max_bytes
         self._selector = EVERYTHING
         self._rollout_id: str | None = None
         self._next_chunk = 0
@@ -74,9 +104,12 @@ class _Session:
         """Carry out one message; raises DexTouchError without a change of the rollout."""
         if data is None:
             raise InvalidInputError("message: got text, expected msgpack in a binary message")
-        message = unpack_openpi(data, max_bytes=MAX_WEBSOCKET_BYTES)
+        message = await decoded(partial(unpack_openpi, max_bytes=self._max_bytes), data)
         given = [name for name in _FORMS if name in message]
-        if len(given) != 1 or set(message) - _KNOWN:
+        known = set(_KNOWN)
+        if "start" in given:
+            known |= {"observation", *_arrays_of(message)}
+        if len(given) != 1 or set(message) - known:
             raise InvalidInputError(
                 f"message: got the keys {', '.join(sorted(message)) or 'none'}, expected one of "
                 f"{', '.join(_FORMS)}, and optionally chunk and return"
@@ -91,9 +124,18 @@ class _Session:
             raise
 
     async def _start(self, message: dict[str, Any]) -> bytes:
-        request = validate_fields(StartRequest, message["start"], where="start")
+        arrays = _arrays_of(message)
+        fields: dict[str, Any] = {
+            name: message[name] for name in ("start", "observation") if name in message
+        }
+        if arrays and "observation" not in fields:
+            raise InvalidInputError(
+                f"start: got arrays ({', '.join(sorted(arrays))}) without 'observation', expected "
+                "first_step and reached_is_measured, as an answer has them beside its arrays"
+            )
+        request, begin = start_of_parts(fields, arrays)
         answer = await self._service.start(
-            request.world, start_from(request), self._selector, owner=self._owner, client=CLIENT
+            request.world, begin, self._selector, owner=self._owner, client=CLIENT
         )
         return self._repacked(answer)
 
@@ -134,3 +176,12 @@ class _Session:
         info = fields["rollout"]
         self._rollout_id, self._next_chunk = info["id"], info["next_chunk"]
         return pack_openpi({**fields, **arrays, "replayed": answer.replayed})
+
+
+def _arrays_of(message: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Arrays beside a start, of this machine's byte order."""
+    return {
+        name: np.asarray(value, value.dtype.newbyteorder("="))
+        for name, value in message.items()
+        if isinstance(value, np.ndarray) and name not in _KNOWN
+    }

@@ -61,11 +61,17 @@ class WatchNote:
     success: bool | None = None
     trace_id: str | None = None
 
+    def after(self, seen: Observation) -> "WatchNote":
+        """The note once this has been observed."""
+        began = self.client, self.key, self.begun_host_ns
+        return WatchNote(*began, seen.uncertainty, seen.success, self.trace_id)
+
     def to_bytes(self, info: Mapping[str, Any]) -> bytes:
         """Serialize the note with the progress of its rollout and the time of this write."""
         uncertainty = None if self.uncertainty is None else self.uncertainty.model_dump()
-        known = vars(self) | {"uncertainty": uncertainty}
-        return msgpack.packb((info, time.time_ns(), tuple(known.values())))
+        began = self.client, self.key, self.begun_host_ns
+        known = (*began, uncertainty, self.success, self.trace_id)
+        return msgpack.packb((info, time.time_ns(), known))
 
     @staticmethod
     def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":

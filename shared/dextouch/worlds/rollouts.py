@@ -307,7 +307,7 @@ class RolloutService:
         parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)
         encoded_s = time.perf_counter() - began_s
-        note = replace(stored.note, uncertainty=seen.uncertainty, success=seen.success)
+        note = stored.note.after(seen)
         record = RolloutRecord(
             info, outcome.snapshot, request_sha256, payload, stored.version, note
         )

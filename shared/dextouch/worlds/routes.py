@@ -21,10 +21,11 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import (
     ForkRequest,
+    JsonAnswer,
     ReturnSelector,
     RolloutInfo,
     RolloutStart,
@@ -43,6 +44,7 @@ from dextouch.serving import (
     OCTETS,
     AccessControl,
     RequireScope,
+    decoded,
     media_type,
     takes,
     timed,
@@ -56,8 +58,6 @@ MAX_BODY_BYTES = 2**28
 MAX_CHUNK_BYTES = 2**20
 # Of a chunk as JSON; more than any world takes at once.
 MAX_ROWS = 4096
-# Bodies above it are decoded in a thread, so that others need not wait.
-MAX_INLINE_BYTES = 64 * KIB
 
 SCOPE: Final = "rollout"
 WATCH_SCOPE: Final = "watch"
@@ -73,7 +73,14 @@ _MAX_QUERY_BYTES: Final = 256
 
 
 class ActionsBody(FrozenModel):
-    """A chunk as JSON: rows of 67 numbers."""
+    """A chunk as JSON: rows of 67 numbers, one for each step.
+
+    Attributes:
+        actions: poses of both wrists and the head camera relative to the start of the rollout, and
+            joint angles of both hands (rad), in the order of docs/rollout_api.md.
+    """
+
+    model_config = example(actions=[[0.0] * ACTION_DIM] * 4)
 
     actions: Annotated[
         list[Annotated[list[float], Field(fail_fast=True)]],
@@ -82,7 +89,32 @@ class ActionsBody(FrozenModel):
 
 
 # Both routes that simulate answer with a packed observation, or as JSON if that is asked for.
-ANSWER: dict[str, Any] = {"content": {MSGPACK: {}, JSON: {}}}
+ANSWER: dict[str, Any] = {
+    "model": JsonAnswer,
+    "content": {MSGPACK: {}},
+    "headers": {
+        REPLAYED_HEADER: {
+            "description": "`true` if the answer is that of an earlier, equal request.",
+            "schema": {"type": "string", "enum": ["true", "false"]},
+        }
+    },
+}
+
+# The dtype is a required parameter; float32 is taken, too.
+BINARY_CHUNK: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            f"{OCTETS}; dtype=float64": {
+                "schema": {
+                    "type": "string",
+                    "format": "binary",
+                    "description": "[K, 67] in C order, little endian; also as `dtype=float32`.",
+                }
+            }
+        },
+    }
+}
 
 # From the query: ?steps=last&cameras=camera_head&tactile=false; unknown parameters are refused.
 Selector = Annotated[ReturnSelector, Query()]
@@ -149,8 +181,8 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
     router = APIRouter(prefix="/v1", tags=["rollouts"], dependencies=[Depends(RequireScope(SCOPE))])
 
     @router.get("/worlds")
-    async def worlds() -> WorldList:
-        """List the available worlds."""
+    async def list_worlds() -> WorldList:
+        """List the worlds of this service: what they can start from, their cameras and tasks."""
         return WorldList(worlds=tuple(service.worlds()))
 
     @router.post(
@@ -158,11 +190,14 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         status_code=201,
         response_class=Response,
         responses={201: ANSWER},
-        openapi_extra=_json_body(StartRequest),
     )
-    @takes({JSON: 16 * KIB, MSGPACK: AS_SET})
-    async def start(request: Request, selector: Selector, owner: Owner) -> Response:
-        """Start a rollout from a task and seed, or from an observation."""
+    @takes({JSON: 16 * KIB, MSGPACK: AS_SET}, model=StartRequest)
+    async def start_rollout(request: Request, selector: Selector, owner: Owner) -> Response:
+        """Start a rollout from a task and seed, or from an observation in MessagePack.
+
+        The answer holds the first observation, and the poses that actions are relative to. As JSON
+        with `Accept: application/json`.
+        """
         with timed(request, "decode"):
             chosen, begin = await _start_of(request)
         with timed(request, "world"):
@@ -171,24 +206,30 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         return _response(request, answer, status=201)
 
     @router.get("/rollouts/{rollout_id}")
-    async def get(rollout_id: str) -> RolloutInfo:
-        """Get the state of a rollout."""
+    async def get_rollout(rollout_id: str) -> RolloutInfo:
+        """Get the progress of a rollout; does not renew its time to live."""
         return await service.get(rollout_id)
 
     @router.delete("/rollouts/{rollout_id}", status_code=204)
-    async def delete(rollout_id: str) -> None:
-        """End a rollout."""
+    async def delete_rollout(rollout_id: str) -> None:
+        """End a rollout, and make room for another one."""
         await service.delete(rollout_id)
 
     @router.post(
         "/rollouts/{rollout_id}/chunks/{chunk}",
         response_class=Response,
         responses={200: ANSWER},
-        openapi_extra=_json_body(ActionsBody),
+        openapi_extra=BINARY_CHUNK,
     )
-    @takes({OCTETS: MAX_CHUNK_BYTES, JSON: MAX_CHUNK_BYTES})
-    async def step(rollout_id: str, chunk: int, request: Request, selector: Selector) -> Response:
-        """Advance by the numbered action chunk."""
+    @takes({OCTETS: MAX_CHUNK_BYTES, JSON: MAX_CHUNK_BYTES}, model=ActionsBody)
+    async def send_chunk(
+        rollout_id: str, chunk: int, request: Request, selector: Selector
+    ) -> Response:
+        """Advance by the numbered action chunk, and return the observations of its steps.
+
+        The newest chunk may be sent again, and gets the same answer. As JSON with
+        `Accept: application/json`.
+        """
         with timed(request, "decode"):
             actions = await _actions_of(request)
         answer = await service.step(rollout_id, chunk, actions, selector)
@@ -198,8 +239,8 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
 
     @router.post("/rollouts/{rollout_id}/fork", status_code=201)
     @takes({JSON: KIB})
-    async def fork(rollout_id: str, asked: ForkRequest, owner: Owner) -> RolloutInfo:
-        """Branch at the current step."""
+    async def fork_rollout(rollout_id: str, asked: ForkRequest, owner: Owner) -> RolloutInfo:
+        """Branch at the current step: the copy shares the past and continues by itself."""
         return await service.fork(rollout_id, seed=asked.seed, owner=owner)
 
     return router
@@ -211,14 +252,16 @@ def watch_router(watch: RolloutWatch) -> APIRouter:
     router = APIRouter(prefix="/v1/watch", tags=["watching"], dependencies=may_watch)
 
     @router.get("")
-    async def listed(limit: Annotated[int, Query(ge=1, le=MAX_WATCHED)] = 100) -> WatchedRollouts:
+    async def list_watched_rollouts(
+        limit: Annotated[int, Query(ge=1, le=MAX_WATCHED)] = 100,
+    ) -> WatchedRollouts:
         """List the open rollouts, the newest first."""
         return await watch.listed(limit)
 
     @router.get(
         "/{watch_id}", response_class=Response, responses={200: {"content": {MSGPACK: {}}}, 304: {}}
     )
-    async def newest(request: Request, watch_id: WatchId) -> Response:
+    async def get_watched_response(request: Request, watch_id: WatchId) -> Response:
         """The newest response of a rollout, as its client asked for it."""
         known = request.headers.get("if-none-match", "").strip('"')
         tag, payload = await watch.newest(watch_id, known)
@@ -236,11 +279,6 @@ def client_name(header: str) -> str:
     return name.strip()[:MAX_CLIENT_LETTERS]
 
 
-def _json_body(model: type[FrozenModel]) -> dict[str, Any]:
-    content = {JSON: {"schema": model.model_json_schema()}}
-    return {"requestBody": {"required": True, "content": content}}
-
-
 async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     kind, _ = media_type(request.headers.get("content-type"))
     body = await request.body()
@@ -255,9 +293,7 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
     kind, parameters = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == JSON:
-        if len(body) > MAX_INLINE_BYTES:
-            return await run_in_threadpool(_actions_from_json, body)
-        return _actions_from_json(body)
+        return await decoded(_actions_from_json, body)
     return actions_from(body, parameters.get("dtype", ""))
 
 

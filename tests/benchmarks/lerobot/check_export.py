@@ -20,16 +20,20 @@ WINDOW = 5
 
 @dataclass(frozen=True)
 class Case:
-    """One way to export: cameras of a unit, at a rate; how near images and actions must come."""
+    """One way to export: cameras of a unit, at a rate; how near images and actions must come.
+
+    With `grown` the second episode is appended, and every touch sample goes along.
+    """
 
     unit: str
     fps: int
     least_psnr_db: float
     action_error: float
+    grown: bool = False
 
     @property
     def name(self) -> str:
-        return f"{self.unit} at {self.fps} Hz"
+        return f"{self.unit} at {self.fps} Hz{', appended' * self.grown}"
 
 
 # Video that is copied differs only by the decoder's way to RGB; what is encoded anew loses more.
@@ -39,6 +43,8 @@ CASES = (
     Case("h264", 15, 25.0, 0.0),
     Case("jpeg", 15, 25.0, 0.0),
     Case("rgb8", 15, 25.0, 0.0),
+    Case("h264", 30, 40.0, 1e-6, grown=True),
+    Case("jpeg", 15, 25.0, 0.0, grown=True),
 )
 
 
@@ -72,7 +78,7 @@ def check(case: Case, folder: Path) -> str:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from takes import CAMERAS, write_episode
 
-    from dextouch.bridges.lerobot import ExportOptions, export_lerobot
+    from dextouch.bridges.lerobot import ExportOptions, export_dataset
     from dextouch.episodes import EpisodeStore
 
     store = EpisodeStore(folder / "store")
@@ -80,9 +86,13 @@ def check(case: Case, folder: Path) -> str:
         write_episode(store, f"take-{index}", unit=case.unit, seed=3 + index)
         for index in range(NUM_EPISODES)
     ]
-    num_frames = export_lerobot(
-        readers, folder / "dataset", repo_id=REPO, options=ExportOptions(fps=case.fps)
-    )
+    num_frames = 0
+    for part in (readers[:1], readers) if case.grown else (readers,):
+        options = ExportOptions(
+            fps=case.fps, touch_samples=case.grown, license_name="cc-by-4.0", existing="append"
+        )
+        done = export_dataset(part, folder / "dataset", repo_id=REPO, options=options)
+        num_frames += done.num_frames
     dataset = LeRobotDataset(REPO, root=folder / "dataset", return_uint8=True)
     require("frames", len(dataset), num_frames)
     require("episodes", dataset.num_episodes, NUM_EPISODES)
@@ -92,12 +102,15 @@ def check(case: Case, folder: Path) -> str:
         item = dataset[index]
         reader = readers[int(item["episode_index"])]
         num_actions += check_numbers(item, reader, case, f"frame {index}")
+        if case.grown:
+            check_touch(item, reader, f"frame {index}")
         psnrs += [check_image(item, reader, camera, case) for camera in CAMERAS]
     if num_actions < sum(reader.num_steps for reader in readers):
         raise MismatchError(
             f"got actions of {num_actions} steps, expected every step of every episode"
         )
     check_window(folder / "dataset", dataset, case)
+    check_card(folder / "dataset")
     return (
         f"{num_frames} frames of {NUM_EPISODES} episodes, {num_actions} actions within "
         f"{case.action_error:g}, images at least {min(psnrs):.1f} dB (bound {case.least_psnr_db:g})"
@@ -131,6 +144,27 @@ def check_numbers(item, reader, case: Case, where: str) -> int:
             f"expected at most {case.action_error:g}"
         )
     return 1
+
+
+def check_touch(item, reader, where: str) -> None:
+    """Compare the touch samples of a frame with those that the episode has at their times."""
+    for hand, side in enumerate(("left", "right")):
+        data = reader.read(f"tactile_{side}")
+        count = int(item["dextouch.tactile_samples_count"][hand])
+        offsets_ns = item["dextouch.tactile_samples_dt_ns"][:count, hand].numpy()
+        rows = np.searchsorted(data.t_ref_ns, int(item["dextouch.t_ref_ns"]) + offsets_ns)
+        got = item["observation.tactile_samples"][:count, hand].numpy()
+        require(f"{where}: touch {side}", np.array_equal(got, data.values[rows]), expected=True)
+
+
+def check_card(folder: Path) -> None:
+    """Read the dataset's card with the Hub's own reader."""
+    from huggingface_hub import DatasetCard
+
+    data = DatasetCard.load(folder / "README.md").data
+    require("licence of the card", data.license, "cc-by-4.0")
+    require("tasks of the card", data.task_categories, ["robotics"])
+    require("first tag of the card", data.tags[0], "LeRobot")
 
 
 def check_image(item, reader, camera: str, case: Case) -> float:

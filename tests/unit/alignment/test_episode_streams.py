@@ -5,7 +5,7 @@ import pytest
 
 from dextouch import images
 from dextouch.episodes import GOP_IMAGES, EpisodeStore
-from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.episodes.image_codecs import ImageGroups
 from dextouch.errors import NotFoundError
 from dextouch.streams import StreamDescriptor
 from services.alignment import jobs
@@ -68,7 +68,7 @@ def no_decoding(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("an image was decoded or encoded")
 
-    monkeypatch.setattr(ImageChunks, "decode", refuse)
+    monkeypatch.setattr(ImageGroups, "decode", refuse)
     monkeypatch.setattr(images, "encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.writer.encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.writer.GopEncoder", refuse)

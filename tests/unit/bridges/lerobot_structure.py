@@ -99,8 +99,15 @@ class Checker:
         return [row["task"] for row in rows]
 
     def check_episodes(self, tasks):
-        table = pq.read_table(self.folder / "meta/episodes/chunk-000/file-000.parquet")
-        rows, start = table.to_pylist(), 0
+        tables = {
+            (int(path.parent.name[-3:]), int(path.stem[-3:])): pq.read_table(path)
+            for path in sorted(self.folder.glob("meta/episodes/*/*.parquet"))
+        }
+        columns = tables[0, 0].column_names
+        for table in tables.values():
+            self.need(table.schema.names == columns, "episodes: files of other columns")
+        rows, start = [row for table in tables.values() for row in table.to_pylist()], 0
+        places = [place for place, table in tables.items() for _ in range(table.num_rows)]
         self.need(len(rows) == self.info["total_episodes"], "episodes: number of rows")
         for index, row in enumerate(rows):
             self.need(row["episode_index"] == index, f"episodes: row {index} is another")
@@ -109,9 +116,9 @@ class Checker:
             self.need(row["dataset_to_index"] == start, f"episodes: {index} stops elsewhere")
             self.need(set(row["tasks"]) <= set(tasks), f"episodes: {index} has unknown tasks")
             place = (row["meta/episodes/chunk_index"], row["meta/episodes/file_index"])
-            self.need(place == (0, 0), f"episodes: {index} says another file of itself")
+            self.need(place == places[index], f"episodes: {index} says another file of itself")
             nested = {name: {} for name in self.features}
-            for column in table.column_names:
+            for column in columns:
                 if column.startswith("stats/"):
                     feature, kind = column.removeprefix("stats/").rsplit("/", 1)
                     nested[feature][kind] = row[column]
@@ -156,8 +163,9 @@ class Checker:
         for name in names & set(table.column_names):
             dtype, shape = self.features[name]["dtype"], self.features[name]["shape"]
             expected = ARROW[dtype]
-            if len(shape) == 2:
-                expected = pa.list_(pa.list_(expected))
+            if len(shape) > 1:
+                for _ in shape:
+                    expected = pa.list_(expected)
             elif shape != [1]:
                 expected = pa.list_(expected, shape[0])
             self.need(table.schema.field(name).type == expected, f"data: type of {name}")

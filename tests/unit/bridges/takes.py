@@ -127,7 +127,7 @@ def write_episode(
     return store.open(episode_id)
 
 
-def write_recording(store, recording_id="take-0001", *, count=70, station="bench-2"):
+def write_recording(store, recording_id="take-0001", *, count=70, station="bench-2", **more):
     """A raw take: counts, NaN poses, JPEG images, repeated stamps, absent device stamps."""
     rng = np.random.default_rng(11)
     t_host_ns = 10**15 + np.sort(rng.integers(0, 10**9, count))
@@ -165,6 +165,7 @@ def write_recording(store, recording_id="take-0001", *, count=70, station="bench
         consent=True,
         calibration={"K_head": matrix_rows(K_HEAD), "distortion_head": (DISTORTION,)},
         ledger=(LedgerEntry(stream="wrist_left", event="lost", count=2),),
+        **more,
     )
     with store.writer(kind="recording", attributes=attributes) as writer:
         for stream in described:

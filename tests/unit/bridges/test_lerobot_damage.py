@@ -133,7 +133,8 @@ DAMAGE = {
     "info is no JSON": (_write(INFO, b"{"), CorruptDataError, "info.json"),
     "info is a list": (_write(INFO, b"[1]"), CorruptDataError, "info.json"),
     "info nests deeply": (_write(INFO, b"[" * 200_000), CorruptDataError, "info.json"),
-    "older format": (_info(codebase_version="v2.1"), InvalidInputError, "v2.1"),
+    "older format": (_info(codebase_version="v1.6"), InvalidInputError, "v1.6"),
+    "format of other files": (_info(codebase_version="v2.1"), NotFoundError, "tasks.jsonl"),
     "no fps": (_info(fps=0), CorruptDataError, "fps"),
     "data path leads out": (
         _info(data_path="../{chunk_index}/{file_index}.parquet"),
@@ -353,3 +354,22 @@ def test_the_sidecar_is_json_that_people_can_read(folder):
     said = json.loads((folder / SIDECAR).read_text())
     assert said["attributes"]["K_head"][0][0] == 60.0
     assert said["grid"] == "model"
+
+
+def test_flipped_bytes_of_texts_neither_end_the_process_nor_read_elsewhere(tmp_path):
+    texts = [f"x{k % 5}" for k in range(200)]
+    lists = [[{"a": f"q{k % 7}", "b": k}] * 2 if k % 3 else None for k in range(200)]
+    path = tmp_path / "texts.parquet"
+    pq.write_table(
+        pa.table({"text": texts, "lists": lists}), path, row_group_size=70, data_page_version="2.0"
+    )
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(3), 0
+    for place in rng.integers(4, len(whole), 200):
+        damaged = bytearray(whole)
+        damaged[place] = int(rng.integers(256))
+        path.write_bytes(damaged)
+        try:
+            source._table_rows(source._read_table(path), path)
+        except CorruptDataError:
+            refused += 1
+    assert refused

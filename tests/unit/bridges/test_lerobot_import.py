@@ -6,7 +6,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
+from dextouch.bridges.lerobot import (
+    ExportOptions,
+    ImportOptions,
+    export_lerobot,
+    import_dataset,
+    import_lerobot,
+)
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,
@@ -225,31 +231,59 @@ def test_datasets_of_others_come_in_by_a_mapping(store, other, folder):
     assert len(readers) == 2
 
 
-def test_what_is_missing_is_listed_with_what_there_is(store, other, folder):
+def test_without_a_head_camera_it_is_a_recording_and_the_reason_is_said(store, other, folder):
     foreign(store, folder)
-    edit_json(folder, INFO, lambda info: info["features"]["action"].update(shape=[7]))
-    with pytest.raises(InvalidInputError) as caught:
-        import_lerobot(folder, other)
-    message = caught.value.message
-    assert "'action': 'action' is float32 [7], expected float32 [67]" in message
-    assert "'camera_head': no video feature 'observation.images.camera_head'" in message
-    assert "'observation.images.top' video [48, 64, 3]" in message
-    assert "mapping=" in message
+    result = import_dataset(folder, other)
+    assert result.kind == "recording"
     assert other.list() == []
+    assert other.list(kind="recording") == result.ids == ["dataset-000000", "dataset-000001"]
+    (note,) = result.notes
+    assert "no feature 'observation.images.camera_head'" in note
+    assert "--map camera_head=FEATURE" in note
+    streams = other.recording(result.ids[0]).streams
+    assert streams["observation_tactile"].shape == (2, 320)
+    assert streams["action"].names[:3] == ("wrist_left.x_m", "wrist_left.y_m", "wrist_left.z_m")
+    assert {"camera_wrist_left", "observation_images_top"} <= set(streams)
+
+
+def test_features_without_a_role_are_streams_of_the_episode(store, other, folder):
+    foreign(store, folder)
+    table = pq.read_table(folder / DATA)
+    numbers = np.arange(table.num_rows, dtype=np.float32)
+    table = table.append_column("observation.current", [numbers])
+    pq.write_table(table.append_column("note", [["a"] * len(numbers)]), folder / DATA)
+
+    def change(info):
+        info["features"]["observation.current"] = {"dtype": "float32", "shape": [1]}
+        info["features"]["note"] = {"dtype": "string", "shape": [1]}
+
+    edit_json(folder, INFO, change)
+    mapping = {"camera_head": "observation.images.top", "amps": "observation.current"}
+    result = import_dataset(folder, other, options=ImportOptions(mapping=mapping))
+    assert result.kind == "episode"
+    named = {(one.source, one.stream) for one in result.reports[0].imported}
+    assert {("observation.current", "amps"), ("note", "note"), ("action", "action")} <= named
+    assert {one.num_samples for one in result.reports[0].imported} == {17}
+    assert import_dataset(folder, other, options=ImportOptions(mapping=mapping)).present == (
+        result.ids
+    )
+    back = other.open(result.ids[1])
+    np.testing.assert_array_equal(back.read("amps").values.ravel(), numbers[17:])
+    np.testing.assert_array_equal(back.stamps_ns("amps"), back.stamps_ns("action"))
 
 
 def test_a_mapping_of_unknown_names_is_refused(store, other, folder):
     foreign(store, folder)
-    for mapping, words in (
-        ({"gripper": "action"}, "gripper"),
-        ({"camera_../x": "action"}, "camera_../x"),
-        ({"camera_head": "observation.images.front"}, "observation.images.front"),
+    top = {"camera_head": "observation.images.top"}
+    for mapping, error, words in (
+        (top | {"gripper": "action"}, UnknownNameError, "gripper"),
+        ({"camera_../x": "observation.images.top"}, InvalidInputError, "camera_../x"),
+        ({"camera_head": "observation.images.front"}, UnknownNameError, "images.front"),
+        ({"camera_head": "observation.state"}, InvalidInputError, "expected images"),
     ):
-        with pytest.raises(UnknownNameError, match=words):
+        with pytest.raises(error, match=words):
             import_lerobot(folder, other, options=ImportOptions(mapping=mapping))
-    wrong = {"camera_head": "observation.state"}
-    with pytest.raises(InvalidInputError, match="expected video"):
-        import_lerobot(folder, other, options=ImportOptions(mapping=wrong))
+    assert other.list() == other.list(kind="recording") == []
 
 
 def test_other_datasets_may_know_no_camera_matrix(store, other, folder):

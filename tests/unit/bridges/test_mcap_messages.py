@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -13,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.bridges.mcap import import_mcap
-from dextouch.bridges.mcap_messages import MessageCodec, Sent, descriptor_set
+from dextouch.bridges.mcap_messages import MessageCodec, Sent, descriptor_set, joint_names
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError
 from tests.unit.bridges.takes import (
@@ -29,6 +30,8 @@ POSES = descriptor("object_poses", "pose", (2, 7), "float64", "pose_m_wxyz", 100
 JPEG = descriptor("camera_head", "image", (8, 8, 3), "uint8", "jpeg", 30)
 RAW = descriptor("camera_head", "image", (1, 2, 3), "uint8", "rgb8", 30)
 TOUCH = descriptor("touch", "tactile", (2,), "float32", "kPa", 60)
+JOINTS = descriptor("joints_left", "robot_state", (20,), "float64", "rad", 100)
+ACTION = descriptor("action", "robot_state", (67,), "float64", "action", 15)
 FLAGS = descriptor("flags", "scalar", (3,), "uint8", "bits", 10)
 # Timestamp 2 s and 3 ns, frame "touch", shape [2], values [1, 2], each tag and length by hand from
 # https://protobuf.dev/programming-guides/encoding.
@@ -77,6 +80,34 @@ def test_numbers_that_are_not_numbers_keep_their_bits():
     assert again.value.tobytes() == bits.tobytes()
 
 
+def test_joints_and_actions_keep_their_bits_too():
+    rng = np.random.default_rng(4)
+    for stream in (JOINTS, ACTION):
+        bits = rng.integers(0, 2**64, stream.shape, dtype=np.uint64)
+        # A signalling NaN with a payload, and a negative zero.
+        bits[:2] = 0x7FF4_0000_0000_0001, 1 << 63
+        again = MessageCodec(stream).decode(encoded(stream, bits.view(np.float64)))
+        assert again.value.tobytes() == bits.tobytes()
+
+
+def test_joints_are_foxgloves_states():
+    parsed = JointStates.FromString(encoded(JOINTS, np.arange(20.0)))
+    assert [joint.position for joint in parsed.joints] == list(range(20))
+    assert parsed.joints[3].name == "l_thumb_ip"
+    theirs = MessageCodec(JOINTS).decode(
+        JointStates(timestamp=parsed.timestamp, joints=parsed.joints).SerializeToString()
+    )
+    np.testing.assert_array_equal(theirs.value, np.arange(20.0))
+
+
+def test_only_what_holds_joints_has_their_names():
+    assert joint_names(JOINTS)[0] == "l_thumb_cmc_flex"
+    right = JOINTS.model_copy(update={"name": "x", "side": "right"})
+    assert joint_names(right)[0] == "r_thumb_cmc_flex"
+    for changes in ({"name": "joints"}, {"shape": (21,)}, {"dtype": "float32"}, {"unit": "m"}):
+        assert joint_names(JOINTS.model_copy(update=changes)) == ()
+
+
 def test_a_pose_is_foxgloves_transform_and_back():
     pose = np.array([0.1, -0.0, 1e300, 0.8, 0.0, 0.0, 0.6])
     parsed = FrameTransform.FromString(encoded(POSE, pose))
@@ -112,15 +143,21 @@ def encoded_as(stream, sent):
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_message_or_a_clear_refusal(data):
-    for stream in (POSE, POSES, JPEG, RAW, TOUCH, FLAGS):
+    for stream in (POSE, POSES, JPEG, RAW, TOUCH, FLAGS, JOINTS, ACTION):
         with suppress(CorruptDataError):
             MessageCodec(stream).decode(data)
 
 
 @pytest.mark.parametrize(
     ("stream", "value"),
-    [(JPEG, b"x" * 40), (RAW, np.zeros((1, 2, 3), np.uint8)), (TOUCH, np.ones(2, np.float32))],
-    ids=["jpeg", "raw", "array"],
+    [
+        (JPEG, b"x" * 40),
+        (RAW, np.zeros((1, 2, 3), np.uint8)),
+        (TOUCH, np.ones(2, np.float32)),
+        (JOINTS, np.ones(20)),
+        (ACTION, np.ones(67)),
+    ],
+    ids=["jpeg", "raw", "array", "joints", "action"],
 )
 def test_a_cut_message_is_never_taken_for_a_whole_one(stream, value):
     whole = encoded(stream, value)
@@ -146,6 +183,17 @@ def test_a_message_without_its_value_is_refused():
         MessageCodec(FLAGS).decode(
             encoded(FLAGS, np.array([1, 2, 255], np.uint8)).replace(b"\xff\0\0\0", b"\0\1\0\0")
         )
+    joints = encoded(JOINTS, np.ones(20))
+    for wrong in (joints.replace(b"l_thumb_ip", b"r_thumb_ip"), TOUCH_BYTES[:8]):
+        with pytest.raises(CorruptDataError, match="joints"):
+            MessageCodec(JOINTS).decode(wrong)
+    # Nine numbers of one wrist, then ten and eight: as many in all.
+    action = encoded(ACTION, np.ones(67)).replace(
+        b"\x1aH" + np.ones(9).tobytes() + b"\x22H" + np.ones(9).tobytes(),
+        b"\x1aP" + np.ones(10).tobytes() + b"\x22@" + np.ones(8).tobytes(),
+    )
+    with pytest.raises(CorruptDataError, match="10 numbers of wrist_left, expected 9"):
+        MessageCodec(ACTION).decode(action)
     with pytest.raises(CorruptDataError, match="8 bytes, expected"):
         MessageCodec(FLAGS).decode(TOUCH_BYTES)
 
@@ -158,12 +206,13 @@ def test_a_message_that_would_unfold_into_memory_is_refused_before_it_is_parsed(
         MessageCodec(POSES).decode(data)
 
 
-def test_files_of_the_first_exporter_are_read(tmp_path):
+@pytest.mark.parametrize("version", [1, 2])
+def test_files_of_each_version_are_read(version, tmp_path):
     store, other = EpisodeStore(tmp_path / "made"), EpisodeStore(tmp_path / "read")
     episode = write_episode(store, num_steps=2, cameras=("camera_head",))
     recording = write_recording(store, count=6)
-    assert import_mcap(GOLDEN / "episode_mcap_v1.mcap", other) == "stand-bottle-0003"
-    assert import_mcap(GOLDEN / "recording_mcap_v1.mcap", other) == "take-0001"
+    assert import_mcap(GOLDEN / f"episode_mcap_v{version}.mcap", other) == "stand-bottle-0003"
+    assert import_mcap(GOLDEN / f"recording_mcap_v{version}.mcap", other) == "take-0001"
     read = other.open("stand-bottle-0003")
     # The last digit of computed poses belongs to the processor.
     poses = {"action", "action_commanded"}

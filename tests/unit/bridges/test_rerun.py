@@ -5,11 +5,15 @@ import pytest
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
 
-from dextouch.bridges.rerun import entity_of, export_rrd, heat_map  # noqa: E402
+from dextouch.bridges.exporting import heat_map  # noqa: E402
+from dextouch.bridges.foreign import ImportAttributes  # noqa: E402
+from dextouch.bridges.foreign_rerun import import_rrd  # noqa: E402
+from dextouch.bridges.rerun import entity_of, export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
 from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402
 from dextouch.geometry import transform_from_pose  # noqa: E402
 from tests.unit.bridges.takes import (  # noqa: E402
+    DISTORTION,
     K_HEAD,
     descriptor,
     write_episode,
@@ -128,10 +132,13 @@ def test_a_recording_is_shown_on_its_own_clock(store, tmp_path):
     stamps = reader.read("tactile_left").t_host_ns
     assert moving["tactile/tactile_left"]["t_host"] == stamps.tolist()
     assert "take-0001" in still["attributes"]["TextDocument:text"][0][0]
+    lens = still["world/camera_head/image"]["dextouch.Lens:distortion_k1_k2_p1_p2_k3"]
+    np.testing.assert_array_equal(lens[0], DISTORTION)
     largest = reader.read("tactile_left").values.max()
     shown = one(moving["tactile/tactile_left"]["Image:buffer"])[3].reshape(28, 26, 3)
     row = reader.read("tactile_left").values[3]
-    np.testing.assert_array_equal(shown, heat_map(row, side="left", full_scale=float(largest)))
+    expected = heat_map(row, side="left", full_scale=float(largest), is_raw=True)
+    np.testing.assert_array_equal(shown, expected)
 
 
 def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):
@@ -146,10 +153,26 @@ def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):
     assert len(rr.chunk.RrdReader(path).blueprints()) == 1
 
 
+@pytest.mark.parametrize(("dtype", "unit"), [("uint8", "mono8"), ("uint16", "mm")])
+def test_gray_and_depth_images_come_back(dtype, unit, store, tmp_path):
+    values = np.arange(2 * 3 * 4, dtype=dtype).reshape(2, 3, 4) * 10
+    stream = descriptor("eye", "image", (3, 4), dtype, unit, 30)
+    about = write_recording(store).attributes
+    about = about.model_copy(update={"recording_id": "eye", "streams": (stream,)})
+    with store.writer(kind="recording", attributes=about) as writer:
+        times = np.array([0, 10**8])
+        none = np.full(2, -1)
+        writer.append("eye", values=values, t_host_ns=times, t_device_ns=none, sequence=none)
+    export_rrd(store.recording("eye"), tmp_path / "eye.rrd")
+    import_rrd(tmp_path / "eye.rrd", store, ImportAttributes(id_prefix="again-"))
+    again = store.recording("again-eye")
+    np.testing.assert_array_equal(again.values("cameras_eye", 0, 2), values)
+
+
 def test_images_that_cannot_be_shown_are_refused(store, tmp_path):
     reader = write_episode(store, num_steps=3)
-    deep = descriptor("camera_head", "image", (4, 4), "uint16", "mm", 30)
+    deep = descriptor("camera_head", "image", (4, 4, 2), "uint8", "uv", 30)
     reader.streams["camera_head"] = deep
-    with pytest.raises(InvalidInputError, match="uint16"):
+    with pytest.raises(InvalidInputError, match="uint8"):
         export_rrd(reader, tmp_path / "take.rrd")
     assert not (tmp_path / "take.rrd").exists()

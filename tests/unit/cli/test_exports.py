@@ -2,7 +2,7 @@
 
 import json
 import sys
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -13,8 +13,11 @@ from dextouch.images import encode_jpeg
 from dextouch.schemas import Review
 from dextouch.streams import encoded_values
 from services.cli import main
+from tests.unit.bridges.foreign_lerobot import arm
 from tests.unit.bridges.lerobot_episodes import make_episode, pictures
 from tests.unit.bridges.takes import differing_streams, write_episode, write_recording
+
+TOP = "observation.images.top"
 
 
 @pytest.fixture
@@ -34,7 +37,7 @@ def dextouch(tmp_path, capsys):
 
 
 def names(folder):
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir() if path.name != "foxglove_layout.json")
 
 
 def test_one_episode_goes_to_one_file_and_comes_back(store, dextouch, tmp_path):
@@ -65,6 +68,129 @@ def test_filters_choose_and_files_go_into_a_folder(store, dextouch, tmp_path):
     assert names(folder) == ["take-0001.mcap", "take-0002.mcap"]
     assert dextouch("import", "--format", "mcap", folder, store="other")[0] == 0
     assert EpisodeStore(tmp_path / "other").list(kind="recording") == ["take-0001", "take-0002"]
+
+
+@pytest.mark.long
+def test_filters_are_those_of_the_dashboards_list(store, dextouch, tmp_path):
+    noon = datetime(2026, 5, 4, 12, tzinfo=UTC)
+    takes = {
+        "a": {"started_at": noon, "success": True, "station": "bench-1"},
+        "b": {"started_at": noon + timedelta(days=1), "success": False},
+        "c": {"started_at": noon + timedelta(days=2)},
+        "d": {},
+    }
+    for name, take in takes.items():
+        write_recording(store, name, count=5, **take)
+    verdict = Review(verdict="accepted", reviewed_at=noon)
+    store.set_review("b", verdict, kind="recording")
+    store.set_review("c", verdict.model_copy(update={"verdict": "rejected"}), kind="recording")
+    cases = {
+        "--outcome success": "a",
+        "--outcome failure": "b",
+        "--outcome not_judged --with-rejected": "cd",
+        "--review accepted": "b",
+        "--review rejected": "c",
+        "--review not_reviewed": "ad",
+        "--station bench-1": "a",
+        "--text BENCH-2": "bd",
+        "--task stand_bottle": "abd",
+        "--after 2026-05-05": "b",
+        "--after 2026-05-04T13:00+01:00 --before 2026-05-05T12:00Z": "a",
+        "--after 2026-05-05T12:00Z --with-rejected": "bc",
+    }
+    for number, (words, expected) in enumerate(cases.items()):
+        to = tmp_path / str(number)
+        given = ("export", "--format", "mcap", "--kind", "recording", "--to", to)
+        status, _, err = dextouch(*given, *words.split())
+        assert (status, names(to)) == (0, [f"{name}.mcap" for name in expected]), (words, err)
+    with pytest.raises(SystemExit):
+        dextouch("export", "--format", "mcap", "--to", tmp_path / "x", "--after", "yesterday")
+    status, _, err = dextouch(
+        "export", "--format", "mcap", "--to", tmp_path / "x", "--text", "x" * 201
+    )
+    assert status == main.EXIT_REFUSED
+    assert "text" in err
+
+
+def test_a_damaged_item_is_told_and_not_left_out(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=3)
+    write_episode(store, "two", num_steps=3)
+    (store.root / "episodes/one/zarr.json").write_text("{")
+    status, _, err = dextouch("export", "--format", "mcap", "--to", tmp_path / "x")
+    assert (status, (tmp_path / "x").exists()) == (main.EXIT_REFUSED, False)
+    assert "one" in err
+
+
+def test_a_layout_for_foxglove_is_written_with_the_files(store, dextouch, tmp_path):
+    write_recording(store, "take-0001", count=5)
+    words = ("export", "--format", "mcap", "--kind", "recording", "take-0001", "--to")
+    status, _, err = dextouch(*words, tmp_path / "takes")
+    assert status == 0
+    assert "1 of 1 do not know when they were recorded" in err
+    beside = json.loads((tmp_path / "takes/foxglove_layout.json").read_text())
+    assert "Image!tactile_left" in beside["configById"]
+    one, chosen = tmp_path / "take.mcap", tmp_path / "layout.json"
+    assert dextouch(*words, one)[0] == 0
+    assert not (tmp_path / "foxglove_layout.json").exists()
+    assert dextouch(*words, tmp_path / "two.mcap", "--layout", chosen)[0] == 0
+    assert json.loads(chosen.read_text()) == beside
+    status, _, err = dextouch(*words, tmp_path / "three.mcap", "--layout", chosen)
+    assert (status, (tmp_path / "three.mcap").exists()) == (main.EXIT_REFUSED, False)
+    assert "layout.json: exists already" in err
+    words = ("export", "--format", "umi", "--to", tmp_path / "x.zip", "--layout", chosen)
+    assert "--layout is for format mcap" in dextouch(*words, "--force")[2]
+
+
+def test_a_layout_is_written_over_nothing(store, dextouch, tmp_path):
+    write_episode(store, num_steps=3)
+    words = ("export", "--format", "mcap", "stand-bottle-0003", "--to")
+    (tmp_path / "takes").mkdir()
+    beside = tmp_path / "takes" / "foxglove_layout.json"
+    beside.write_text("mine")
+    status, _, err = dextouch(*words, tmp_path / "takes")
+    assert status
+    assert "foxglove_layout.json: exists already" in err
+    assert [path.name for path in (tmp_path / "takes").iterdir()] == [beside.name]
+    both = tmp_path / "q.mcap"
+    status, _, err = dextouch(*words, both, "--layout", both, "--force")
+    assert status
+    assert "is one of the exported files" in err
+
+
+@pytest.mark.parametrize(
+    ("form", "flags", "right"),
+    [
+        ("mcap", ["--fps", "30"], "lerobot"),
+        ("rrd", ["--touch-samples"], "lerobot"),
+        ("umi", ["--license", "mit"], "lerobot"),
+        ("mcap", ["--repo-id", "a/b"], "lerobot"),
+        ("rrd", ["--jpeg-quality", "90"], "mcap"),
+        ("lerobot", ["--no-touch-images"], "mcap"),
+        ("import", ["--fps", "30"], "lerobot"),
+        ("import", ["--k-head", "1,1,1,1"], "lerobot"),
+        ("import", ["--timeline", "t"], "rrd"),
+        ("import", ["--task", "wipe"], "leave --task out"),
+    ],
+)
+def test_options_that_a_format_ignores_are_refused(form, flags, right, store, dextouch, tmp_path):
+    write_episode(store, num_steps=3)
+    path = tmp_path / "take.mcap"
+    if form == "import":
+        dextouch("export", "--format", "mcap", "--to", path)
+        status, _, err = dextouch("import", path, *flags, store="other")
+    else:
+        status, _, err = dextouch("export", "--format", form, "--to", tmp_path / "x", *flags)
+    assert status
+    assert flags[0] in err
+    assert right in err
+
+
+def test_a_folder_of_two_formats_needs_a_choice(dextouch, tmp_path):
+    for name in ("a.mcap", "b.rrd"):
+        (tmp_path / name).write_bytes(b"")
+    status, _, err = dextouch("import", tmp_path)
+    assert status
+    assert "choose one with --format" in err
 
 
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
@@ -152,11 +278,63 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     assert dextouch(*words, "--force")[0] == 0
     assert names(tmp_path) == ["data", "store"]
     status, out, _ = dextouch("import", "--format", "lerobot", folder, store="other")
-    assert (status, out) == (0, "one\n")
+    # The exported groups of two images are not those of the store.
+    assert (status, out.splitlines()[-1]) == (0, "one")
+    assert "observation.images.camera_head: decoded, encoded as h264" in out
+    status, out, _ = dextouch("import", "--format", "lerobot", folder, store="other")
+    assert (status, out) == (0, "1 episodes of these files are in the store already\n")
     (folder / "meta" / "info.json").unlink()
     status, _, err = dextouch(*words, "--force")
     assert status == main.EXIT_REFUSED
     assert "not a LeRobot data set" in err
+
+
+def test_lerobot_data_sets_grow_and_get_a_card(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=5)
+    folder, report = tmp_path / "data", tmp_path / "report.json"
+    words = ("export", "--format", "lerobot", "--to", folder, "--json", report)
+    assert dextouch(*words, "--license", "cc-by-4.0", "--touch-samples")[0] == 0
+    write_episode(store, "two", num_steps=4)
+    status, _, err = dextouch(*words, "--append")
+    assert status == main.EXIT_REFUSED
+    assert "with --touch-samples" in err
+    status, out, err = dextouch(*words, "--append", "--touch-samples")
+    assert (status, "1 episodes  4 steps" in out) == (0, True)
+    assert "1 episodes were in the data set already" in err
+    assert json.loads(report.read_text())["present"] == ["one"]
+    assert "license: cc-by-4.0" in (folder / "README.md").read_text()
+    assert dextouch("import", folder, store="other")[1].endswith("one\ntwo\n")
+    words = ("export", "--format", "umi", "--append", "--to", tmp_path / "all.zip")
+    status, _, err = dextouch(*words)
+    assert status == main.EXIT_REFUSED
+    assert "--append is for format lerobot" in err
+
+
+def test_a_lerobot_data_set_of_another_robot_becomes_recordings(store, dextouch, tmp_path):
+    folder, report = arm().write_v21(tmp_path / "arm"), tmp_path / "report.json"
+    words = ("import", folder, "--json", report, "--map", f"camera_head={TOP}")
+    status, out, _ = dextouch(*words, "--k-head", "60,60,32,24", "--fps", "5", "--task", "cubes")
+    assert status == 0
+    assert out.startswith("imported as recordings: 'action': 'action' is float32 [7], expected")
+    assert f"  camera_head  <- {TOP}  h264 [48, 64, 3]  12 samples, 5 Hz" in out
+    assert "kept as numbers: text as UTF-8" in out
+    told = json.loads(report.read_text())
+    assert told["ids"] == ["arm-000000", "arm-000001"] == store.list(kind="recording")
+    assert {one["stream"] for one in told["reports"][0]["imported"]} >= {"action", "subtask"}
+    assert (told["failed"], told["present"]) == ({}, [])
+    (folder / "videos/chunk-000" / TOP / "episode_000000.mp4").unlink()
+    status, out, err = dextouch(*words, "--id-prefix", "again-")
+    assert status == 3
+    assert "again-arm-000001" in out
+    assert f"{folder}: episode 0: not imported: " in err
+    told = json.loads(report.read_text())
+    assert (told["ids"], [*told["failed"]]) == (["again-arm-000001"], ["episode 0"])
+    about = store.recording("arm-000000").attributes
+    assert about.calibration["K_head"] == ((60, 0, 32), (0, 60, 24), (0, 0, 1))
+    assert (about.task, about.domain) == ("cubes", "robot")
+    with pytest.raises(SystemExit) as usage:
+        dextouch(*words, "--k-head", "60,60,32")
+    assert usage.value.code == main.EXIT_USAGE
 
 
 @pytest.mark.long
@@ -228,7 +406,7 @@ def test_a_missing_package_is_named_with_its_extra(store, dextouch, tmp_path, mo
     monkeypatch.setitem(sys.modules, "rerun", None)
     status, _, err = dextouch("export", "--format", "rrd", "one", "--to", tmp_path / "one.rrd")
     assert status == main.EXIT_REFUSED
-    assert "dextouch-wm[rerun]" in err
+    assert "[rerun]" in err
 
 
 def test_files_that_are_not_there_are_refused(dextouch, tmp_path):

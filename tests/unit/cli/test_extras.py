@@ -9,6 +9,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from services.cli.extras import EXTRA_OF, missing_package
 
@@ -40,7 +42,7 @@ for line in sys.stdin.read().splitlines():
     answers[line] = (status, err.getvalue())
 print(json.dumps(answers))
 """
-NAMED = re.compile(r"pip install 'dextouch-wm\[(\w+)\]'")
+NAMED = re.compile(r"pip install [^`]*\[(\w+)\]")
 # One of each command, and the words of those that have some.
 COMMANDS = (
     "demo --seeds 1",
@@ -165,13 +167,32 @@ def test_extras_bring_what_is_said_of_them():
             assert wanted & brings, f"{package}: not in extra {extra!r}"
 
 
+def test_whatever_an_extra_brings_and_we_import_has_a_hint():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    brought = {
+        canonicalize_name(Requirement(line).name)
+        for extra in set(EXTRA_OF.values())
+        for line in extras[extra]
+    }
+    paths = [path for folder in ("services", "shared") for path in (ROOT / folder).rglob("*.py")]
+    pattern = re.compile(r"^\s*(?:from|import) (\w+)", re.MULTILINE)
+    imported = {name for path in paths for name in pattern.findall(path.read_text())}
+    named = {
+        package
+        for package, names in importlib.metadata.packages_distributions().items()
+        if package in imported and brought & {canonicalize_name(name) for name in names}
+    }
+    assert named - {"dextouch", "services"} <= set(EXTRA_OF)
+
+
 def test_all_is_offered_for_what_it_brings():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     everything = tomllib.loads(text)["project"]["optional-dependencies"]["all"][0]
     brought = set(re.search(r"\[(.*)\]", everything)[1].split(","))
     for package, extra in EXTRA_OF.items():
         message = str(missing_package(ModuleNotFoundError("no", name=package)))
-        assert ("dextouch-wm[all]" in message) == (extra in brought), package
+        assert ("the extra 'all'" in message) == (extra in brought), package
 
 
 def test_a_module_of_ours_that_is_missing_is_an_error_of_ours():

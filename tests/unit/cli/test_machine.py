@@ -218,4 +218,62 @@ def test_packages_of_another_version_are_told(monkeypatch):
     monkeypatch.setattr(doctor.importlib.metadata, "version", version)
     (wrong,) = doctor._outdated()
     assert (wrong.what, wrong.found) == ("scipy", "1.17.0, expected <1")
-    assert wrong.do == "pip install 'scipy<1'"
+    assert wrong.do.endswith("pip install 'scipy<1'")
+
+
+CV2 = {
+    "ours": ('opencv_version = "4.14.0.94"\ncontrib = True\nheadless = True\nrolling = False\n'),
+    "lerobot's": 'opencv_version = "4.13.0.92"\ncontrib = False\nheadless = True\n',
+}
+BOTH = {"opencv-contrib-python-headless": "4.14.0.94", "opencv-python-headless": "4.13.0.92"}
+
+
+@pytest.fixture
+def opencv(tmp_path, monkeypatch):
+    """What is found where these distributions are installed, and these files of cv2 are left."""
+
+    def examine(installed, version_file):
+        folder = tmp_path / "cv2"
+        folder.mkdir(exist_ok=True)
+        if version_file is not None:
+            (folder / "__init__.py").touch()
+            (folder / "version.py").write_text(version_file)
+        for name, version in installed.items():
+            info = tmp_path / f"{name.replace('-', '_')}-{version}.dist-info"
+            info.mkdir()
+            (info / "METADATA").write_text(f"Name: {name}\nVersion: {version}\n")
+        # Nothing that is really installed.
+        monkeypatch.setattr(doctor.sys, "path", [str(tmp_path)])
+        monkeypatch.delitem(doctor.sys.modules, "cv2", raising=False)
+        doctor.importlib.invalidate_caches()
+        return doctor.opencv_findings()
+
+    return examine
+
+
+def test_the_loaded_opencv_is_named(opencv):
+    (found,) = opencv({"opencv-contrib-python-headless": "4.14.0.94"}, CV2["ours"])
+    assert (found.found, found.ok) == ("of opencv-contrib-python-headless 4.14.0.94", True)
+
+
+def test_an_opencv_of_others_over_ours_is_told(opencv):
+    (found,) = opencv(BOTH, CV2["lerobot's"])
+    assert found.found.startswith("of opencv-python-headless 4.13.0.92; installed: ")
+    assert (found.ok, found.required) == (False, False)
+    assert found.do.endswith("--no-deps opencv-contrib-python-headless==4.14.0.94")
+
+
+def test_ours_over_that_of_others_is_in_order(opencv):
+    (found,) = opencv(BOTH, CV2["ours"])
+    assert found.ok
+    assert "opencv-python-headless 4.13.0.92" in found.found
+
+
+def test_files_that_another_build_took_along_are_missed(opencv):
+    (found,) = opencv({"opencv-contrib-python-headless": "4.14.0.94"}, None)
+    assert found.found.startswith("damaged")
+    assert " pip install --force-reinstall " in found.do
+
+
+def test_without_opencv_nothing_is_said(opencv):
+    assert opencv({}, None) == []

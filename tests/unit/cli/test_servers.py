@@ -1,6 +1,9 @@
 """Several services in one process: known URLs, one stop for all, a failing one is said."""
 
 import asyncio
+import signal
+import subprocess
+import sys
 from contextlib import asynccontextmanager, suppress
 
 import httpx
@@ -88,3 +91,28 @@ def test_a_taken_port_is_named():
     with pytest.raises(ConflictError, match=rf"cannot listen on 127.0.0.1:{port}.*--page-port"):
         bind("page", host="127.0.0.1", port=port)
     place.socket.close()
+
+
+TWO_SIGNALS = """
+import asyncio, os, signal
+from services.pipelines.servers import run_on_event_loop, stop_on_signals
+
+async def drained():
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    os.kill(os.getpid(), {number})
+    await stop.wait()
+    os.kill(os.getpid(), {number})
+    await asyncio.sleep(60)
+
+run_on_event_loop(drained())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_the_process_without_a_traceback(number):
+    code = TWO_SIGNALS.format(number=int(number))
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, timeout=60, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (-number, b"")

@@ -1,17 +1,24 @@
 """The gymnasium environments: gymnasium's own checker and vector, matched seeds, ends, masks."""
 
+import sys
 import threading
 from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from unittest.mock import Mock
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dextouch.clients import RolloutClient
-from dextouch.clients.gym_env import WorldEnv, WorldVectorEnv
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.clients.gym_env import ENV_ID, RolloutEnv, WorldEnv, WorldVectorEnv, make_vector
+from dextouch.errors import InvalidInputError, UnavailableError, UnknownNameError
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
@@ -64,6 +71,80 @@ def test_gymnasium_accepts_it(env):
     check_env(env, skip_render_check=True)
 
 
+@pytest.fixture
+def made(url):
+    """The registered environment, found by the name of its module."""
+    opened = []
+
+    def make(**options):
+        given = {"world": "sum", "chunk_steps": 4, "max_chunks": 3} | ASKED | options
+        opened.append(gymnasium.make(f"dextouch.clients.gym_env:{ENV_ID}", url=url, **given))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+
+
+def test_gymnasium_makes_it_by_name_and_accepts_its_images(made):
+    env = made(render_mode="rgb_array")
+    assert isinstance(env.unwrapped, WorldEnv)
+    # Makes it again in each of its render modes.
+    check_env(env.unwrapped)
+    seen, _ = env.reset(seed=3)
+    cameras = env.unwrapped.description.cameras
+    np.testing.assert_array_equal(
+        env.render(), np.concatenate([seen[name] for name in cameras], axis=1)
+    )
+    assert env.metadata["render_fps"] == 15 / 4
+
+
+def test_a_list_has_every_step_of_the_chunk_once(made):
+    env = made(render_mode="rgb_array_list")
+    assert env.metadata["render_fps"] == 15
+    env.reset(seed=3)
+    assert [len(env.render()), len(env.render())] == [1, 0]
+    seen, *_ = env.step(actions(4))
+    images = env.render()
+    assert len(images) == 4
+    np.testing.assert_array_equal(
+        images[-1][:, : seen["camera_head"].shape[1]], seen["camera_head"]
+    )
+
+
+def test_gymnasium_records_videos_of_it(made, tmp_path, monkeypatch):
+    # What encodes the images is left out: moviepy brings 68 MB of ffmpeg.
+    clips = []
+
+    class ImageSequenceClip:
+        def __init__(self, images, fps):
+            clips.append((images, fps))
+
+        def write_videofile(self, path, **_):
+            Path(path).touch()
+
+    name = "moviepy.video.io.ImageSequenceClip"
+    for module in ("moviepy", "moviepy.video", "moviepy.video.io", name):
+        monkeypatch.setitem(sys.modules, module, ModuleType(module))
+    monkeypatch.setattr(sys.modules[name], "ImageSequenceClip", ImageSequenceClip, raising=False)
+    env = RecordVideo(made(render_mode="rgb_array"), str(tmp_path / "videos"))
+    env.reset(seed=3)
+    first, ended = env.unwrapped.render(), False
+    while not ended:
+        *_, terminated, truncated, _ = env.step(actions(4))
+        ended = terminated or truncated
+    last = env.unwrapped.render()
+    env.close()
+    ((images, fps),) = clips
+    # The start, and the end of three chunks.
+    assert len(images) == 4
+    assert fps == 15 / 4
+    np.testing.assert_array_equal(images[0], first)
+    np.testing.assert_array_equal(images[-1], last)
+    assert len({image.shape for image in images}) == 1
+    assert images[0].dtype == np.uint8
+
+
 def test_success_ends_and_length_truncates(env):
     env.reset(seed=0)
     outcomes = [env.step(actions(4))[1:4] for _ in range(3)]
@@ -105,6 +186,8 @@ def test_wrong_use_is_named(client, env):
         WorldEnv(client, world="moon", **ASKED)
     with pytest.raises(InvalidInputError, match="multiple of 4"):
         WorldEnv(client, world="sum", chunk_steps=6, **ASKED)
+    with pytest.raises(UnknownNameError, match="valid: rgb_array, rgb_array_list"):
+        WorldEnv(client, world="sum", render_mode="depth", **ASKED)
     with pytest.raises(InvalidInputError, match="call reset first"):
         env.step(actions(4))
     with pytest.raises(UnknownNameError, match="valid: init"):
@@ -201,6 +284,42 @@ def test_each_of_the_vector_begins_from_its_own_observation(make_envs):
     env.close()
 
 
+@pytest.fixture
+def closed(monkeypatch):
+    """Clients that were closed."""
+    clients, close = [], RolloutClient.close
+    monkeypatch.setattr(RolloutClient, "close", lambda one: (clients.append(one), close(one)))
+    return clients
+
+
+def test_an_environment_that_cannot_be_made_leaves_no_client_open(url, closed):
+    for num_failed, make in enumerate([RolloutEnv, partial(make_vector, num_envs=2)], start=1):
+        with pytest.raises(UnknownNameError, match="moon"):
+            make(url=url, world="moon", **ASKED)
+        assert len(closed) == num_failed
+
+
+def test_everything_is_closed_where_the_service_is_gone(url, closed, monkeypatch):
+    vector = make_vector(num_envs=2, url=url, world="sum", chunk_steps=4, **ASKED)
+    vector.reset(seed=0)
+    gone = Mock(side_effect=UnavailableError("the service does not answer"))
+    monkeypatch.setattr("dextouch.clients.rollouts.Rollout.close", gone)
+    vector.close()
+    assert (gone.call_count, len(closed)) == (2, 2)
+    assert vector._threads._shutdown
+
+
+def test_make_vec_gives_starts_that_are_asked_for(url):
+    given = {"url": url, "world": "sum", "chunk_steps": 4, "max_chunks": 1} | ASKED
+    env = gymnasium.make_vec(f"dextouch.clients.gym_env:{ENV_ID}", num_envs=2, **given)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    env.reset(seed=[3, 4])
+    env.step(np.stack([actions(4)] * 2))
+    with pytest.raises(InvalidInputError, match=r"environments \[0, 1\] have no episode"):
+        env.step(np.stack([actions(4)] * 2))
+    env.close()
+
+
 def test_wrong_use_of_the_vector_is_named(make_envs, vector):
     envs = make_envs(2)
     with pytest.raises(InvalidInputError, match="same client"):
@@ -209,13 +328,20 @@ def test_wrong_use_of_the_vector_is_named(make_envs, vector):
         WorldVectorEnv([envs[0], *make_envs(1, chunk_steps=8)])
     with pytest.raises(InvalidInputError, match=r"environments \[0, 1, 2\] have no episode"):
         vector.step(np.stack([actions(4)] * 3))
+    vector.reset(seed=5)
+    for num_chunks in (0, 2, 4):
+        with pytest.raises(InvalidInputError, match=f"got {num_chunks} chunks, expected 3"):
+            vector.step(np.zeros((num_chunks, 4, 67)))
+    # None has advanced.
+    _, _, _, _, infos = vector.step(np.stack([actions(4)] * 3))
+    assert infos["last_step"].tolist() == [4, 4, 4]
     with pytest.raises(UnknownNameError, match="valid: inits, reset_mask"):
         vector.reset(options={"init": None})
     for seed in ([1, 2], range(4)):
         with pytest.raises(InvalidInputError, match=r"seed: got \d, expected 3"):
             vector.reset(seed=seed)
     with pytest.raises(InvalidInputError, match="none at the first reset"):
-        vector.reset(options={"reset_mask": np.array([True, False, True])})
+        WorldVectorEnv(make_envs(3)).reset(options={"reset_mask": np.array([True, False, True])})
     for mask in ([True, False], [1, 0, 1], [False] * 3, "all"):
         with pytest.raises(InvalidInputError, match="reset_mask: got"):
             vector.reset(options={"reset_mask": mask})

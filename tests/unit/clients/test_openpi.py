@@ -1,12 +1,16 @@
 """Policies behind openpi's protocol, served by hand with websockets and msgpack alone."""
 
+import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from unittest.mock import Mock
 
 import msgpack
 import numpy as np
 import pytest
+from websockets.sync.client import ClientConnection
 from websockets.sync.server import serve
 
 from dextouch.clients import OpenPiPolicy, PolicyStart
@@ -145,6 +149,63 @@ def test_a_late_answer_is_not_taken_for_the_next_one():
         policy.close()
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_answer_that_an_interrupt_left_behind_is_not_taken_for_the_next_one(error, monkeypatch):
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        return {"actions": np.full((16, 67), float(len(asked)))}
+
+    with policy_server(answer) as url:
+        policy = OpenPiPolicy(url)
+        with monkeypatch.context() as patched:
+            patched.setattr(ClientConnection, "recv", Mock(side_effect=error))
+            with pytest.raises(error):
+                policy.act(observation())
+        actions = policy.act(observation())
+        assert actions[0, 0] == len(asked)
+        policy.close()
+
+
+def test_a_silent_server_does_not_delay_policies_of_another():
+    with socket.create_server(("127.0.0.1", 0)) as silent, ThreadPoolExecutor(1) as threads:
+        address = f"ws://127.0.0.1:{silent.getsockname()[1]}"
+        waiting = threads.submit(OpenPiPolicy, address, timeout_s=5.0)
+        with silent.accept()[0]:
+            with policy_server(linear) as url:
+                OpenPiPolicy(url).close()
+            assert not waiting.done()
+        with pytest.raises(UnavailableError):
+            waiting.result(20)
+
+
+def test_the_last_policy_closes_the_connection_and_a_new_one_has_the_new_limit():
+    limits = iter([8, 3])
+    connections = []
+
+    def handle(connection):
+        connections.append(connection)
+        connection.send(msgpack.packb({"max_batch": next(limits)}))
+        for data in connection:
+            reply = linear(msgpack.unpackb(data, object_hook=decoded))
+            connection.send(msgpack.packb(reply, default=encoded))
+
+    with serve(handle, "127.0.0.1", 0, compression=None) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        first, second = OpenPiPolicy(url), OpenPiPolicy(url)
+        first.close()
+        first.close()
+        assert second.act(observation()).shape == (8, 67)
+        assert len(connections) == 1
+        second.close()
+        assert second.act(observation()).shape == (8, 67)
+        assert (len(connections), second._server.max_batch) == (2, 3)
+        second.close()
+        server.shutdown()
+
+
 def test_it_is_a_policy_by_name():
     with policy_server(lambda _: {"actions": np.zeros((16, 67))}) as url:
         policy = PolicySource.parse("pi=dextouch.clients:OpenPiPolicy").load({"url": url})
@@ -153,3 +214,135 @@ def test_it_is_a_policy_by_name():
         policy.close()
     with pytest.raises(InvalidInputError, match="expected at least 1"):
         OpenPiPolicy("ws://127.0.0.1:9", chunk_steps=0)
+
+
+def linear(request):
+    """Actions that depend on the whole request, as those of a network do."""
+    state = request["observation/state"].astype(np.float32)
+    touch = request["observation/tactile"].mean()
+    return {"actions": np.tile(state, (8, 1)) + touch + len(request["prompt"])}
+
+
+def acting_together(url, num_policies, num_chunks):
+    """Actions of several policies in threads of their own, by policy and chunk."""
+
+    begin = threading.Barrier(num_policies)
+
+    def act(index):
+        policy = OpenPiPolicy(url)
+        begin.wait(20)
+        policy.reset(PolicyStart("t", "x" * index, 0, fakes.anchor(), np.eye(3)))
+        return [
+            policy.act(fakes.observation(1, seed=100 * index + chunk))
+            for chunk in range(num_chunks)
+        ]
+
+    with ThreadPoolExecutor(num_policies) as threads:
+        return list(threads.map(act, range(num_policies)))
+
+
+def test_requests_of_several_rollouts_go_together_where_the_server_says_so():
+    sizes = []
+
+    def answer(request):
+        requests = request.get("batch", [request])
+        sizes.append(len(requests))
+        # The first one waits for all others.
+        time.sleep(0.3 if len(sizes) == 1 else 0.01)
+        answers = [linear(one) for one in requests]
+        return {"batch": answers} if "batch" in request else answers[0]
+
+    results, counts = {}, {}
+    for max_batch in (1, 4):
+        sizes.clear()
+        with policy_server(answer, max_batch=max_batch) as url:
+            results[max_batch] = acting_together(url, 6, 5)
+        counts[max_batch] = list(sizes)
+    assert set(counts[1]) == {1}
+    assert max(counts[4]) == 4
+    assert sum(counts[4]) == sum(counts[1]) == 30
+    np.testing.assert_allclose(results[4], results[1], rtol=0, atol=1e-6)
+
+
+def wait_for_others(policy, count):
+    for _ in range(2000):
+        if len(policy._server._waiting) == count:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{len(policy._server._waiting)} requests wait, expected {count}")
+
+
+@contextmanager
+def batch_of_three(answer):
+    """Pending requests of four policies, of which three wait for the first and go together."""
+    is_asked, may_answer = threading.Event(), threading.Event()
+
+    def held(request):
+        is_asked.set()
+        assert may_answer.wait(20)
+        return answer(request)
+
+    with policy_server(held, max_batch=8) as url, ThreadPoolExecutor(4) as threads:
+        policies = [OpenPiPolicy(url) for _ in range(4)]
+        for index, one in enumerate(policies):
+            one.reset(PolicyStart("t", "x" * index, 0, fakes.anchor(), np.eye(3)))
+        pending = [threads.submit(policies[0].act, observation())]
+        assert is_asked.wait(20)
+        pending += [threads.submit(one.act, observation()) for one in policies[1:]]
+        wait_for_others(policies[0], 3)
+        may_answer.set()
+        yield policies, pending
+
+
+def refuses_two(request):
+    """Reports an error about the request of the third policy, and about each batch with it."""
+    requests = request.get("batch", [request])
+    if any(one["prompt"] == "xx" for one in requests):
+        return "no such prompt: xx"
+    answers = [linear(one) for one in requests]
+    return {"batch": answers} if "batch" in request else answers[0]
+
+
+def answers_short(request):
+    if "batch" in request:
+        return {"batch": [linear(request["batch"][0])]}
+    return linear(request) if request["prompt"] != "xx" else "no such prompt: xx"
+
+
+@pytest.mark.parametrize("answer", [refuses_two, answers_short])
+def test_a_request_that_is_refused_fails_alone(answer):
+    with batch_of_three(answer) as (policies, pending):
+        errors = [future.exception(20) for future in pending]
+        assert [type(error) for error in errors] == [
+            type(None), type(None), InvalidInputError, type(None),
+        ]  # fmt: skip
+        assert "no such prompt: xx" in str(errors[2])
+        assert policies[0].act(observation()).shape == (8, 67)
+
+
+def test_a_batch_that_gets_no_answer_fails_with_an_error_for_each_and_its_cause(monkeypatch):
+    def unpacked(*_, **__):
+        raise MemoryError("no room for 3 answers")
+
+    def answer(request):
+        if "batch" in request:
+            monkeypatch.setattr("dextouch.clients.openpi.unpack_openpi", unpacked)
+        return {"batch": []} if "batch" in request else linear(request)
+
+    with batch_of_three(answer) as (_, pending):
+        assert pending[0].exception(20) is None
+        errors = [future.exception(20) for future in pending[1:]]
+        assert [type(error) for error in errors] == [UnavailableError] * 3
+        assert len({id(error) for error in errors}) == 3
+        assert {type(error.__cause__) for error in errors} == {MemoryError}
+
+
+@pytest.mark.parametrize("metadata", [{"max_batch": 8, "resets": True}, {"max_batch": True}, {}])
+def test_requests_are_not_joined_where_the_server_does_not_say_so(metadata):
+    def answer(request):
+        time.sleep(0.01)
+        assert "batch" not in request
+        return {} if "reset" in request else linear(request)
+
+    with policy_server(answer, **metadata) as url:
+        assert len(acting_together(url, 3, 2)) == 3

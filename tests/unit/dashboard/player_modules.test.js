@@ -4,8 +4,10 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import { test } from "node:test";
 
+import { exportCommand, itemsOfKind } from "./static/catalog/export_command.js";
 import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
 import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
+import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
 import { FetchQueue } from "./static/player/fetch_queue.js";
 import { BONES, frameOfMatrix, frameOfPose, Orbit, toWorld } from "./static/player/geometry.js";
 import { unpack } from "./static/packed.js";
@@ -162,4 +164,26 @@ test("the orbit sees its target in the middle, and up above", () => {
   assert.ok(project([0, 0.1, 1]).x > 200);
   assert.equal(project([3, 0, 1]), null);
   assert.equal(BONES.length, 24);
+});
+
+test("a selection is steps of the grid, from its start to before its end", () => {
+  const about = { num_steps: 31, model_rate_hz: 15 };
+  assert.deepEqual(stepsOf([0, 2e9], about), [0, 31]);
+  assert.deepEqual(stepsOf([1e9, 1.9e9], about), [15, 29]);
+  // Step 1 is at 66 666 667 ns, on which a playhead can stand.
+  assert.deepEqual(stepsOf([66_666_667, 133_333_333], about), [1, 2]);
+  assert.deepEqual(stepsOf([-5e8, 9e9], about), [0, 31]);
+});
+
+test("commands can be pasted into a shell", () => {
+  assert.equal(trimCommand("a", [15, 29], { outcome: "keep", keep: false }), "dextouch store trim a --steps 15 29 --outcome keep");
+  const labels = { task: undefined, instruction: "it's $(up)", operator: "", outcome: "", keep: true };
+  assert.equal(relabelCommand({ kind: "recording", id: "a" }, labels), `dextouch store relabel a --kind recording --instruction 'it'"'"'s $(up)' --keep`);
+});
+
+test("a selection without an item of the kind has no command to export", () => {
+  const ids = itemsOfKind([{ kind: "recording", id: "a" }], "episode").map(({ id }) => id);
+  assert.equal(exportCommand({ format: "mcap", kind: "episode", ids, filters: {} }), "");
+  assert.match(exportCommand({ format: "mcap", kind: "recording", ids: ["a"], filters: {} }), / a --to a.mcap$/);
+  assert.match(exportCommand({ format: "mcap", kind: "episode", ids: null, filters: { task: "wipe" } }), /--task=wipe/);
 });

@@ -57,6 +57,17 @@ async def test_reviews_are_forwarded(client, services):
     assert answer.status_code == 413
 
 
+async def test_downloads_are_forwarded_and_their_refusals_passed_on(client, services):
+    body = {"items": [{"kind": "episode", "id": "a"}]}
+    answer = await client.post("/v1/episode_store/downloads", json=body)
+    assert services.asked == ["/v1/downloads"]
+    assert answer.status_code == 503
+    assert "POST /v1/downloads answered 404" in answer.json()["detail"]
+    too_large = {"items": [{"kind": "episode", "id": "a" * 2**20}]}
+    answer = await client.post("/v1/episode_store/downloads", json=too_large)
+    assert answer.status_code == 413
+
+
 async def test_clicks_are_forwarded(client, services):
     body = {"objects": {"cup": {"state": "hidden"}}}
     await client.post("/v1/episode_store/episodes/take-1/clicks", json=body)

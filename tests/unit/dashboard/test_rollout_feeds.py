@@ -129,8 +129,8 @@ async def test_a_watched_rollout_is_fetched_again_only_after_it_changed(world):
     statuses = []
     sent = world._sent
 
-    async def noted(request, *given):
-        answer = await sent(request, *given)
+    async def noted(request, **given):
+        answer = await sent(request, **given)
         statuses.append(answer.status_code)
         return answer
 

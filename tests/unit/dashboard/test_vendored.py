@@ -4,17 +4,20 @@ import hashlib
 import json
 from pathlib import Path
 
+import pytest
+
+from dextouch.serving import api_page
 from services.dashboard.app import STATIC
 
-VENDOR = STATIC / "vendor"
 
-
-def test_vendored_files_have_their_recorded_hashes():
-    packages = json.loads((VENDOR / "vendored.json").read_text())
+@pytest.mark.parametrize("folder", [STATIC, api_page.FOLDER])
+def test_vendored_files_have_their_recorded_hashes(folder):
+    vendor = folder / "vendor"
+    packages = json.loads((vendor / "vendored.json").read_text())
     recorded = {name: sha for one in packages for name, sha in one["sha256"].items()}
     found = {
-        str(path.relative_to(VENDOR)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in VENDOR.rglob("*")
+        str(path.relative_to(vendor)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in vendor.rglob("*")
         if path.is_file() and path.name != "vendored.json"
     }
     assert found == recorded

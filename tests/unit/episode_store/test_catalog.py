@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, LimitExceededError, StorageError
-from services.episode_store import catalog as catalog_module
+from services.episode_store import catalog_index
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import CatalogFilter, EpisodeFilter, Page
 from tests.unit.episode_store.episodes import write_episode
@@ -104,12 +104,12 @@ def test_hours(store):
 def test_what_did_not_change_is_not_looked_at(store, monkeypatch):
     """After the folder's stamp has settled, a list costs one stat."""
     catalog = Catalog(store)
-    long_ago_ns = time.time_ns() - 10 * catalog_module.SETTLED_NS
+    long_ago_ns = time.time_ns() - 10 * catalog_index.SETTLED_NS
     os.utime(store.root / "episodes", ns=(long_ago_ns, long_ago_ns))
     assert ids(catalog) == "abcd"
     with monkeypatch.context() as patch:
-        patch.setattr(catalog_module._Shelf, "_scan", None)
-        patch.setattr(store, "open", None)
+        for name in ("folder_numbers", "stamps", "open"):
+            patch.setattr(store, name, None)
         assert ids(catalog, origin="twin") == "ab"
     store.delete("b")
     write_episode(store, "f")
@@ -132,24 +132,6 @@ def test_a_young_stamp_is_not_believed(store):
     store.delete("a")
     os.utime(folder, ns=(now_ns, now_ns))
     assert ids(catalog) == "bcd"
-
-
-def test_a_bucket_is_listed_now_and_then(store, monkeypatch, tmp_path):
-    """A store whose groups lie elsewhere: its root is only the folder of unfinished things."""
-    work_folder, asked, now_ns = tmp_path / "work", [], [0]
-    monkeypatch.setattr(catalog_module.time, "monotonic_ns", lambda: now_ns[0])
-    whole = store.list
-    monkeypatch.setattr(store, "list", lambda kind: asked.append(kind) or whole(kind=kind))
-    root, store.root = store.root, work_folder
-    catalog = Catalog(store)
-    store.root = root
-    assert ids(catalog, origin="twin") == "ab"
-    write_episode(store, "e")
-    assert ids(catalog) == "abcd"
-    assert asked == ["episode"]
-    now_ns[0] += catalog_module.BUCKET_PERIOD_NS
-    assert ids(catalog) == "abcde"
-    assert asked == ["episode", "episode"]
 
 
 def test_recordings_are_filtered_too(start, attributes, batch_of, store):
@@ -233,7 +215,7 @@ def test_an_episode_that_may_not_be_read_hides_no_other(reachable):
         assert ids(Catalog(store)) == "open"
         # Opening it says what is wrong.
         assert store.list() == ["closed", "open"]
-        for look in (store.open, store.exists, store.revision, store.num_bytes):
+        for look in (store.open, store.exists, store.num_bytes):
             with pytest.raises(StorageError, match=r"closed.*Permission denied"):
                 look("closed")
     closed.chmod(0o755)

@@ -8,10 +8,13 @@ from scipy import stats
 
 from services.episode_store.items import (
     FIGURES,
+    MAX_SCORE,
     MIN_ITEMS,
+    figure_row,
     figures_of,
-    find_outliers,
-    robust_scores,
+    outlier_scores,
+    outliers_of,
+    spread_of,
 )
 from tests.unit.episode_store.episodes import write_episode, write_recording
 
@@ -35,17 +38,27 @@ PLANTED = {
 }
 
 
+def find_outliers(items):
+    """Findings of each of the items of one group."""
+    spread = spread_of(np.array([figure_row(figures) for figures in items]))
+    return [outliers_of(figures, spread) for figures in items]
+
+
 @pytest.mark.parametrize("num_items", [8, 9, 50])
 def test_scores_are_those_of_scipy(num_items):
     values = np.random.default_rng(num_items).gamma(2.0, 3.0, num_items)
-    mad = stats.median_abs_deviation(values)
-    expected = 0.6745 * (values - np.median(values)) / mad
-    np.testing.assert_allclose(robust_scores(values, resolution=0.0), expected, rtol=1e-12)
+    items = np.array([figure_row({"duration_s": value}) for value in values])
+    expected = 0.6745 * (values - np.median(values)) / stats.median_abs_deviation(values)
+    spread = spread_of(items)
+    np.testing.assert_allclose((items - spread[0])[:, 0] / spread[1, 0], expected, rtol=1e-12)
+    found = outlier_scores(items, spread)[:, 0]
+    np.testing.assert_allclose(found, np.where(abs(expected) > MAX_SCORE, abs(expected), 0.0))
 
 
 def test_scores_of_values_that_hardly_differ():
-    values = np.array([5.0] * 9 + [5.2])
-    np.testing.assert_allclose(robust_scores(values, resolution=0.1), [0.0] * 9 + [2.0])
+    items = np.array([figure_row({"duration_s": value}) for value in [5.0] * 9 + [5.2]])
+    # The resolution of a duration.
+    np.testing.assert_allclose(spread_of(items)[:, 0], [5.0, 0.25])
 
 
 def usual_items(rng, count):

@@ -1,5 +1,6 @@
 """An episode with H.264, JPEG and numbers, and ways to forge its files."""
 
+import base64
 import json
 import shutil
 import struct
@@ -7,16 +8,25 @@ import tracemalloc
 from contextlib import contextmanager
 from itertools import pairwise
 
+import google_crc32c
 import numpy as np
+from numcodecs.zstd import Zstd
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import canonical_json, sha256_hex
+from dextouch.episodes.format import (
+    ArrayEntry,
+    array_metadata,
+    canonical_json,
+    sha256_hex,
+)
 from dextouch.episodes.shards import with_crc
 
 ID = "stand-bottle-0003"
 VIDEO, STILLS, TOUCH = "camera_head", "camera_wrist_left", "tactile_left"
 # More than any test here needs, far less than what the forged numbers ask for.
 MEMORY_BYTES = 64 << 20
+# Of images of 64 x 64 pixels and fewer.
+IMAGE_CHUNK = 4096
 _WRITTEN: list[EpisodeStore] = []
 
 
@@ -92,7 +102,107 @@ def forge_attributes(folder, data):
     forge_record(folder, lambda record: record.update(attributes_sha256=sha256_hex(data)))
 
 
+def descriptors(folder):
+    group = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dextouch"]
+    return {stream["name"]: stream for stream in group["streams"]}
+
+
+def record_of(folder):
+    return json.loads((folder / "commit.json").read_bytes())["record"]
+
+
+def rows_of(folder, name):
+    """All rows of an array of numbers, decoded by another library than the reader's."""
+    entry = record_of(folder)["arrays"][name]
+    chunks, _ = chunks_of(shard_of(folder, name), num_chunks(folder, name))
+    data = b"".join(Zstd(1).decode(chunk[:-4]) for chunk in chunks)
+    rows = np.frombuffer(data, entry["dtype"]).reshape(-1, *entry["shape"][1:])
+    return rows[: entry["shape"][0]]
+
+
+def images_of(folder, name):
+    """The encoded images of a camera of format v3, by the description of the format."""
+    chunks, _ = chunks_of(shard_of(folder, name), num_chunks(folder, name))
+    data = b"".join(chunk[:-4] for chunk in chunks)
+    return [data[start:stop] for start, stop, _ in rows_of(folder, f"{name}_index").tolist()]
+
+
+def write_numbers(folder, name, rows):
+    """Write an array of numbers anew, with its checksums in the commit record."""
+    size, row_bytes = record_of(folder)["arrays"][name]["chunk_rows"], rows[0].nbytes
+    parts = [rows[at : at + size].tobytes() for at in range(0, len(rows), size)]
+    chunks = [with_crc(Zstd(1).encode(part.ljust(size * row_bytes, b"\0"))) for part in parts]
+    forge_chunks(folder, name, chunks)
+
+
+def forge_chunks(folder, name, chunks):
+    """Write storage chunks of numbers anew, with their checksums in the commit record."""
+    write_shard(shard_of(folder, name), chunks)
+    crcs = base64.b64encode(b"".join(chunk[-4:] for chunk in chunks)).decode()
+    forge_record(folder, lambda record: record["arrays"][name].update(crc32c=crcs))
+
+
+def write_images(folder, name, images):
+    """Write other encoded images, as many as before, with all checksums right."""
+    data, ends = b"".join(images), np.cumsum([len(image) for image in images])
+    size = record_of(folder)["arrays"][name]["chunk_rows"]
+    parts = [data[at : at + size].ljust(size, b"\0") for at in range(0, len(data), size)]
+    write_shard(shard_of(folder, name), [with_crc(part) for part in parts])
+    crcs = [google_crc32c.value(image) for image in images]
+    rows = np.stack([np.concatenate([[0], ends[:-1]]), ends, crcs], axis=1).astype("<i8")
+    write_numbers(folder, f"{name}_index", rows)
+    forge_record(folder, lambda record: record["arrays"][name].update(shape=[len(data)]))
+
+
+def as_v2(folder):
+    """Write a group of format v3 as releases before wrote it, in format v2."""
+    arrays, streams = record_of(folder)["arrays"], descriptors(folder)
+    plain = {}
+    for name, entry in arrays.items():
+        stream = name.removesuffix("_index") if name.endswith("_index") else name
+        unit = streams.get(stream, {}).get("unit")
+        if stream != name and unit in {"jpeg", "h264"}:
+            continue
+        column = entry | {"crc32c": None, "attributes": {}}
+        owner = max((one for one in streams if name.startswith(one)), key=len)
+        column["dimension_names"] = [f"{owner}_time", *entry["dimension_names"][1:]]
+        if unit in {"jpeg", "h264"}:
+            images, shape = images_of(folder, name), streams[name]["shape"]
+            rows = {"jpeg": 1, "h264": 8}[unit]
+            groups = [images[at : at + rows] for at in range(0, len(images), rows)]
+            shutil.rmtree(folder / name)
+            path = folder / name / "c" / "0" / "0" / "0" / "0"
+            path.parent.mkdir(parents=True)
+            packed = [parts[0] if unit == "jpeg" else group(parts) for parts in groups]
+            write_shard(path, [with_crc(part) for part in packed])
+            column |= {"shape": [len(images), *shape], "chunk_rows": rows, "codec": unit}
+            axes = [f"{name}_axis{axis}" for axis in (1, 2, 3)]
+            column["dimension_names"] = [f"{name}_time", *axes]
+            shutil.rmtree(folder / f"{name}_index")
+        plain[name] = column
+        metadata = array_metadata(ArrayEntry.model_validate_json(json.dumps(column)))
+        (folder / name / "zarr.json").write_bytes(metadata)
+    about = json.loads((folder / "zarr.json").read_bytes())
+    del about["consolidated_metadata"]
+    forge_record(folder, lambda record: record.update(format_version=2, arrays=plain))
+    forge_attributes(folder, canonical_json(about))
+
+
+def forge_images(folder, name, edit):
+    """Replace encoded images by others, in either version."""
+    if record_of(folder)["format_version"] == 3:
+        write_images(folder, name, edit(images_of(folder, name)))
+        return
+    path, count = shard_of(folder, name), num_chunks(folder, name)
+    chunks, _ = chunks_of(path, count)
+    if descriptors(folder)[name]["unit"] == "jpeg":
+        write_shard(path, [with_crc(one) for one in edit([chunk[:-4] for chunk in chunks])])
+    else:
+        forge_first_group(folder, lambda units: group(edit(units)))
+
+
 def forge_first_group(folder, forge):
+    """Replace the first group of pictures of a video of format v2."""
     path = shard_of(folder, VIDEO)
     chunks, _ = chunks_of(path, num_chunks(folder, VIDEO))
     payload = chunks[0][:-4]

@@ -1,5 +1,6 @@
 """How large storage chunks are, and what a stream must not be: memory stays bounded."""
 
+import base64
 import json
 
 import numpy as np
@@ -7,16 +8,26 @@ import pytest
 import zstandard
 from pydantic import ValidationError
 
-from dextouch.episodes import stream_arrays
-from dextouch.episodes.format import array_metadata, canonical_json, decode_commit
+from dextouch.episodes import files, stream_arrays, writer
+from dextouch.episodes.care import inspect_group, repair_group
+from dextouch.episodes.files import MAX_METADATA_BYTES
+from dextouch.episodes.format import (
+    CommitRecord,
+    array_metadata,
+    canonical_json,
+    decode_commit,
+    encode_commit,
+    with_rows,
+)
 from dextouch.episodes.shards import with_crc
-from dextouch.errors import CorruptDataError
+from dextouch.errors import CorruptDataError, StorageError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
 from tests.unit.episodes.hostile_group import (
     chunks_of,
     forge_record,
     memory_bound,
+    record_of,
     shard_of,
     write_shard,
 )
@@ -140,10 +151,12 @@ def test_a_stored_chunk_of_gigabytes_is_refused_before_it_is_unpacked(store):
     with store.writer(kind="recording", attributes=take(heavy)) as writer:
         writer.append("raw", values=np.zeros((1, 50_000)), t_host_ns=np.array([7]))
     folder = store.root / "recordings" / "take-1"
-    forge_record(folder, lambda record: record["arrays"]["raw"].update(chunk_rows=5000))
+    chunk = with_crc(repeated_zeros(5000 * 400_000))
+    forged = {"chunk_rows": 5000, "crc32c": base64.b64encode(chunk[-4:]).decode()}
+    forge_record(folder, lambda record: record["arrays"]["raw"].update(forged))
     record, _ = decode_commit((folder / "commit.json").read_bytes(), what="take-1")
     (folder / "raw" / "zarr.json").write_bytes(array_metadata(record.arrays["raw"]))
-    write_shard(shard_of(folder, "raw"), [with_crc(repeated_zeros(5000 * 400_000))])
+    write_shard(shard_of(folder, "raw"), [chunk])
     reader = store.recording("take-1")
     for read in (lambda: reader.read("raw"), reader.verify):
         with memory_bound(), pytest.raises(CorruptDataError, match=r"'raw'.*2000000000 bytes"):
@@ -162,3 +175,65 @@ def test_rows_behind_the_last_one_are_zero(store):
     # Five rows of two numbers, and a checksum of four bytes.
     last = np.frombuffer(zstandard.decompress(chunks[-1][:-4]), "<f4").reshape(5, 2)
     assert last[:, 0].tolist() == [11, 12, 0, 0, 0]
+
+
+def camera(name):
+    return stream((480, 640, 3), "uint8", 60, name=name, kind="image", unit="h264")
+
+
+def with_checksums(descriptor, hours):
+    """Entries of a stream as a writer makes them."""
+    for name, entry in stream_arrays(descriptor, "recording").items():
+        count = round(hours * 3600 * descriptor.nominal_rate_hz)
+        if entry.codec == "zstd":
+            crcs = bytes(4 * -(-count // entry.chunk_rows))
+            entry = entry.model_copy(update={"crc32c": base64.b64encode(crcs).decode()})  # noqa: PLW2901
+        yield name, with_rows(entry, count)
+
+
+def test_the_record_of_half_a_day_of_three_cameras_can_be_read():
+    streams = [camera(f"camera_{n}") for n in range(3)] + [stream((360,), "uint16", 60)]
+    arrays = {name: one for each in streams for name, one in with_checksums(each, 12)}
+    whole = CommitRecord(kind="recording", id="x", attributes_sha256="0", arrays=arrays)
+    assert len(encode_commit(whole)[0]) > MAX_METADATA_BYTES
+    data = writer.encoded_record(whole)
+    assert len(data) <= MAX_METADATA_BYTES
+    kept = decode_commit(data, what="x")[0].arrays
+    assert {name: one.shape for name, one in kept.items()} == {
+        n: a.shape for n, a in arrays.items()
+    }
+    # No more than is needed: a camera has four arrays of 1.7 MB, one of which is enough.
+    assert sum(kept[name].crc32c != arrays[name].crc32c for name in arrays) <= 4
+
+
+def test_a_record_without_checksums_is_read_and_verified(store, monkeypatch):
+    """A storage chunk a sample makes a long take of a short one."""
+    monkeypatch.setattr(writer, "MAX_METADATA_BYTES", 50_000)
+    stamps_ns = np.arange(3000) * 10**9
+    with store.writer(kind="recording", attributes=take(stream((), rate_hz=1))) as one:
+        one.append("raw", values=stamps_ns / 1e9, t_host_ns=stamps_ns)
+    folder = store.root / "recordings" / "take-1"
+    assert (folder / "commit.json").stat().st_size <= 50_000
+    assert None in {array["crc32c"] for array in record_of(folder)["arrays"].values()}
+    values = store.recording("take-1").read("raw").values
+    np.testing.assert_array_equal(values, stamps_ns / 1e9)
+    assert not inspect_group(store.files("take-1", kind="recording"), "recording").findings
+
+
+def test_what_could_not_be_read_again_is_not_committed(store, made, monkeypatch):
+    monkeypatch.setattr(writer, "MAX_METADATA_BYTES", 1000)
+    with pytest.raises(StorageError, match="expected at most 1000 each"):
+        made.write(store)
+    assert store.list() == []
+    assert store.sweep() == 0
+
+
+@pytest.mark.parametrize("limit", ["MAX_COMMIT_BYTES", "MAX_METADATA_BYTES"])
+def test_what_is_too_large_is_no_damage_to_salvage(store, made, monkeypatch, limit):
+    made.write(store)
+    (name,) = store.list()
+    monkeypatch.setattr(files, limit, 1000)
+    report = repair_group(store.root, "episode", name)
+    assert (report.action, report.new_id) == ("left", None)
+    assert "expected at most 1000" in report.notes[0]
+    assert store.list() == [name]

@@ -11,6 +11,7 @@ from dextouch.errors import CorruptDataError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import encoded_values
+from tests.unit.episodes.hostile_group import IMAGE_CHUNK
 
 CAMERA = "camera_head"
 NUM_STEPS = 41
@@ -142,12 +143,17 @@ def test_a_copy_with_the_same_damaged_image_still_mends_the_rest(make_episode, s
     images[9] = images[9][:-60]
     recording_of(store, images, "jpeg")
     shutil.copytree(store.root, tmp_path / "copy")
-    shard = next((store.root / "recordings/take" / CAMERA).rglob("c/0/0/0/0"))
+    shard = store.root / "recordings/take" / CAMERA / "c/0"
     data = bytearray(shard.read_bytes())
-    data[sum(map(len, images[:15])) + 15 * 4 + 100] ^= 1
+    place = sum(map(len, images[:15])) + 100
+    chunk = place // IMAGE_CHUNK
+    data[place + 4 * chunk] ^= 1
     shard.write_bytes(data)
     findings = inspect_group(store.files("take", kind="recording"), "recording").findings
-    assert [finding.chunk for finding in findings] == [9, 15]
+    assert {(finding.chunk, finding.image) for finding in findings} == {(None, 9), (chunk, None)}
+    assert [f.message.split("; ")[-1] for f in findings if f.image is None] == [
+        "damaged images: 15"
+    ]
     copy = EpisodeStore(tmp_path / "copy").files("take", kind="recording")
     repaired = repair_group(store.root, "recording", "take", copy=copy)
     assert repaired.lost == {CAMERA: 1}

@@ -44,7 +44,7 @@ def inspect(store, item_id):
 
 
 def look(store, item_id):
-    return store.revision(item_id), store.num_bytes(item_id), store.review(item_id)
+    return store.num_bytes(item_id), store.review(item_id)
 
 
 USES = (read_a_window, read_samples, read_encoded_images, verify, inspect, look)

@@ -3,10 +3,13 @@
 import json
 import struct
 from datetime import UTC, datetime
+from functools import partial
+from threading import Thread
 
 import numpy as np
 import pytest
 
+from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import (
     DeletionRequest,
     delete_for_good,
@@ -15,10 +18,12 @@ from dextouch.episodes.care import (
     repair_group,
     reviews_by,
 )
+from dextouch.episodes.editing import MergeOptions, add_note, merge_stores, relabel_item
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from dextouch.schemas import LineageEntry, RecordingAttributes, Review
+from dextouch.schemas import LineageEntry, NewNote, RecordingAttributes, Review
 from dextouch.streams import SampleBatch, StreamDescriptor
+from tests.unit.episode_store import episodes as takes
 
 MINE, OTHER = "op-1", "op-10"
 FORCE = StreamDescriptor(
@@ -163,9 +168,9 @@ def test_a_recording_with_and_without_what_was_made_of_it(filled, tmp_path):
     assert [v.id for v in plan_deletion(filled.root, alone)] == ["a-take"]
     receipt = delete_for_good(filled.root, alone, tmp_path / "r.json")
     assert not receipt.complete
-    assert [(r.where, r.names[-1]) for r in receipt.remaining] == [
-        ("episodes/a-episode/zarr.json", "a-take")
-    ]
+    (remaining,) = receipt.remaining
+    assert remaining.where == "episodes/a-episode/zarr.json"
+    assert "a-take" in remaining.names
     request = DeletionRequest(recording="b-take")
     assert sorted(v.id for v in plan_deletion(filled.root, request)) == [
         "b-episode",
@@ -327,3 +332,66 @@ def test_a_damaged_plan_is_said(filled, tmp_path):
     (path.parent / "other.json").write_text('{"victims": ["a-take"]}')
     receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
     assert [r.where for r in receipt.remaining] == [".deletions/other.json"]
+
+
+def two_stores(tmp_path):
+    """A store into which that of another operator with equal ids was merged."""
+    one, other = (EpisodeStore(tmp_path / name) for name in ("one", "other"))
+    takes.write_take(one, "t", operator=MINE)
+    takes.write_take(other, "t", operator=OTHER, num_steps=12)
+    merge_stores([other], one, options=MergeOptions(rename=True))
+    return one
+
+
+@pytest.mark.parametrize(
+    ("operator", "left"),
+    [(MINE, ["t-aligned-merged-1", "t-merged-1"]), (OTHER, ["t", "t-aligned"])],
+)
+def test_of_merged_stores_only_the_operator_goes(tmp_path, operator, left):
+    store = two_stores(tmp_path)
+    receipt = delete_for_good(store.root, DeletionRequest(operator=operator), tmp_path / "r.json")
+    assert sorted(store.list() + store.list(kind="recording")) == left
+    assert len(receipt.deleted) == 2
+
+
+def test_of_merged_stores_only_the_recording_goes(tmp_path):
+    store = two_stores(tmp_path)
+    delete_for_good(store.root, DeletionRequest(recording="t"), tmp_path / "r.json")
+    assert store.list() == ["t-aligned-merged-1"]
+    assert store.list(kind="recording") == ["t-merged-1"]
+
+
+@pytest.mark.parametrize("is_stored", [True, False])
+def test_the_id_of_an_edited_source_that_somebody_used_again_is_another_thing(tmp_path, is_stored):
+    store = EpisodeStore(tmp_path / "store")
+    takes.write_recording(store, "t", operator=MINE)
+    relabel_item(store, "t", {"instruction": "up"}, kind="recording")
+    store.purge()
+    takes.write_take(store, "t", operator=OTHER, num_steps=12)
+    if not is_stored:
+        store.delete("t", kind="recording", for_good=True)
+    found = plan_deletion(store.root, DeletionRequest(operator=MINE))
+    assert [victim.id for victim in found] == ["t-relabelled-1"]
+
+
+def test_a_note_that_is_written_during_a_deletion_stays(filled, tmp_path, monkeypatch):
+    """A deletion takes names off notes while nobody else changes them."""
+    new = partial(NewNote, start_ns=0, stop_ns=10**9)
+    add_note(filled, "b-take", new(text="mine", author=MINE), kind="recording")
+    real, threads = deletion.without_author, []
+
+    def slow(*args):
+        if not threads:
+            late = new(text="theirs", author=OTHER)
+            threads.append(
+                Thread(target=add_note, args=(filled, "b-take", late), kwargs={"kind": "recording"})
+            )
+            threads[0].start()
+            threads[0].join(0.3)
+        return real(*args)
+
+    monkeypatch.setattr(deletion, "without_author", slow)
+    delete_for_good(filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json")
+    threads[0].join()
+    notes = filled.notes("b-take", kind="recording").notes
+    assert [(one.text, one.author) for one in notes] == [("mine", None), ("theirs", OTHER)]

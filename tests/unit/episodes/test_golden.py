@@ -1,4 +1,4 @@
-"""The format on disk: version 2 is read and written as ever, others are refused."""
+"""The format on disk: version 3 is read and written as ever, 2 is read, others are refused."""
 
 import json
 import re
@@ -118,9 +118,9 @@ def write_recording(store):
         )
 
 
-@pytest.fixture
-def golden():
-    return EpisodeStore(GOLDEN / "store_v2")
+@pytest.fixture(params=[2, 3])
+def golden(request):
+    return EpisodeStore(GOLDEN / f"store_v{request.param}")
 
 
 def check_content(store):
@@ -138,23 +138,34 @@ def check_content(store):
     assert recording.read("force").t_device_ns.tolist() == [-1] * 5
 
 
-def test_version_2_is_read(golden):
+def test_versions_are_read(golden):
     check_content(golden)
 
 
-def test_version_2_is_still_written(golden, store):
+def test_both_versions_have_the_same_content():
+    """Each array of numbers, and the groups of images, have one hash in both."""
+    old, new = (EpisodeStore(GOLDEN / f"store_v{version}") for version in (2, 3))
+    for before, after in ((old.open("golden"), new.open("golden")),):
+        entries = after._contents.entries
+        for name, entry in before._contents.entries.items():
+            assert entries[name].sha256 == entry.sha256, name
+    assert old.recording("golden").content() == new.recording("golden").content()
+
+
+def test_version_3_is_still_written(store):
     """Byte for byte except the shards, whose compressed bytes are zstd's own affair."""
+    golden = EpisodeStore(GOLDEN / "store_v3")
     write_episode(store)
     write_recording(store)
     found = (path.relative_to(golden.root) for path in golden.root.rglob("*.json"))
     # Encoded video is not the same on every processor.
     files = sorted(path for path in found if "video" not in path.parts)
-    assert len(files) == 14
+    assert len(files) == 15
     for path in files:
         assert (store.root / path).read_bytes() == (golden.root / path).read_bytes(), path
 
 
-def test_video_of_version_2_is_read(golden):
+def test_video_is_read(golden):
     """The access units of one encoder, decoded as they were when they were written."""
     reader = golden.open("video")
     reader.verify()
@@ -166,13 +177,13 @@ def test_video_of_version_2_is_read(golden):
 
 
 @pytest.mark.parametrize("kind", ["episode", "recording"])
-@pytest.mark.parametrize("version", [1, 3, "2"])
-def test_another_version_is_refused_with_what_to_do(golden, tmp_path, kind, version):
-    shutil.copytree(golden.root, tmp_path / "other")
+@pytest.mark.parametrize("version", [1, 4, "3"])
+def test_another_version_is_refused_with_what_to_do(tmp_path, kind, version):
+    shutil.copytree(GOLDEN / "store_v3", tmp_path / "other")
     store = EpisodeStore(tmp_path / "other")
     stamp_version(store, kind, "golden", version)
     told = (
-        f"{kind} golden: commit.json has format version {version!r}, expected 2; "
+        f"{kind} golden: commit.json has format version {version!r}, expected 2 or 3; "
         "read it with the release that wrote it"
     )
     with pytest.raises(StorageError, match=f"^{re.escape(told)}$") as caught:

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes.shards import with_crc
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images import encode_jpeg
 from tests.unit.episodes.hostile_group import (
@@ -13,17 +12,21 @@ from tests.unit.episodes.hostile_group import (
     MEMORY_BYTES,
     STILLS,
     VIDEO,
-    chunks_of,
+    as_v2,
     copy_of,
     forge_attributes,
     forge_first_group,
+    forge_images,
     forge_record,
     group,
     memory_bound,
-    num_chunks,
-    shard_of,
-    write_shard,
+    rows_of,
+    write_numbers,
     written_once,
+)
+
+BOTH_VERSIONS = pytest.mark.parametrize(
+    "prepare", [pytest.param(lambda folder: None, id="v3"), pytest.param(as_v2, id="v2")]
 )
 
 
@@ -68,13 +71,70 @@ def bounded_memory():
         lambda units: b"\x08",
     ],
 )
-def test_forged_groups_of_pictures(store, folder, forge):
+def test_forged_groups_of_pictures_of_version_2(store, folder, forge):
+    as_v2(folder)
+    assert store.open(ID).verify().num_arrays == 12
     forge_first_group(folder, forge)
     with pytest.raises(CorruptDataError, match=VIDEO):
         store.open(ID).images(VIDEO)
 
 
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize(
+    "forge",
+    [
+        lambda units: [units[1], units[0], *units[2:]],
+        lambda units: [units[0][units[0].rfind(b"\x00\x00\x01") :], *units[1:]],
+        lambda units: [*units[:3], *units[4:9], units[8], *units[9:]],
+        lambda units: [b"\x00\x00\x00\x01\x09\x10"] * len(units),
+        lambda units: [bytes(100)] * len(units),
+    ],
+)
+def test_forged_pictures(store, folder, forge):
+    assert store.open(ID).verify().num_arrays == 14
+    forge_images(folder, VIDEO, forge)
+    with pytest.raises(CorruptDataError, match=f"{VIDEO}.*image 0|{VIDEO}.*image 3"):
+        store.open(ID).images(VIDEO)
+
+
+def change(row, column, value):
+    def edit(index):
+        index[row, column] = value
+        return index
+
+    return edit
+
+
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize("name", [VIDEO, STILLS])
+@pytest.mark.parametrize(
+    ("forged", "says"),
+    [
+        (change(0, 0, 1), "inconsistent"),
+        (change(0, 0, -8), "inconsistent"),
+        (change(3, 0, 0), "inconsistent"),
+        (change(3, 1, 2**62), "inconsistent"),
+        (change(-1, 1, 2**62), "inconsistent"),
+        (change(-1, 1, -(2**62)), "inconsistent"),
+        (lambda index: index[::-1].copy(), "inconsistent"),
+        (lambda index: index[:1].repeat(len(index), axis=0), "inconsistent"),
+        (change(5, 2, 7), "image 5: checksum"),
+        (change(5, 2, -1), "image 5: checksum"),
+    ],
+)
+def test_forged_indices(store, folder, name, forged, says):
+    """With right checksums, so that nothing but the places of the images is wrong."""
+    write_numbers(folder, f"{name}_index", forged(rows_of(folder, f"{name}_index").copy()))
+    reader = store.open(ID)
+    for read in (reader.images, lambda name: reader.encoded_images(name, 0, 8)):
+        with pytest.raises(CorruptDataError, match=f"'{name}'.*{says}"):
+            read(name)
+    with pytest.raises(CorruptDataError, match=f"'{name}"):
+        reader.verify()
+
+
 def test_a_short_group_in_the_middle_shifts_nothing(store, folder):
+    as_v2(folder)
     forge_first_group(folder, lambda units: group(units[:7]))
     with pytest.raises(CorruptDataError, match="holds 7 images, expected 8"):
         store.open(ID).encoded_images(VIDEO, 0, 12)
@@ -124,18 +184,20 @@ def peak_bytes():
     return int(status.split("VmHWM:")[1].split()[0]) * 1024
 
 
+@BOTH_VERSIONS
 @pytest.mark.parametrize(("wide", "high"), [(1024, 1024), (1024, 4), (8, 8), (4, 5)])
-def test_video_that_announces_another_size(store, folder, wide, high):
+def test_video_that_announces_another_size(store, folder, wide, high, prepare):
     """16,384 x 16,384 pixels would be 400 MB an image."""
+    prepare(folder)
     true = store.open(ID).images(VIDEO, 8, 16)
 
     def forge(units):
         start = b"\x00\x00\x00\x01"
         kept = [part for part in units[0].split(start) if part and part[0] & 0x1F != 7]
         first = sequence_parameters(wide, high) + b"".join(start + part for part in kept)
-        return group([first, *units[1:]])
+        return [first, *units[1:]]
 
-    forge_first_group(folder, forge)
+    forge_images(folder, VIDEO, forge)
     Path("/proc/self/clear_refs").write_text("5")
     before = peak_bytes()
     reader = store.open(ID)
@@ -146,23 +208,24 @@ def test_video_that_announces_another_size(store, folder, wide, high):
     np.testing.assert_array_equal(reader.images(VIDEO, 8, 16), true)
 
 
+@BOTH_VERSIONS
 @pytest.mark.usefixtures("bounded_memory")
 @pytest.mark.parametrize("shape", [(64, 65), (65, 64), (1, 1), (128, 128)])
-def test_a_jpeg_of_another_size(store, folder, shape):
-    path = shard_of(folder, STILLS)
-    chunks, _ = chunks_of(path, num_chunks(folder, STILLS))
+def test_a_jpeg_of_another_size(store, folder, shape, prepare):
+    prepare(folder)
     image = encode_jpeg(np.full((*shape, 3), 90, np.uint8))
-    write_shard(path, [with_crc(image), *chunks[1:]])
-    with pytest.raises(CorruptDataError, match=r"storage chunk 0.*expected .64, 64."):
+    forge_images(folder, STILLS, lambda images: [image, *images[1:]])
+    with pytest.raises(CorruptDataError, match=r"image 0: .*expected .64, 64."):
         store.open(ID).images(STILLS)
 
 
-def test_a_jpeg_that_announces_much_and_holds_little(store, folder):
-    path = shard_of(folder, STILLS)
-    chunks, _ = chunks_of(path, num_chunks(folder, STILLS))
-    for forged in (chunks[0][:-80], chunks[0][: len(chunks[0]) // 2], b"\xff\xd8\xff", b"x"):
-        write_shard(path, [with_crc(forged), *chunks[1:]])
-        with pytest.raises(CorruptDataError, match="storage chunk 0"):
+@BOTH_VERSIONS
+def test_a_jpeg_that_announces_much_and_holds_little(store, folder, prepare):
+    prepare(folder)
+    whole = store.open(ID).encoded_images(STILLS, 0, 1)[0]
+    for forged in (whole[:-80], whole[: len(whole) // 2], b"\xff\xd8\xff", b"x"):
+        forge_images(folder, STILLS, lambda images, forged=forged: [forged, *images[1:]])
+        with pytest.raises(CorruptDataError, match="image 0: "):
             store.open(ID).images(STILLS)
 
 
@@ -175,11 +238,10 @@ def test_images_larger_than_any_are_refused_before_they_are_made(store, folder, 
     data = (folder / "zarr.json").read_bytes()
     shape = f'"shape":[{size},{size},3]'.encode()
     forge_attributes(folder, data.replace(b'"shape":[64,64,3]', shape))
-
-    def edit(record):
-        for name in (VIDEO, STILLS):
-            record["arrays"][name]["shape"][1:3] = [size, size]
-
-    forge_record(folder, edit)
+    # That of images of so many pixels.
+    forge_record(
+        folder,
+        lambda record: [record["arrays"][n].update(chunk_rows=65536) for n in (VIDEO, STILLS)],
+    )
     with pytest.raises(StorageError, match=says):
         store.open(ID)

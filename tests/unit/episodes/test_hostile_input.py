@@ -16,6 +16,7 @@ from tests.unit.episodes.hostile_group import (
     chunks_of,
     copy_of,
     forge_attributes,
+    forge_chunks,
     forge_record,
     memory_bound,
     num_chunks,
@@ -81,7 +82,7 @@ def test_storage_that_refuses_is_no_damage(store, monkeypatch):
 
 
 def test_all_of_it_is_whole(store):
-    assert store.open(ID).verify().num_arrays == 12
+    assert store.open(ID).verify().num_arrays == 14
     assert len(everything(store)) == 12
 
 
@@ -184,7 +185,8 @@ def add_array(record):
 def rows_of_stream(name, rows):
     def edit(record):
         for array, entry in record["arrays"].items():
-            if array in {name, f"{name}_t_ref_ns"}:
+            is_row = array in {name, f"{name}_index", f"{name}_t_ref_ns"}
+            if is_row and entry["codec"] != "bytes":
                 entry["shape"][0] = rows
 
     return edit
@@ -192,7 +194,7 @@ def rows_of_stream(name, rows):
 
 def rows_and_chunks(name, rows):
     def edit(record):
-        rows_of_stream(name, rows)(record)
+        rows_of_stream(name.removesuffix("_index"), rows)(record)
         record["arrays"][name]["chunk_rows"] = rows
 
     return edit
@@ -212,8 +214,10 @@ def rows_and_chunks(name, rows):
         (edit_array(TOUCH, dtype="float64"), "not what the attributes say"),
         (edit_array(TOUCH, dtype="object"), "float64"),
         (edit_array(STILLS, codec="zstd"), "not what the attributes say"),
-        (rows_of_stream(TOUCH, 2**39), "too short for its index"),
-        (rows_of_stream(VIDEO, 2**39), "too short for its index"),
+        (rows_of_stream(TOUCH, 2**39), "bytes of checksums, expected 4 for each of 18325193797"),
+        (rows_of_stream(VIDEO, 2**39), "bytes of checksums, expected 4 for each of 68719476736"),
+        (edit_array(VIDEO, shape=[2**39]), "inconsistent with its 549755813888 bytes"),
+        (edit_array(TOUCH, crc32c="A?"), "checksums in the commit record"),
         (edit_array(TOUCH, shape=[80, 320]), "not what the attributes say"),
         (rename_array, "not in the commit record"),
         (add_array, "elsewhere"),
@@ -233,15 +237,15 @@ def test_forged_commit_records(store, folder, edit, words):
 
 
 @pytest.mark.usefixtures("bounded_memory")
-@pytest.mark.parametrize("name", [TOUCH, VIDEO, STILLS])
+@pytest.mark.parametrize("name", [TOUCH, f"{VIDEO}_index", f"{STILLS}_index"])
 def test_forged_rows_of_one_storage_chunk(store, folder, name):
     """With a true index of one storage chunk that is said to hold half a million million rows."""
     forge_record(folder, rows_and_chunks(name, 2**39))
     path = shard_of(folder, name)
     chunks, _ = chunks_of(path, 3)
-    write_shard(path, chunks[:1])
-    reader = store.open(ID)
-    ways = [lambda: reader.images(name), lambda: reader.encoded_images(name, 0, 2**39)]
+    forge_chunks(folder, name, chunks[:1])
+    reader, camera = store.open(ID), name.removesuffix("_index")
+    ways = [lambda: reader.images(camera), lambda: reader.encoded_images(camera, 0, 2**39)]
     if name == TOUCH:
         ways = [lambda: reader._contents.shard(name).read()]
     for read in ways:
@@ -308,8 +312,8 @@ def repeated(size):
 def test_bombs_are_not_unpacked(store, folder, bomb):
     path = shard_of(folder, TOUCH)
     chunks, _ = chunks_of(path, num_chunks(folder, TOUCH))
-    write_shard(path, [with_crc(bomb(chunks[0][:-4])), *chunks[1:]])
-    with pytest.raises(CorruptDataError, match=r"storage chunk 0|need at least"):
+    forge_chunks(folder, TOUCH, [with_crc(bomb(chunks[0][:-4])), *chunks[1:]])
+    with pytest.raises(CorruptDataError, match=r"storage chunk 0: (?!is intact)|need at least"):
         store.open(ID).read(TOUCH)
 
 

@@ -1,56 +1,83 @@
-"""Other readers of Zarr v3 see the same numbers, bit for bit, without our code."""
+"""Other readers of Zarr v3 list and read a group with encoded cameras without our code."""
+
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
 
-tensorstore = pytest.importorskip("tensorstore", reason="tensorstore is not installed")
+from dextouch.episodes import EpisodeStore
+from tests.unit.episodes.hostile_group import rows_of
+
+READERS = Path(__file__).parents[2] / "system" / "zarr_readers" / "read.py"
+UNITS = {"camera_head": "h264", "camera_wrist_left": "jpeg", "camera_wrist_right": "rgb8"}
 
 
-@pytest.fixture
-def folder(make_episode, store):
-    made = make_episode(camera_unit="h264")
-    made.write(store)
-    return made, store.root / "episodes" / made.attributes.episode_id
+def write_truth(made, store, path):
+    """An episode with three kinds of cameras, and what its arrays hold, as they were given."""
+    made.descriptors = [
+        d.model_copy(update={"unit": UNITS.get(d.name, d.unit)}) for d in made.descriptors
+    ]
+    reader = made.write(store)
+    folder = store.root / "episodes" / made.attributes.episode_id
+    truth = {f"{name}_t_ref_ns": stamps for name, stamps in made.stamps_ns.items()}
+    for name, values in made.values.items():
+        truth[name] = values
+        if UNITS.get(name) in {"jpeg", "h264"}:
+            images = reader.encoded_images(name, 0, len(values))
+            truth[name] = np.frombuffer(b"".join(images), np.uint8)
+            truth[f"{name}_index"] = rows_of(folder, f"{name}_index")
+            truth[f"pixels/{name}"] = reader.images(name)
+    np.savez(path, **truth)
+    return folder
 
 
-def numeric_arrays(made):
-    arrays = {f"{name}_t_ref_ns": stamps for name, stamps in made.stamps_ns.items()}
-    cameras = {d.name for d in made.descriptors if d.kind == "image"}
-    return arrays | {name: v for name, v in made.values.items() if name not in cameras}
+@pytest.mark.parametrize("library", ["zarr", "xarray", "tensorstore"])
+def test_a_group_with_encoded_cameras_is_listed_and_read(make_episode, store, tmp_path, library):
+    pytest.importorskip(library, reason=f"{library} is not installed")
+    folder = write_truth(make_episode(), store, tmp_path / "truth.npz")
+    # Our package is in this environment, too: the script blocks it.
+    ran = subprocess.run(
+        [sys.executable, str(READERS), str(folder), str(tmp_path / "truth.npz"), library],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert library in ran.stdout
 
 
-def check_equal(got, true):
-    got = np.asarray(got)
-    assert got.dtype == true.dtype
-    assert got.shape == true.shape
-    assert got.tobytes() == true.tobytes()
-
-
-def test_zarr_python_reads_the_numbers(folder):
-    made, path = folder
-    group = zarr.open_group(path, mode="r")
-    for name, true in numeric_arrays(made).items():
-        check_equal(group[name][:], true)
-
-
-def test_tensorstore_reads_the_numbers(folder):
-    made, path = folder
-    for name, true in numeric_arrays(made).items():
-        spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(path / name)}}
-        array = tensorstore.open(spec, read=True, open=True).result()
-        check_equal(array.read().result(), true)
-        assert array.domain.labels[0].endswith("_time")
-
-
-# zarr-python says so of every file in a group that is no array; the commit record is one.
-@pytest.mark.filterwarnings("ignore:Object at commit.json is not recognized")
-def test_xarray_lines_streams_up_by_name(folder, store):
+def test_a_recording_is_listed_with_its_other_stamps_as_coordinates(tmp_path):
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
-    made, path = folder
-    with xarray.open_zarr(path, consolidated=False) as data:
-        for name, true in numeric_arrays(made).items():
-            check_equal(data[name].values, true)
-            assert data[name].dims[0] == f"{name.removesuffix('_t_ref_ns')}_time"
-        images = store.open(made.attributes.episode_id).images("camera_head")
-        check_equal(data["camera_head"].values, images)
+    golden = EpisodeStore(Path(__file__).parents[2] / "golden" / "store_v3")
+    with xarray.open_zarr(golden.root / "recordings" / "golden") as data:
+        assert set(data.data_vars) == {"force"}
+        assert set(data["force"].coords) == {
+            "force_t_host_ns",
+            "force_t_device_ns",
+            "force_sequence",
+        }
+        assert data["force_sequence"].values.tolist() == [9, 10, 11, 12, 13]
+        assert data["force"].attrs["long_name"] == "force"
+
+
+@pytest.mark.parametrize("unit", ["days", "seconds", "hours since 2020-01-01"])
+def test_units_that_xarray_would_take_for_times_are_left_out(store, unit):
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed")
+    from tests.unit.episodes.test_store import recording_attributes, scalar_stream
+
+    with store.writer(kind="recording", attributes=recording_attributes()) as writer:
+        writer.add_stream(scalar_stream(unit=unit))
+        writer.append("force", values=np.ones((3, 2), "f4"), t_host_ns=np.arange(3))
+    with xarray.open_zarr(store.root / "recordings" / "take-1") as data:
+        assert data["force"].dtype == np.float32
+
+
+@pytest.mark.parametrize("item", ["golden", "video"])
+def test_zarr_python_reads_images_of_version_2_through_our_codecs(item):
+    golden = EpisodeStore(Path(__file__).parents[2] / "golden" / "store_v2")
+    group = zarr.open_group(golden.root / "episodes" / item, mode="r")
+    images = golden.open(item).images("camera_head")
+    np.testing.assert_array_equal(group["camera_head"][:], images)

@@ -56,5 +56,5 @@ def test_without_the_library_the_message_says_what_to_install(monkeypatch):
         if name.startswith(("obstore", "dextouch.episodes.object_")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "obstore", None)
-    with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[s3\]'"):
+    with pytest.raises(UnavailableError, match=r"needs obstore; run `.*pip install .*\[s3\]"):
         EpisodeStore("s3://bucket/prefix")

@@ -9,7 +9,7 @@ from dextouch.episodes import GOP_IMAGES, EpisodeStore, LocalGroup
 from dextouch.episodes.care import inspect_group, repair_group
 from dextouch.episodes.format import CHUNK_SECONDS
 from dextouch.errors import ConflictError, CorruptDataError
-from tests.unit.episodes.hostile_group import flip
+from tests.unit.episodes.hostile_group import IMAGE_CHUNK, as_v2, flip, record_of, rows_of
 
 ID = "stand-bottle-0003"
 NEW = f"{ID}-salvaged-1"
@@ -17,8 +17,8 @@ VIDEO, STILLS, TOUCH = "camera_head", "camera_wrist_left", "tactile_left"
 TOUCH_ROWS = round(60 * CHUNK_SECONDS)
 
 
-@pytest.fixture
-def truth(make_episode, store):
+@pytest.fixture(params=[3, pytest.param(2, marks=pytest.mark.long)])
+def truth(request, make_episode, store):
     """What every stream holds before anything is damaged, as it is read."""
     made = make_episode(camera_unit="h264", num_steps=31)
     made.descriptors = [
@@ -26,7 +26,11 @@ def truth(make_episode, store):
         for d in made.descriptors
         if d.name not in {"camera_wrist_right", "tactile_right"}
     ]
-    reader = made.write(store)
+    made.write(store)
+    if request.param == 2:
+        as_v2(store.root / "episodes" / ID)
+    reader = store.open(ID)
+    assert reader._contents.version == request.param
     return {name: reader.read(name) for name in reader.streams}
 
 
@@ -39,11 +43,22 @@ def shard_of(folder, name):
     return next(path for path in (folder / name / "c").rglob("*") if path.is_file())
 
 
+def place_of_image(folder, name, number):
+    """File offset of an image of format v3, and the storage chunk it begins in."""
+    start = int(rows_of(folder, f"{name}_index")[number, 0])
+    chunk = start // IMAGE_CHUNK
+    return start + 4 * chunk, chunk
+
+
 def damage_chunk(folder, name, number):
-    """Flip a byte in the middle of one storage chunk."""
-    path = shard_of(folder, name)
+    """Flip a byte of one storage chunk, of v3 in the first image of a group; returns its chunk."""
+    if record_of(folder)["arrays"][name]["codec"] == "bytes":
+        place, chunk = place_of_image(folder, name, number * {VIDEO: GOP_IMAGES, STILLS: 1}[name])
+        flip(shard_of(folder, name), place)
+        return chunk
     index = EpisodeStore(folder.parents[1]).open(ID)._contents.shard(name).check_index()
-    flip(path, int(index[number, 0] + index[number, 1] // 2))
+    flip(shard_of(folder, name), int(index[number, 0] + index[number, 1] // 2))
+    return number
 
 
 def check_salvaged(store, truth, gone):
@@ -78,10 +93,13 @@ def check_salvaged(store, truth, gone):
 )
 def test_what_holds_is_salvaged(store, folder, truth, array, number, stream, rows):
     sha256 = store.open(ID).content_sha256
-    damage_chunk(folder, array, number)
+    chunk = damage_chunk(folder, array, number)
     report = inspect_group(LocalGroup(folder), "episode")
-    assert [(f.array, f.chunk) for f in report.findings] == [(array, number)]
-    assert f"episode {ID}: array {array!r}: storage chunk {number}" in report.findings[0].message
+    assert [(f.array, f.chunk) for f in report.findings] == [(array, chunk)]
+    message = report.findings[0].message
+    assert f"episode {ID}: array {array!r}: storage chunk {chunk}" in message
+    if array in {VIDEO, STILLS} and store.open(ID)._contents.version == 3:
+        assert message.endswith(f"damaged images: {rows[0]}")
     result = repair_group(store.root, "episode", ID)
     assert (result.action, result.new_id) == ("salvaged", NEW)
     assert result.lost == check_salvaged(store, truth, {stream: list(rows)})
@@ -125,9 +143,12 @@ def test_a_damaged_index_and_chunk_cost_that_chunk(store, folder, truth, place):
 
 @pytest.mark.parametrize(("name", "kept"), [(TOUCH, TOUCH_ROWS), (VIDEO, GOP_IMAGES), (STILLS, 1)])
 def test_of_a_truncated_file_the_front_is_kept(store, folder, truth, name, kept):
-    index = store.open(ID)._contents.shard(name).check_index()
     path = shard_of(folder, name)
-    path.write_bytes(path.read_bytes()[: int(index[1].sum()) - 1])
+    if record_of(folder)["arrays"][name]["codec"] == "bytes":
+        stop = place_of_image(folder, name, 2 * kept)[0]
+    else:
+        stop = int(store.open(ID)._contents.shard(name).check_index()[1].sum())
+    path.write_bytes(path.read_bytes()[: stop - 1])
     repair_group(store.root, "episode", ID)
     check_salvaged(store, truth, {name: list(range(kept, len(truth[name])))})
 

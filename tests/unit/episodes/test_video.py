@@ -15,7 +15,13 @@ from dextouch.episodes import (
     is_keyframe,
 )
 from dextouch.episodes.files import make_held_folder
-from dextouch.episodes.image_codecs import GopDecoder, ImageChunks, pack_chunk, transform_pixels
+from dextouch.episodes.image_codecs import (
+    GopDecoder,
+    ImageGroups,
+    pack_group,
+    transform_pixels,
+    unpack_group,
+)
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -205,26 +211,23 @@ def test_a_full_disk_in_the_encoders_thread_is_said(store, file_size_limit):
 def test_a_forged_size_is_refused_before_it_is_decoded():
     large = GopEncoder(4096, 4096, rate_hz=30.0, settings=VideoSettings())
     unit = large.encode(np.zeros((4096, 4096, 3), np.uint8))
-    chunks = ImageChunks("h264", (HEIGHT, WIDTH, 3), GOP_IMAGES, "camera")
+    groups = ImageGroups("h264", (HEIGHT, WIDTH, 3), "camera")
     out = np.empty((1, HEIGHT, WIDTH, 3), np.uint8)
-    with pytest.raises(CorruptDataError, match="camera: storage chunk 4"):
-        chunks.decode(pack_chunk("h264", [unit]), 4, [0], FULL, out)
-    jpeg = ImageChunks("jpeg", (HEIGHT, WIDTH, 3), 1, "camera")
+    with pytest.raises(CorruptDataError, match="camera: image 32: "):
+        groups.decode([unit], 4, [0], FULL, out)
+    jpeg = ImageGroups("jpeg", (HEIGHT, WIDTH, 3), "camera")
     with pytest.raises(CorruptDataError, match="expected"):
-        jpeg.decode(encode_jpeg(np.zeros((8, 8, 3), np.uint8)), 0, [0], FULL, out)
+        jpeg.decode([encode_jpeg(np.zeros((8, 8, 3), np.uint8))], 0, [0], FULL, out)
 
 
 def test_bytes_that_are_no_group_are_refused(encoder):
     units = [encoder.encode(image) for image in moving_images(8)]
-    chunks = ImageChunks("h264", (HEIGHT, WIDTH, 3), GOP_IMAGES, "camera")
     out = np.empty((1, HEIGHT, WIDTH, 3), np.uint8)
-    whole = pack_chunk("h264", units)
-    assert chunks.unpack(whole, 0) == units
+    whole = pack_group("h264", units)
+    assert unpack_group("h264", whole, "storage chunk 0") == units
     for bad in (b"", whole[:3], whole[:20], whole[:-1], whole + b"x", bytes(40)):
         with pytest.raises(CorruptDataError, match="storage chunk 0"):
-            chunks.decode(bad, 0, [0], FULL, out)
-    with pytest.raises(CorruptDataError, match="expected image 5"):
-        chunks.decode(pack_chunk("h264", units[:5]), 0, [5], FULL, out)
+            unpack_group("h264", bad, "storage chunk 0")
     decoder = GopDecoder(HEIGHT, WIDTH)
     with pytest.raises(CorruptDataError):
         decoder.decode(units[1:3], [0, 1], FULL, np.empty((2, HEIGHT, WIDTH, 3), np.uint8))

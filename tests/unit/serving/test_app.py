@@ -153,9 +153,14 @@ async def test_the_answer_to_many_mistakes_is_short():
 
 def operation_of(app: FastAPI, path: str, method: str) -> tuple[dict, dict[str, str]]:
     """An operation of the OpenAPI document, and the media types of its responses by status."""
-    operation = app.openapi()["paths"][path][method]
-    answers = operation["responses"].items()
-    return operation, {status: "".join(answer.get("content", "")) for status, answer in answers}
+    document = app.openapi()
+    operation, refused = document["paths"][path][method], document["components"]["responses"]
+    answers = {
+        status: refused[answer["$ref"].rpartition("/")[2]] if "$ref" in answer else answer
+        for status, answer in operation["responses"].items()
+    }
+    kinds = {status: "".join(answer.get("content", "")) for status, answer in answers.items()}
+    return operation, kinds
 
 
 def test_the_document_has_what_routes_declare():

@@ -15,7 +15,7 @@ from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
 from structlog.testing import capture_logs
 
 from dextouch.serving import AS_SET, OCTETS, ServiceSettings, create_service_app, server_options
-from dextouch.serving.connections import MAX_REFUSED
+from dextouch.serving.connections import MAX_REFUSED, accept_messages_of
 from dextouch.serving.guard import takes
 
 TIMEOUT_S = 0.4
@@ -63,6 +63,14 @@ class Served:
                 while True:
                     await websocket.send_bytes(bytes(MIB))
             self.ended.append("flow")
+
+        @router.websocket("/inbox")
+        async def inbox(websocket: WebSocket) -> None:
+            await websocket.accept()
+            accept_messages_of(websocket, MIB)
+            with suppress(WebSocketDisconnect):
+                while True:
+                    await websocket.send_text(str(len(await websocket.receive_bytes())))
 
         limits = {"client_timeout_s": TIMEOUT_S, "max_connections": MAX_CONNECTIONS} | settings
         made = ServiceSettings.model_validate(limits)
@@ -280,10 +288,71 @@ def test_what_is_no_http_leaves_one_line_with_its_client(served):
 @pytest.mark.parametrize("asked", ["large", "flow"])
 def test_a_client_that_does_not_read_is_cut_off(served, asked):
     first = UPGRADE if asked == "flow" else GET.replace(b"/healthz", b"/v1/large")
-    with served.connect(first + b"\r\n"):
-        while not served.server.server_state.tasks:
-            time.sleep(0.01)
+    with served.connect(first + b"\r\n") as opened:
+        assert opened.recv(1)
         served.until_none_is_left()
+
+
+def frame(kind, data, *, num_bytes=None):
+    """A frame (RFC 6455, 5.2) masked with zeros; of one of `num_bytes` the rest is missing."""
+    length = (num_bytes or len(data)).to_bytes(2, "big")
+    return bytes([kind, 0x80 | 126]) + length + bytes(4) + data
+
+
+BEGIN, REST, LAST, PING, BINARY = 0x02, 0x00, 0x80, 0x89, 0x82
+PINGS = bytes([PING, 0x80 | 125, *bytes(4), *bytes(125)]) * 10
+
+
+def inbox(served):
+    opened = served.connect(UPGRADE.replace(b"/v1/flow", b"/v1/inbox"))
+    opened.sendall(b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n")
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        head += opened.recv(1)
+    assert head.startswith(b"HTTP/1.1 101")
+    # A message that is small on the way may not be large in memory.
+    assert b"deflate" not in head.lower()
+    return opened
+
+
+@pytest.mark.parametrize(
+    ("first", "piece"),
+    [
+        (frame(BEGIN, b"a"), frame(REST, b"a")),
+        (frame(BEGIN, b"a" * 1000), PINGS),
+        (frame(BINARY, b"a", num_bytes=60_000), b"a"),
+    ],
+    ids=["frames", "pings", "one frame"],
+)
+def test_a_message_that_does_not_end_is_cut_off(served, first, piece):
+    with inbox(served) as opened:
+        opened.settimeout(0.01)
+        opened.sendall(first)
+        deadline_s = time.monotonic() + 10 * TIMEOUT_S + 2
+        with suppress(ConnectionError):
+            while time.monotonic() < deadline_s:
+                opened.sendall(piece)
+                with suppress(TimeoutError):
+                    # Answers to pings, or the end.
+                    if not opened.recv(2**16):
+                        break
+                time.sleep(0.02)
+            else:
+                pytest.fail("its message is waited for")
+    served.until_none_is_left()
+
+
+def test_long_messages_in_many_frames_arrive_and_silence_between_them_is_no_mistake(served):
+    with inbox(served) as opened:
+        for _ in range(2):
+            opened.sendall(frame(BEGIN, b"a"))
+            for _ in range(40):
+                # 40 KiB/s for longer than a slow client may take.
+                opened.sendall(frame(REST, bytes(1024)))
+                time.sleep(0.025)
+            opened.sendall(frame(LAST, b"a"))
+            assert opened.recv(100)[2:] == b"40962"
+            time.sleep(2 * TIMEOUT_S)
 
 
 @pytest.mark.long

@@ -89,7 +89,8 @@ def test_the_body_is_documented_with_its_parts(app):
     document = app.openapi()
     body = document["paths"]["/v1/marks"]["post"]["requestBody"]
     assert body["required"]
-    fields = body["content"]["application/json"]["schema"]["properties"]
+    assert body["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Marks"}
+    fields = document["components"]["schemas"]["Marks"]["properties"]
     reference = fields["marks"]["additionalProperties"]["$ref"]
     assert reference == "#/components/schemas/Mark"
     assert document["components"]["schemas"]["Mark"]["properties"]["count"]["minimum"] == 0

@@ -9,7 +9,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from dextouch.clients import RolloutClient
-from dextouch.worlds import WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
+from dextouch.worlds.openpi import largest_message
+from services.pipelines.servers import served as serve
 from tests.unit.worlds import fakes
 from tests.unit.worlds.running import served
 
@@ -51,7 +53,8 @@ class Client:
 def opened(url, key=None):
     headers = {"Authorization": f"Api-Key {key}"} if key else None
     address = url.replace("http", "ws") + "/v1/openpi"
-    with connect(address, compression=None, additional_headers=headers, proxy=None) as connection:
+    given = {"compression": None, "max_size": None, "additional_headers": headers, "proxy": None}
+    with connect(address, **given) as connection:
         yield Client(connection)
 
 
@@ -151,7 +154,7 @@ def test_a_refused_message_changes_nothing(url, message, error):
     [
         ("hello", "got text"),
         (b"\xc1", "not msgpack"),
-        (b"\0" * 100_000, "got 100000 bytes, expected at most 65536"),
+        (b"\0" * 100_000, "got 100000 bytes, expected at most 68480"),
     ],
 )
 def test_what_is_no_message_is_answered(url, message, error):
@@ -160,6 +163,77 @@ def test_what_is_no_message_is_answered(url, message, error):
         with pytest.raises(RuntimeError, match=error):
             client.receive()
         assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
+
+
+def camera_message(size_px, cameras, dtype=">f8"):
+    """A start from images, in the byte order of another machine."""
+    rng = np.random.default_rng(0)
+    images = {
+        f"image/{camera}": rng.integers(0, 255, (1, size_px, size_px, 3), np.uint8)
+        for camera in cameras
+    }
+    poses = {name: np.eye(4) for name in ANCHOR_NAMES} | {"K_head": np.diag([300.0, 300.0, 1.0])}
+    touch = {"tactile_kpa": rng.random((1, 2, 320)).astype("<f4")}
+    arrays = poses | {"action_reached": fakes.actions(1)}
+    arrays = {name: array.astype(dtype) for name, array in arrays.items()} | images | touch
+    return {"start": START | {"world": "copy-first"}, "observation": FIRST, **arrays}
+
+
+# What a robot with three cameras of 448 px sends: 1.8 MB.
+BIG_PX, BIG_CAMERAS = 448, ("camera_head", "camera_wrist_left", "camera_wrist_right")
+ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
+FIRST = {"first_step": 0, "reached_is_measured": True}
+
+
+@pytest.fixture(scope="module")
+def camera_url():
+    """Served with the limits of our own servers, by key."""
+    world = CopyFirstWorld(
+        tasks=("stand_bottle",),
+        cameras=BIG_CAMERAS,
+        image_height_px=BIG_PX,
+        image_width_px=BIG_PX,
+        model_rate_hz=15.0,
+    )
+    keys = ({"name": "policy", "key": KEY, "scopes": ["rollout"]},)
+    settings = WorldServiceSettings.model_validate({"api_keys": keys})
+    with serve({"worlds": create_world_app({"copy-first": world}, settings)}) as urls:
+        yield urls["worlds"]
+
+
+def test_a_rollout_starts_from_images_that_its_world_needs(camera_url):
+    message = camera_message(BIG_PX, BIG_CAMERAS)
+    with opened(camera_url, KEY) as client:
+        seen = client.infer(message | {"return": {"cameras": ["camera_wrist_right"]}})
+        np.testing.assert_array_equal(
+            seen["image/camera_wrist_right"], message["image/camera_wrist_right"]
+        )
+        np.testing.assert_array_equal(seen["action_reached"], message["action_reached"])
+        assert client.infer({"actions": fakes.actions(4)})["rollout"]["next_chunk"] == 1
+        del message["observation"]
+        with pytest.raises(RuntimeError, match="without 'observation'"):
+            client.infer(message)
+        # Arrays belong to a start.
+        with pytest.raises(RuntimeError, match="got the keys actions, extra"):
+            client.infer({"actions": fakes.actions(4), "extra": np.zeros(3)})
+        # More than one observation of this world is not read.
+        client.connection.send(b"\0" * 2_000_000)
+        with pytest.raises(ConnectionClosed) as caught:
+            client.receive()
+        assert caught.value.rcvd.code == 1009
+
+
+def test_the_limit_of_a_message_is_what_worlds_need():
+    def limit(max_body_bytes=2**24, **changed):
+        world = fakes.SumWorld().description.model_copy(update=changed)
+        return largest_message([world], max_body_bytes=max_body_bytes)
+
+    assert limit(starts_from=("task_seed",)) == 2**16
+    # Two cameras of 8 px, two hands of 320 taxels as float32.
+    assert limit() == 2**16 + 2 * 8 * 8 * 3 + 2 * 320 * 4
+    assert limit(image_height_px=10_000) == 2**16 + 2 * 10_000 * 8 * 3 + 2 * 320 * 4
+    assert limit(image_height_px=10_000, max_body_bytes=2**18) == 2**18
+    assert limit(scales_images=True) == 2**24
 
 
 def test_a_key_with_the_scope_is_needed_where_keys_are_set():

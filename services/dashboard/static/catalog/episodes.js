@@ -6,6 +6,7 @@ import { pagePath } from "../session.js";
 import { startTheme } from "../theme.js";
 import { get, getIfServed, newestJobs, post } from "./api.js";
 import * as cells from "./cells.js";
+import { ExportDialog } from "./export.js";
 import { Grid } from "./grid.js";
 import { listen, say, showSelected } from "./grid_keys.js";
 import { showLineage } from "./lineage.js";
@@ -242,6 +243,7 @@ const KEYS = {
   z: () => restore(lastMoved),
   g: align,
   l: () => query.view !== "trash" && chosen().length && showLineage(find("lineage_dialog"), lineageSubject()),
+  e: () => query.view !== "trash" && exporting.open(query, grid.selected.size ? chosen().map(({ item }) => item) : []),
   escape: () => { endDeletion(); say(""); grid.select([...grid.selected], false); },
   arrowleft: () => query.page > 1 && go({ page: query.page - 1 }),
   arrowright: () => query.page * PAGE_ROWS < total && go({ page: query.page + 1 }),
@@ -253,6 +255,7 @@ function lineageSubject() {
   return row.item.kind === "recording" ? { kind: "recording", id: row.item.id } : subjectOf(row.item);
 }
 
+const exporting = new ExportDialog(find("export_dialog"));
 const grid = new Grid(find("rows"), { onChange: () => showSelection(), onOpen: open });
 let typed = null;
 form.addEventListener("input", (event) => {
@@ -268,7 +271,7 @@ for (const tab of document.querySelectorAll("[data-view-tab]")) tab.addEventList
 for (const head of document.querySelectorAll("[data-sort]")) {
   head.addEventListener("click", () => go({ sort: head.dataset.sort, descending: head.dataset.sort === query.sort ? !query.descending : ["time", "duration", "findings"].includes(head.dataset.sort) }));
 }
-listen(grid, { form, actions: KEYS, buttons: [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"]] });
+listen(grid, { form, actions: KEYS, buttons: [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"], ["export", "e"]] });
 window.addEventListener("popstate", () => { query = readQuery(location.search); showQuery(); refresh(); });
 document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
 setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);

@@ -41,7 +41,7 @@ export function isFiltered({ filters }) {
 }
 
 // Midnight of a day here, days later, with its zone.
-function midnight(day, daysLater = 0) {
+export function midnight(day, daysLater = 0) {
   const [year, month, date] = day.split("-").map(Number);
   return new Date(year, month - 1, date + daysLater).toISOString();
 }

@@ -1,5 +1,7 @@
 // Facts about the item: what was done by whom, how it ended, its quality, clocks, lineage and exports.
 
+import { downloadControl } from "../catalog/download.js";
+import { commandLine } from "../command.js";
 import { element, levelBadge } from "../dom.js";
 import { number } from "../format.js";
 import { pagePath } from "../session.js";
@@ -83,29 +85,15 @@ function lineage(nodes) {
     ...others.map((node) => element("li", {}, `${RELATIONS[node.relation]} ${node.kind} `, link(node), node.summary ? element("span", { class: "quiet" }, ` ${node.summary}`) : null))));
 }
 
-function command(text) {
-  const copy = element("button", { type: "button", class: "plain" }, "Copy");
-  const code = element("code", {}, text);
-  copy.addEventListener("click", async () => {
-    try {
-      await navigator.clipboard.writeText(text);
-      copy.textContent = "Copied";
-    } catch {
-      // Pages that are not served from loopback or by HTTPS have no clipboard.
-      getSelection().selectAllChildren(code);
-      copy.textContent = "Selected";
-    }
-  });
-  return element("p", { class: "command" }, code, copy);
-}
-
 function exports({ kind, id }) {
   const of_kind = kind === "recording" ? "--kind recording " : "";
+  const command = (format) => `dextouch export --format ${format} ${of_kind}${id} --to ${id}.${format}`;
   return wideBlock("Open in other tools",
-    element("p", {}, "Foxglove: export, open the file, and import ", element("a", { href: "/static/player/foxglove_layout.json", download: "dextouch_layout.json" }, "this layout"), "."),
-    command(`dextouch export --format mcap ${of_kind}${id} --to ${id}.mcap`),
+    element("p", {}, "Foxglove: download or export, open the file, and import ", element("a", { href: "/static/player/foxglove_layout.json", download: "dextouch_layout.json" }, "this layout"), "."),
+    downloadControl(() => ({ items: [{ kind, id }] })),
+    commandLine(command("mcap")).node,
     element("p", {}, "Rerun: export and open; the file contains its layout."),
-    command(`dextouch export --format rrd ${of_kind}${id} --to ${id}.rrd && rerun ${id}.rrd`));
+    commandLine(`${command("rrd")} && rerun ${id}.rrd`).node);
 }
 
 export async function showFacts(root, item) {

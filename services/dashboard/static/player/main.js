@@ -4,6 +4,7 @@ import { element, setText } from "../dom.js";
 import { drawScale } from "../hands.js";
 import { ask } from "../session.js";
 import { startTheme } from "../theme.js";
+import { Editing } from "./editing.js";
 import { outcomeBadge, showFacts } from "./facts.js";
 import { Item } from "./item.js";
 import { Player } from "./player.js";
@@ -28,6 +29,7 @@ async function open() {
   setText(find("scale_end"), isRaw ? "largest count" : `${heatmap.full_scale_kpa} kPa`);
   const player = new Player(item, heatmap, parseState(location.search));
   showFacts(find("facts"), item);
+  new Editing(player);
   return player;
 }
 

@@ -31,6 +31,7 @@ export class Timeline {
     this.ruler = element("div", { class: "ruler" });
     this.head = element("div", { class: "playhead" });
     this.over = element("div", { class: "over" }, this.head);
+    this.marks = [];
     this.lanes = [...item.streams.values()].map((stream) => this.lane(stream));
     root.append(element("div", { class: "lane ruler_row" }, element("span", { class: "lane_name" }), this.ruler, element("span", { class: "lane_note" })),
       element("div", { class: "lanes" }, ...this.lanes.map(({ row }) => row)), this.over);
@@ -118,7 +119,19 @@ export class Timeline {
     return Math.min(Math.max((t_ns - this.range[0]) / (this.range[1] - this.range[0]), 0), 1);
   }
 
+  // Marks {span_ns, node} over all lanes, in place of the earlier ones.
+  setMarks(marks) {
+    for (const { node } of this.marks) node.remove();
+    this.marks = marks;
+    this.over.prepend(...marks.map(({ node }) => node));
+    this.draw();
+  }
+
   draw() {
+    for (const { span_ns, node } of this.marks) {
+      node.hidden = span_ns[1] < this.range[0] || span_ns[0] > this.range[1];
+      place(node, ...span_ns.map((t_ns) => this.share(t_ns)));
+    }
     const marks = ticks(...this.range, Math.max(2, (this.ruler.clientWidth || 800) / PX_PER_TICK));
     this.ruler.replaceChildren(...marks.at_ns.map((t_ns) => {
       const mark = element("span", {}, tickText(t_ns, marks.step_ns));

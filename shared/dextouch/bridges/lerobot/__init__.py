@@ -1,6 +1,21 @@
-"""LeRobotDataset v3.0 import and export."""
+"""Import of LeRobotDataset v2 and v3, and export of v3.0."""
 
-from dextouch.bridges.lerobot.exporting import ExportOptions, export_lerobot
-from dextouch.bridges.lerobot.importing import ImportOptions, import_lerobot
+from dextouch.bridges.lerobot.exporting import (
+    DatasetExport,
+    ExportOptions,
+    export_dataset,
+    export_lerobot,
+)
+from dextouch.bridges.lerobot.importing import DatasetImport, import_dataset, import_lerobot
+from dextouch.bridges.lerobot.recordings import ImportOptions
 
-__all__ = ["ExportOptions", "ImportOptions", "export_lerobot", "import_lerobot"]
+__all__ = [
+    "DatasetExport",
+    "DatasetImport",
+    "ExportOptions",
+    "ImportOptions",
+    "export_dataset",
+    "export_lerobot",
+    "import_dataset",
+    "import_lerobot",
+]

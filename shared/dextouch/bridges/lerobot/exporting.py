@@ -1,6 +1,7 @@
 """Export of episodes to a LeRobotDataset v3.0 folder, which appears complete or not at all."""
 
 import json
+import math
 import re
 import shutil
 import sys
@@ -15,8 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dextouch.bridges.exporting import BLOCK_IMAGES
+from dextouch.bridges.exporting import BLOCK_IMAGES, replace_folder
 from dextouch.bridges.lerobot import layout
+from dextouch.bridges.lerobot.appending import ExistingDataset
+from dextouch.bridges.lerobot.card import check_license, write_card
 from dextouch.bridges.lerobot.layout import (
     EpisodeFrames,
     Statistics,
@@ -35,11 +38,6 @@ from dextouch.tactile.layout import common_layout
 ROWS_AT_ONCE: Final = 100
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
-CARD: Final = (
-    "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
-    f"---\n\n# {{}}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from DexTouch "
-    "episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
-)
 # Of video that has to be encoded.
 VIDEO = VideoSettings(crf=23, preset="veryfast")
 GROUP_IMAGES: Final = 2
@@ -51,14 +49,34 @@ class ExportOptions:
 
     `fps`: frames a second, a whole number; without it the model rate of the first episode.
     `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
-    own rate; without it all image streams of the first episode, the head's first.
+    own rate; without it all image streams of the first episode, the head's first. `touch_samples`:
+    also every touch sample since the frame before. `license_name`: identifier of the Hub for the
+    dataset's card. `existing`: what to do where the folder is a dataset already: refuse, replace
+    it, or append the episodes to it.
     """
 
     fps: int | None = None
     cameras: tuple[str, ...] | None = None
+    touch_samples: bool = False
+    license_name: str | None = None
+    existing: Literal["refuse", "replace", "append"] = "refuse"
 
 
 DEFAULTS = ExportOptions()
+
+
+@dataclass(frozen=True)
+class DatasetExport:
+    """Result of an export; of an appended one the counts are those of the new episodes.
+
+    `present` are episodes that the dataset had already, `num_touch_left_out` touch samples that did
+    not fit into their frame (`ExportOptions.touch_samples`).
+    """
+
+    num_episodes: int
+    num_frames: int
+    present: tuple[str, ...] = ()
+    num_touch_left_out: int = 0
 
 
 def export_lerobot(
@@ -68,37 +86,75 @@ def export_lerobot(
     repo_id: str,
     options: ExportOptions = DEFAULTS,
 ) -> int:
-    """Write episodes as one LeRobotDataset v3.0 and return the number of frames.
+    """Write episodes as one LeRobotDataset, as `export_dataset`; returns the number of frames."""
+    return export_dataset(readers, folder, repo_id=repo_id, options=options).num_frames
+
+
+def export_dataset(
+    readers: Iterable[EpisodeReader],
+    folder: Path,
+    *,
+    repo_id: str,
+    options: ExportOptions = DEFAULTS,
+) -> DatasetExport:
+    """Write episodes as one LeRobotDataset v3.0, which appears complete or not at all.
 
     Readers are opened one at a time, in the order of the dataset. `repo_id` is its name,
-    `user/name`.
+    `user/name`. A dataset that is replaced or appended to stays as it was until the new one is
+    complete; files that an appended one keeps are not copied.
 
     Raises:
-        ConflictError: the folder exists.
+        ConflictError: the folder exists, is no dataset, or was changed meanwhile.
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
             one dataset, such as with a camera that one of them lacks.
         ShapeError: images with an odd side.
-        CorruptDataError, StorageError: a damaged episode; the write failed.
+        CorruptDataError, StorageError: a damaged episode or dataset; the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
-    if folder.exists():
-        raise ConflictError(f"{folder}: exists already; choose another folder")
+    check_license(options.license_name)
+    before = _existing(folder, options)
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
     dataset: _Dataset | None = None
+    present: list[str] = []
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, partial, ignore_errors=True)
         for reader in readers:
+            if before is not None and reader.content_sha256 in before.content_sha256:
+                present.append(reader.item_id)
+                continue
             if dataset is None:
-                dataset = _Dataset(partial, reader, options)
+                dataset = _Dataset(partial, reader, options, before)
                 stack.callback(dataset.close)
             dataset.add(reader)
         if dataset is None:
+            if present:
+                return DatasetExport(0, 0, tuple(present))
             raise InvalidInputError("export to LeRobot: got no episode, expected at least one")
-        dataset.finish(repo_id)
-        with disk_errors(f"complete {folder}"):
-            partial.rename(folder)
-    return dataset.num_frames
+        dataset.finish(repo_id, options.license_name)
+        if before is not None:
+            before.check_unchanged()
+        if folder.exists():
+            replace_folder(partial, folder)
+        else:
+            with disk_errors(f"complete {folder}"):
+                partial.rename(folder)
+    return dataset.result(tuple(present))
+
+
+def _existing(folder: Path, options: ExportOptions) -> ExistingDataset | None:
+    """The dataset to append to; raises ConflictError where the folder must not be changed."""
+    if not folder.exists():
+        return None
+    if options.existing == "refuse":
+        raise ConflictError(
+            f"{folder}: exists already; choose another folder, or add --append or --force"
+        )
+    if not (folder / layout.INFO_FILE).is_file():
+        raise ConflictError(
+            f"{folder}: is not a LeRobot data set, so --force and --append leave it as it is"
+        )
+    return ExistingDataset.read(folder) if options.existing == "append" else None
 
 
 def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
@@ -118,9 +174,11 @@ def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) ->
 class _ParquetFiles:
     """Numbered parquet files of one kind; each table becomes a row group."""
 
-    def __init__(self, folder: Path, template: str, *, file_bytes: int = sys.maxsize) -> None:
+    def __init__(
+        self, folder: Path, template: str, *, file_bytes: int = sys.maxsize, first_file: int = 0
+    ) -> None:
         self._folder, self._template, self._file_bytes = folder, template, file_bytes
-        self._path, self._number = folder, -1
+        self._path, self._number = folder, first_file - 1
         self._writer: pq.ParquetWriter | None = None
 
     def append(self, table: pa.Table) -> int:
@@ -144,10 +202,17 @@ class _ParquetFiles:
 class _Dataset:
     """Writes a new dataset episode by episode; `finish` writes the metadata.
 
-    The first episode decides about cameras, and whether actions are commanded ones.
+    The first episode decides about cameras, and whether actions are commanded ones. With `before`
+    the episodes follow those of that dataset, whose files it takes over.
     """
 
-    def __init__(self, folder: Path, first: EpisodeReader, options: ExportOptions) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        first: EpisodeReader,
+        options: ExportOptions,
+        before: ExistingDataset | None,
+    ) -> None:
         rate_hz, streams = first.attributes.model_rate_hz, first.streams
         if options.fps is None and rate_hz != round(rate_hz):
             raise InvalidInputError(
@@ -165,24 +230,42 @@ class _Dataset:
         self._has_measured = "action_commanded" in streams
         shapes = {name: streams[name].shape for name in self._cameras}
         self._tactile_layout = first.tactile_layout
+        self._num_samples = _num_samples(first, self._cameras, self.fps, options, before)
         self._features = layout.dataset_features(
             shapes,
             self.fps,
             has_measured=self._has_measured,
             num_taxels=self._tactile_layout.num_taxels,
+            num_samples=self._num_samples,
         )
-        self.num_frames = self._num_episodes = 0
+        self.num_frames = self._num_episodes = self._num_left_out = 0
         self._tasks: dict[str, int] = {}
         self._total: dict[str, Statistics] = {}
+        self._before = before
         with disk_errors(f"create {folder}"):
             folder.mkdir(parents=True)
-        self._data = _ParquetFiles(folder, layout.DATA_PATH, file_bytes=layout.DATA_FILE_MB << 20)
-        self._episodes = _ParquetFiles(folder, layout.EPISODES_PATH)
+        if before is not None:
+            before.check_fits(self._features, self.fps)
+            before.link_into(folder)
+            self.num_frames, self._num_episodes = before.num_frames, len(before.source.episodes)
+            self._tasks = {text: number for number, text in before.source.tasks.items()}
+            self._total = dict(before.statistics)
+        size = layout.DATA_FILE_MB << 20
+        data, rows = (self._next_file(one) for one in (layout.DATA_PATH, layout.EPISODES_PATH))
+        self._data = _ParquetFiles(folder, layout.DATA_PATH, file_bytes=size, first_file=data)
+        self._episodes = _ParquetFiles(folder, layout.EPISODES_PATH, first_file=rows)
+        self._rows_place = layout.file_place(rows)
         self._rows: list[dict[str, Any]] = []
-        self._videos = {
-            camera: CameraVideo(folder, layout.IMAGES + camera, fps=self.fps, shape=shape)
-            for camera, shape in shapes.items()
-        }
+        self._videos = {}
+        for camera, shape in shapes.items():
+            key = layout.IMAGES + camera
+            number = self._next_file(layout.VIDEO_PATH, video_key=key)
+            self._videos[camera] = CameraVideo(
+                folder, key, fps=self.fps, shape=shape, first_file=number
+            )
+
+    def _next_file(self, template: str, **values: str) -> int:
+        return 0 if self._before is None else self._before.next_file(template, **values)
 
     def add(self, reader: EpisodeReader) -> None:
         _check_cameras(reader, self._cameras)
@@ -196,8 +279,9 @@ class _Dataset:
         common_layout([self._tactile_layout, reader.tactile_layout], what=f"dataset, {where}")
         row: dict[str, Any] = {"episode_index": self._num_episodes, "length": len(frames)}
         row["tasks"] = [attributes.instruction or attributes.task]
-        task_index = self._tasks.setdefault(row["tasks"][0], len(self._tasks))
-        columns = self._columns(frames, task_index)
+        next_task = max(self._tasks.values(), default=-1) + 1
+        task_index = self._tasks.setdefault(row["tasks"][0], next_task)
+        columns = self._columns(frames, task_index, self._touch_samples(reader, frames))
         statistics = {name: value_statistics(column) for name, column in columns.items()}
         how: dict[str, Literal["remuxed", "encoded"]] = {}
         for camera in self._cameras:
@@ -218,7 +302,7 @@ class _Dataset:
         for name, values in statistics.items():
             self._total[name] = combine(self._total.get(name), values)
             row.update({f"stats/{name}/{kind}": value.tolist() for kind, value in values.items()})
-        row["meta/episodes/chunk_index"] = row["meta/episodes/file_index"] = 0
+        row["meta/episodes/chunk_index"], row["meta/episodes/file_index"] = self._rows_place
         sidecar = layout.Sidecar(
             episode_index=self._num_episodes,
             content_sha256=reader.content_sha256,
@@ -245,9 +329,20 @@ class _Dataset:
         images = (image for block in blocks for image in reader.images_at(camera, block))
         return encode_images(images, self.fps, VIDEO, GROUP_IMAGES), "encoded"
 
-    def _columns(self, frames: EpisodeFrames, task_index: int) -> dict[str, np.ndarray]:
+    def _touch_samples(self, reader: EpisodeReader, frames: EpisodeFrames) -> dict[str, np.ndarray]:
+        if not self._num_samples:
+            return {}
+        touch = layout.touch_samples(reader, frames.columns[layout.STAMP], self._num_samples)
+        excess = touch[layout.SAMPLES_COUNT] - self._num_samples
+        self._num_left_out += int(excess.clip(0).sum())
+        return touch
+
+    def _columns(
+        self, frames: EpisodeFrames, task_index: int, touch: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
         frame_index = np.arange(len(frames), dtype=np.int64)
         columns = frames.columns | {
+            **touch,
             "timestamp": (frame_index / self.fps).astype(np.float32),
             "frame_index": frame_index,
             "episode_index": np.full_like(frame_index, self._num_episodes),
@@ -265,10 +360,21 @@ class _Dataset:
 
     def _write_rows(self) -> None:
         if self._rows:
-            self._episodes.append(pa.Table.from_pylist(self._rows))
+            table = pa.Table.from_pylist(self._rows)
+            if self._before is not None:
+                self._before.check_columns(table.column_names)
+            self._episodes.append(table)
             self._rows = []
 
-    def finish(self, repo_id: str) -> None:
+    def result(self, present: tuple[str, ...]) -> DatasetExport:
+        """The counts of the new episodes."""
+        num_frames, num_episodes = self.num_frames, self._num_episodes
+        if self._before is not None:
+            num_frames -= self._before.num_frames
+            num_episodes -= len(self._before.source.episodes)
+        return DatasetExport(num_episodes, num_frames, present, self._num_left_out)
+
+    def finish(self, repo_id: str, license_name: str | None) -> None:
         """Complete the files and write the metadata; raises StorageError if the write failed."""
         self.close()
         self._write_tasks()
@@ -278,7 +384,8 @@ class _Dataset:
         }
         for name, content in ((layout.STATS_FILE, statistics), (layout.INFO_FILE, self._info())):
             self._write(name, json.dumps(content, indent=4, allow_nan=False) + "\n")
-        self._write(layout.CARD_FILE, CARD.format(repo_id))
+        with disk_errors(f"write the card of {self._folder}"):
+            write_card(self._folder, repo_id=repo_id, license_name=license_name)
 
     def _write_tasks(self) -> None:
         """A table whose pandas index is the task's text."""
@@ -288,7 +395,7 @@ class _Dataset:
             for n, (p, d) in kinds.items()
         ]
         header = {"index_columns": ["task"], "column_indexes": [], "columns": described}
-        numbers = pa.array(np.arange(len(self._tasks), dtype=np.int64))
+        numbers = pa.array(np.array(list(self._tasks.values()), dtype=np.int64))
         texts = pa.array(list(self._tasks), pa.string())
         table = pa.Table.from_pydict({"task_index": numbers, "task": texts})
         path = self._folder / layout.TASKS_FILE
@@ -297,7 +404,8 @@ class _Dataset:
             pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(header)}), path)
 
     def _info(self) -> dict[str, Any]:
-        return {
+        known: dict[str, Any] = {} if self._before is None else self._before.info
+        new = {
             "codebase_version": layout.CODEBASE_VERSION,
             "fps": self.fps,
             "features": self._features,
@@ -312,12 +420,46 @@ class _Dataset:
             "robot_type": "dextouch",
             "splits": {"train": f"0:{self._num_episodes}"},
         }
+        counts = {key: new[key] for key in new if key.startswith(("total_", "splits"))}
+        return new | known | counts
 
     def _write(self, name: str, text: str) -> None:
         path = self._folder / name
         with disk_errors(f"write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
+
+
+def _num_samples(
+    first: EpisodeReader,
+    cameras: tuple[str, ...],
+    fps: int,
+    options: ExportOptions,
+    before: ExistingDataset | None,
+) -> int:
+    """Touch samples that a frame has room for; 0 without any.
+
+    It is as many as a frame of the first episode has, and half as many more as nominal rates give.
+    """
+    if before is not None:
+        feature = before.info["features"].get(layout.SAMPLES)
+        if (feature is None) == options.touch_samples:
+            raise InvalidInputError(
+                f"{before.source.folder}: its frames have {'no' if feature is None else 'all'} "
+                f"touch samples; append {'without' if feature is None else 'with'} "
+                "--touch-samples, or export into a new folder"
+            )
+        return int(feature["shape"][0]) if feature is not None else 0
+    if not options.touch_samples:
+        return 0
+    rates_hz = [one.nominal_rate_hz for one in first.streams.values() if one.kind == "tactile"]
+    if not rates_hz:
+        raise InvalidInputError(
+            f"episode {first.attributes.episode_id!r}: has no touch; export without --touch-samples"
+        )
+    t_ns = frames_of(first, cameras, fps).columns[layout.STAMP]
+    most = int(layout.touch_counts(first, t_ns).max())
+    return max(most, math.ceil(1.5 * max(rates_hz) / fps))
 
 
 def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:

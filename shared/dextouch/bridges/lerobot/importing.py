@@ -1,38 +1,65 @@
-"""Import of LeRobotDataset v3 folders as episodes of the store."""
+"""Import of LeRobot datasets: those with our actions as episodes, all others as recordings."""
 
-import hashlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from itertools import islice
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32, Int64
 from pydantic import ValidationError
 
-from dextouch.bridges.exporting import BLOCK_IMAGES
+from dextouch.bridges.foreign import (
+    MAX_ID,
+    ForeignStream,
+    ImageUnit,
+    ImportedStream,
+    ImportReport,
+    Refused,
+    file_sha256,
+    stream_names,
+)
 from dextouch.bridges.lerobot import layout
+from dextouch.bridges.lerobot.feature_streams import (
+    COUNTERS,
+    TASK_INDEX,
+    Frames,
+    camera_stream,
+    feature_streams,
+)
 from dextouch.bridges.lerobot.layout import WORLD
-from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
-from dextouch.bridges.lerobot.video import VideoSpan, read_images, read_units
-from dextouch.episodes import GOP_IMAGES, EpisodeStore, EpisodeWriter, disk_errors, is_keyframe
-from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
+from dextouch.bridges.lerobot.recordings import (
+    ImportOptions,
+    dataset_contradictions,
+    dataset_id,
+    recordings_importer,
+)
+from dextouch.bridges.lerobot.source import (
+    DatasetInfo,
+    EpisodeEntry,
+    FeatureInfo,
+    LeRobotFolder,
+    whole_text,
+)
+from dextouch.episodes import EpisodeStore, Kind
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    UnknownNameError,
+)
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import (
-    Domain,
+    MAX_INSTRUCTION,
     EpisodeAttributes,
     LineageEntry,
-    Matrix,
     StoredAnchor,
     first_problems,
 )
-from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor, StreamKind
 from dextouch.tactile.layout import DEXTOUCH_V1, SIDES, TactileLayout
 
-ImageUnit = Literal["h264", "jpeg", "rgb8"]
-HEAD = "camera_head"
 TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
 _CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
 # Usual feature of a role, and the shape of its rows; -1 is the number of taxels.
@@ -50,69 +77,174 @@ _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
 }
 
 
-@dataclass(frozen=True)
-class ImportOptions:
-    """Options of an import: information that the dataset itself lacks.
+DEFAULTS = ImportOptions()
 
-    `mapping`: our name → the dataset's feature, for features under other names: `action`, `state`,
-    `tactile` and cameras (`camera_head`, `camera_wrist_left`, …). `id_prefix`: put before every id
-    (needed when ids exist already); `images`: the unit that images are stored in. Only for datasets
-    of other origin: `K_head` in pixels, `domain` and `task` (without it the dataset's own text).
+
+@dataclass
+class DatasetImport:
+    """Result of an import: what was written under which ids, and what was not.
+
+    `reports` has one for each id; those of our own exports list no streams. `present` are the ids
+    of what the store had from the same files, and `failed` the errors of the other episodes.
     """
 
-    mapping: Mapping[str, str] = field(default_factory=dict)
-    id_prefix: str = ""
-    images: ImageUnit = "h264"
-    K_head: Matrix | None = None
-    domain: Domain = "robot"
-    task: str | None = None
+    kind: Kind
+    ids: list[str] = field(default_factory=list)
+    present: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    reports: list[ImportReport] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
+    def as_json(self) -> dict[str, object]:
+        """Plain JSON values."""
+        return asdict(self)
 
-DEFAULTS = ImportOptions()
+    def lines(self) -> Iterator[str]:
+        """The result for a terminal: all of the first recording, of others what is new."""
+        for line in self._lines():
+            yield "".join(one if one.isprintable() else "\ufffd" for one in line)
+
+    def _lines(self) -> Iterator[str]:
+        yield from self.notes
+        told: set[str] = set()
+        for report in self.reports:
+            head, *rest = report.lines()
+            yield head if report.imported else report.recording_id
+            about = ("  refused", "  contradiction")
+            fresh = [one for one in rest if not told or one.startswith(about)]
+            yield from (one for one in fresh if one not in told)
+            told.update(rest)
+        if self.present:
+            yield f"{len(self.present)} episodes of these files are in the store already"
 
 
 def import_lerobot(
     folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
 ) -> list[str]:
-    """Write every episode of a dataset into the store and return their ids.
+    """Write every episode of a dataset into the store and return the ids, as `import_dataset`.
 
-    Each episode appears complete or not at all; after an error, earlier episodes remain. Nothing
-    outside the folder is read.
+    Raises also if some episodes fail, when the others are written: the first error.
+    """
+    result, error = _import(folder, store, options)
+    if error is not None:
+        raise error
+    return result.ids
 
-    Raises:
+
+def import_dataset(
+    folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
+) -> DatasetImport:
+    """Write every episode of a dataset into the store, as an episode or else as a recording.
+
+    Our own exports become episodes, and so do datasets with a 67-D action and a head camera.
+    Everything else becomes recordings, with a stream for each feature. Each appears complete or not
+    at all; one that fails is listed in `failed` and the next one is tried. Those that the store has
+    from the same files are skipped, so that an import can be repeated. Nothing outside the folder
+    is read.
+
+    Raises, if no episode can be imported, what the first one of them raised:
         NotFoundError: a file is missing.
         UnknownNameError: a mapping of an unknown name, or to a feature that the dataset lacks.
-        InvalidInputError: another version of the format, or features that do not fit; all are
-            listed, with what the dataset has.
+        InvalidInputError: another version of the format, or options that do not fit.
         CorruptDataError: damaged or truncated files, or paths that lead out of the folder.
         LimitExceededError: larger than the limits of this reader.
         ConflictError: an id exists already.
     """
+    result, error = _import(folder, store, options)
+    if error is not None and not (result.ids or result.present):
+        raise error
+    return result
+
+
+def _import(
+    folder: Path, store: EpisodeStore, options: ImportOptions
+) -> tuple[DatasetImport, DexTouchError | None]:
+    """What came in, and the first error of an episode."""
     source = LeRobotFolder(folder)
     first = source.sidecar(source.episodes[0]) if source.episodes else None
-    features = _map_features(source.info, options.mapping, _tactile_layout(first))
-    ids: list[str] = []
+    features, missing = _map_features(source.info, options.mapping, _tactile_layout(first))
+    if first is None and missing:
+        result = DatasetImport("recording", notes=[f"imported as recordings: {'; '.join(missing)}"])
+        write = recordings_importer(source, store, options)
+
+        def import_one(entry: EpisodeEntry) -> None:
+            report = write(entry)
+            (result.ids if report.imported else result.present).append(report.recording_id)
+            result.reports += [report] if report.imported else []
+
+        return result, _import_each(source, import_one, result)
+    if missing:
+        raise InvalidInputError(f"{folder}: an export of DexTouch that is changed: {missing}")
+    if options.fps is not None:
+        raise InvalidInputError(f"--fps: {folder} has our actions, whose rate cannot be changed")
+    for name, key in options.mapping.items():
+        is_taken = first is not None or key in features.values()
+        if is_taken and name not in {*_ROLES, *features}:
+            raise UnknownNameError(f"name of feature {key!r} (--map)", name, [*_ROLES, "camera_…"])
+    result = DatasetImport("episode")
+    about = dataset_contradictions(source)
+
+    def import_episode(entry: EpisodeEntry) -> None:
+        report = _import_episode(source, store, entry, features, options, result)
+        if report is not None:
+            report.contradictions += about
+            result.ids.append(report.recording_id)
+            result.reports.append(report)
+
+    return result, _import_each(source, import_episode, result)
+
+
+def _import_each(
+    source: LeRobotFolder, import_one: Callable[[EpisodeEntry], None], result: DatasetImport
+) -> DexTouchError | None:
+    """Try every episode once; returns the first error."""
+    first = None
     for entry in source.episodes:
-        sidecar = source.sidecar(entry)
-        content, anchor = _content(source, entry, features, sidecar)
-        if sidecar is None:
-            changes = _foreign_attributes(source, entry, anchor, features, options)
-        else:
-            changes = _known_attributes(source, anchor, sidecar, options)
         try:
-            attributes = EpisodeAttributes.model_validate(changes)
-        except ValidationError as error:
-            raise InvalidInputError(
-                f"import from LeRobot: the options make no episode ({first_problems(error)})"
-            ) from error
-        if store.exists(attributes.episode_id):
-            raise ConflictError(
-                f"episode {attributes.episode_id!r} exists already; give another "
-                "id_prefix (`dextouch import --id-prefix`)"
-            )
-        _store(store, attributes, content, options.images)
-        ids.append(attributes.episode_id)
-    return ids
+            import_one(entry)
+        except DexTouchError as error:
+            result.failed[f"episode {entry.index}"] = error.message
+            first = first or error
+    return first
+
+
+def _import_episode(
+    source: LeRobotFolder,
+    store: EpisodeStore,
+    entry: EpisodeEntry,
+    features: Mapping[str, str],
+    options: ImportOptions,
+    result: DatasetImport,
+) -> ImportReport | None:
+    sidecar = source.sidecar(entry)
+    content, anchor = _content(source, entry, features, sidecar, options.images)
+    refused: list[Refused] = []
+    if sidecar is None:
+        changes = _foreign_attributes(source, entry, anchor, options)
+        refused = _add_others(content, source, entry, features, options)
+    else:
+        changes = _known_attributes(source, anchor, sidecar, options)
+    try:
+        attributes = EpisodeAttributes.model_validate(changes)
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"import from LeRobot: the options make no episode ({first_problems(error)})"
+        ) from error
+    if store.exists(attributes.episode_id):
+        if store.open(attributes.episode_id).attributes.lineage == attributes.lineage:
+            result.present.append(attributes.episode_id)
+            return None
+        raise ConflictError(
+            f"episode {attributes.episode_id!r} exists already; give another "
+            "id_prefix (`dextouch import --id-prefix`)"
+        )
+    report = ImportReport(attributes.episode_id, whole_text(source.folder.name), refused=refused)
+    report.imported = _store(store, attributes, content, features)
+    if sidecar is not None:
+        told = [f"{one.source}: {note}" for one in report.imported for note in one.notes]
+        result.notes += [note for note in told if note not in result.notes]
+        report.imported = []
+    return report
 
 
 def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
@@ -124,13 +256,11 @@ def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
 
 def _map_features(
     info: DatasetInfo, names: Mapping[str, str], tactile: TactileLayout
-) -> dict[str, str]:
-    """The dataset's features by role; roles and cameras that it has no feature for are absent."""
-    for ours, theirs in names.items():
-        if ours not in _ROLES and not _CAMERA_NAME.fullmatch(ours):
-            raise UnknownNameError("name of a mapping", ours, [*_ROLES, "camera_…"])
+) -> tuple[dict[str, str], list[str]]:
+    """The dataset's features by role, and why it has no episodes of ours (empty if it has)."""
+    for theirs in names.values():
         if theirs not in info.features:
-            raise UnknownNameError("feature of the dataset", theirs, list(info.features))
+            raise UnknownNameError("feature of the dataset (--map)", theirs, list(info.features))
     roles: dict[str, str] = {}
     problems = []
     for ours, (usual, sizes) in _ROLES.items():
@@ -143,22 +273,17 @@ def _map_features(
             said = f"{name!r} is {_describe(got)}, expected float32 {[*shape]}" if got else ""
             problems.append(f"{ours!r}: {said or f'no feature {name!r}'}")
     cameras = _cameras(info, names)
-    if HEAD not in cameras:
-        problems.append(f"{HEAD!r}: no video feature {layout.IMAGES + HEAD!r}")
-    problems += [
-        f"{ours!r}: {name!r} is {_describe(info.features[name])}, expected video [h, w, 3]"
-        for ours, name in cameras.items()
-        if not info.features[name].is_video()
-    ]
-    if problems:
-        has = "; ".join(f"{name!r} {_describe(f)}" for name, f in info.features.items())
-        raise InvalidInputError(
-            f"LeRobot dataset does not fit: {'; '.join(problems)}. It has: {has}. Name the right "
-            "ones in Python: dextouch.bridges.lerobot.import_lerobot(folder, store, "
-            "options=ImportOptions(mapping={'camera_head': 'observation.images.top'}))",
-            missing=problems,
+    if HEAD_CAMERA not in cameras:
+        problems.append(
+            f"{HEAD_CAMERA!r}: no feature {layout.IMAGES + HEAD_CAMERA!r} "
+            f"(--map {HEAD_CAMERA}=FEATURE)"
         )
-    return roles | cameras
+    problems += [
+        f"{ours!r}: {name!r} is {_describe(info.features[name])}, expected images [h, w, 3]"
+        for ours, name in cameras.items()
+        if not info.features[name].has_colours()
+    ]
+    return roles | cameras, problems
 
 
 def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
@@ -168,10 +293,11 @@ def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
         for name, feature in info.features.items()
         if name.startswith(layout.IMAGES)
         and _CAMERA_NAME.fullmatch(name.removeprefix(layout.IMAGES))
-        and feature.dtype == "video"
+        and feature.is_camera()
         and name not in names.values()
     }
-    return own | {ours: theirs for ours, theirs in names.items() if ours not in _ROLES}
+    given = {o: t for o, t in names.items() if o not in _ROLES and _CAMERA_NAME.fullmatch(o)}
+    return own | given
 
 
 def _describe(feature: FeatureInfo) -> str:
@@ -182,14 +308,23 @@ def _describe(feature: FeatureInfo) -> str:
 class _Content:
     """Streams of an episode with one row per step.
 
-    `numbers` has the kind, unit and values of each, and which steps have one; `cameras` where the
-    images are, and their stamps. A stamp that comes twice is one image, the nearest to two steps.
+    `numbers` has the kind, unit and values of each, and which steps have one; `others` are cameras,
+    and in datasets of other origin what no role takes. A stamp that comes twice is one image, the
+    nearest to two steps.
     """
 
     t_ref_ns: Int64[np.ndarray, " n"]
     numbers: dict[str, tuple[StreamKind, str, np.ndarray, Bool[np.ndarray, " n"]]]
-    cameras: dict[str, tuple[VideoSpan, Int64[np.ndarray, " n"]]]
+    others: list[ForeignStream]
     tactile_layout: TactileLayout
+
+    def add_touch(
+        self, kpa: Float32[np.ndarray, "n 2 taxels"], valid: Bool[np.ndarray, "n 2"]
+    ) -> None:
+        """Add the streams of the hands that were sensed at any step."""
+        for hand, side in enumerate(SIDES):
+            if (keep := valid[:, hand]).any():
+                self.numbers[f"tactile_{side}"] = ("tactile", "kPa", kpa[:, hand], keep)
 
 
 def _content(
@@ -197,8 +332,9 @@ def _content(
     entry: EpisodeEntry,
     features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
+    images: ImageUnit | None,
 ) -> tuple[_Content, AnchorPoses | None]:
-    """An episode's numbers, where its videos are, and the poses that its actions are relative to.
+    """An episode's numbers, where its images are, and the poses that its actions are relative to.
 
     These are the measured ones of the first frame; None where the dataset's description gives them.
     """
@@ -211,31 +347,54 @@ def _content(
     if (np.diff(t_ns) <= 0).any():
         raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
     measured, commanded, anchor = _actions(columns, features, sidecar, where)
-    content = _Content(t_ns, {}, {}, _tactile_layout(sidecar))
+    content = _Content(t_ns, {}, [], _tactile_layout(sidecar))
     if "tactile" in features:
         valid = columns.get(layout.VALID, np.ones((entry.length, 2))).astype(bool)
-        kpa = columns[features["tactile"]].astype(np.float32)
-        for hand, side in enumerate(SIDES):
-            # Of the hands that were sensed at any step.
-            if (keep := valid[:, hand]).any():
-                content.numbers[f"tactile_{side}"] = ("tactile", "kPa", kpa[:, hand], keep)
+        content.add_touch(columns[features["tactile"]].astype(np.float32), valid)
     everywhere = np.ones(entry.length, dtype=bool)
     for name, actions in (("action", measured), ("action_commanded", commanded)):
         if actions is not None:
             content.numbers[name] = ("robot_state", "action", actions, everywhere)
+    frames = Frames(source, entry, t_ns, source.info.fps)
     for camera, key in features.items():
         if camera in _ROLES:
             continue
-        span = source.span(entry, key)
         stamps = _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where)
-        content.cameras[camera] = (span, stamps)
+        stream = camera_stream(frames, key, camera, stamps, images)
+        if isinstance(stream, str):
+            raise InvalidInputError(f"{where}: {key!r} {stream}")
+        content.others.append(stream)
     return content, anchor
 
 
+def _add_others(
+    content: _Content,
+    source: LeRobotFolder,
+    entry: EpisodeEntry,
+    features: Mapping[str, str],
+    options: ImportOptions,
+) -> list[Refused]:
+    """Add a stream of each feature that has no role, and return those that cannot be one."""
+    taken = {*features.values(), *COUNTERS, TASK_INDEX, *_OURS}
+    left = [key for key in source.info.features if key not in taken]
+    ours = [*content.numbers, *(one.descriptor.name for one in content.others)]
+    # Names of our own streams come first, so that no other gets one of them.
+    given = {name: key for name, key in options.mapping.items() if key in left}
+    names = stream_names([*ours, *left], {name: name for name in ours} | given)
+    frames = Frames(source, entry, content.t_ref_ns, source.info.fps)
+    streams, refused = feature_streams(frames, {key: names[key] for key in left}, options.images)
+    content.others.extend(streams)
+    return refused
+
+
 def _store(
-    store: EpisodeStore, attributes: EpisodeAttributes, content: _Content, images: ImageUnit
-) -> None:
-    """Write an episode into the store, atomically; `images` is the unit of the cameras."""
+    store: EpisodeStore,
+    attributes: EpisodeAttributes,
+    content: _Content,
+    features: Mapping[str, str],
+) -> list[ImportedStream]:
+    """Write an episode into the store, atomically."""
+    told = []
     with store.writer(attributes=attributes) as writer:
 
         def add(name: str, **properties: object) -> None:
@@ -246,31 +405,31 @@ def _store(
             more = {}
             if kind == "tactile" and content.tactile_layout != DEXTOUCH_V1:
                 more["layout"] = content.tactile_layout
-            add(name, kind=kind, shape=values.shape[1:], dtype=str(values.dtype), unit=unit, **more)
-            writer.append(name, values=values[keep], t_ref_ns=content.t_ref_ns[keep])
-        for name, (span, stamps_ns) in content.cameras.items():
-            add(name, kind="image", shape=span.shape, dtype="uint8", unit=images)
-            _store_images(writer, name, span, stamps_ns, images)
+            t_ns, shape, role = content.t_ref_ns[keep], values.shape[1:], name.partition("_")[0]
+            add(name, kind=kind, shape=shape, dtype=str(values.dtype), unit=unit, **more)
+            writer.append(name, values=values[keep], t_ref_ns=t_ns)
+            one = ImportedStream(name, features[role], kind, unit, shape, None)
+            told.append(_timed(one, [t_ns]))
+        for stream in content.others:
+            about, stamps = stream.descriptor, []
+            writer.add_stream(about)
+            for block in stream.blocks:
+                writer.append(about.name, values=block.values, t_ref_ns=block.t_ns)
+                stamps.append(block.t_ns)
+            one = ImportedStream(
+                about.name, stream.source, about.kind, about.unit, about.shape, about.frame
+            )
+            one.notes = tuple(stream.notes)
+            told.append(_timed(one, stamps))
+    return told
 
 
-def _store_images(
-    writer: EpisodeWriter, name: str, span: VideoSpan, stamps_ns: np.ndarray, unit: ImageUnit
-) -> None:
-    """Copy video that is H.264 in the store's groups already; encode everything else again."""
-    fresh = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) > 0
-    units = read_units(span) if unit == "h264" and fresh.all() else None
-    # The store's video is in closed groups of pictures.
-    if units and all(is_keyframe(u) == (k % GOP_IMAGES == 0) for k, u in enumerate(units)):
-        writer.append(name, values=encoded_values(units), t_ref_ns=stamps_ns)
-        return
-    images = (image for image, wanted in zip(read_images(span), fresh, strict=True) if wanted)
-    stamps_ns = stamps_ns[fresh]
-    for start in range(0, len(stamps_ns), BLOCK_IMAGES):
-        block = np.stack(list(islice(images, BLOCK_IMAGES)))
-        writer.append(name, values=block, t_ref_ns=stamps_ns[start : start + BLOCK_IMAGES])
-    # Exhausts the reader, so that a file that is too short is refused.
-    for _ in images:
-        pass
+def _timed(stream: ImportedStream, stamps_ns: Sequence[np.ndarray]) -> ImportedStream:
+    t_ns = np.concatenate(stamps_ns)
+    stream.num_samples = len(t_ns)
+    stream.duration_s = float(np.ptp(t_ns)) / 1e9
+    stream.rate_hz = (len(t_ns) - 1) / stream.duration_s if stream.duration_s else 0.0
+    return stream
 
 
 def _columns(
@@ -356,18 +515,16 @@ def _foreign_attributes(
     source: LeRobotFolder,
     entry: EpisodeEntry,
     anchor: AnchorPoses | None,
-    features: Mapping[str, str],
     options: ImportOptions,
 ) -> dict[str, object]:
-    name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
-    data_file = source.data_file(entry)
-    with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    name = whole_text(source.folder.resolve().name)
+    digest = file_sha256(source.data_file(entry))
     came_from = f"lerobot:{name}/episode-{entry.index:06d}"
     return {
-        "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
+        "episode_id": options.id_prefix
+        + dataset_id(source, entry, MAX_ID - len(options.id_prefix)),
         "task": (options.task or entry.task or "unknown")[:128],
-        "instruction": entry.task[:2000],
+        "instruction": (options.instruction or entry.task)[:MAX_INSTRUCTION],
         "domain": options.domain,
         "origin": "recorded",
         "model_rate_hz": float(source.info.fps),

@@ -31,6 +31,9 @@ CODEBASE_VERSION: Final = "v3.0"
 INFO_FILE: Final = "meta/info.json"
 STATS_FILE: Final = "meta/stats.json"
 TASKS_FILE: Final = "meta/tasks.parquet"
+# Of v2, which has one JSON object on each line.
+TASKS_LINES: Final = "meta/tasks.jsonl"
+EPISODES_LINES: Final = "meta/episodes.jsonl"
 CARD_FILE: Final = "README.md"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -49,6 +52,24 @@ MEASURED: Final = "dextouch.action_measured"
 VALID: Final = "dextouch.tactile_valid"
 STAMP: Final = "dextouch.t_ref_ns"
 IMAGE_DT: Final = "dextouch.image_dt_ns"
+# With native rates: the samples since the frame before, at most as many as the first axis has.
+SAMPLES: Final = "observation.tactile_samples"
+SAMPLES_DT: Final = "dextouch.tactile_samples_dt_ns"
+SAMPLES_COUNT: Final = "dextouch.tactile_samples_count"
+# Of features, for the dataset's card.
+MEANING: Final = {
+    STATE: "measured wrist and head poses in the world, joints in rad",
+    TACTILE: "kPa, left and right hand, mean of the samples since the frame before",
+    ACTION: "as the state, but relative to the measured poses of the episode's first step",
+    MEASURED: "the measured action, where `action` is the commanded one",
+    VALID: "whether there was a touch sample, left and right",
+    STAMP: "time of the frame in ns on the episode's clock",
+    IMAGE_DT: "time of each camera's image minus that of the frame, ns",
+    SAMPLES: "kPa of each touch sample since the frame before, oldest first, then zeros",
+    SAMPLES_DT: "time of each of these samples minus that of the frame, ns; zeros after the last",
+    SAMPLES_COUNT: "number of touch samples since the frame before, left and right",
+    "timestamp": "seconds: frame_index / fps",
+}
 
 Feature = dict[str, Any]
 Features = dict[str, Feature]
@@ -118,16 +139,24 @@ def dataset_features(
     *,
     has_measured: bool,
     num_taxels: int = NUM_TAXELS,
+    num_samples: int = 0,
 ) -> Features:
     """Every feature of an export, by name, for cameras with images of shape [height, width, 3].
 
-    With `has_measured` actions are commanded ones, and measured ones are stored beside them.
+    With `has_measured` actions are commanded ones, and measured ones are stored beside them; with
+    `num_samples` there are as many touch samples in each frame.
     """
     names = action_names()
     pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
     features = {IMAGES + name: _video_feature(shape, fps) for name, shape in cameras.items()}
     features[STATE] = pose
     features[TACTILE] = _feature("float32", [2, num_taxels], ["hand", "taxel_kpa"])
+    if num_samples:
+        features[SAMPLES] = _feature(
+            "float32", [num_samples, 2, num_taxels], ["sample", "hand", "taxel_kpa"]
+        )
+        features[SAMPLES_DT] = _feature("int64", [num_samples, 2], ["sample", "hand"])
+        features[SAMPLES_COUNT] = _feature("int64", [2], list(SIDES))
     features[ACTION] = pose
     if has_measured:
         features[MEASURED] = pose
@@ -299,6 +328,41 @@ def _tactile(
             ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns))
             kpa[:, hand], valid[:, hand] = mean_over_ranges(data.values, ranges)
     return kpa, valid
+
+
+def touch_counts(reader: EpisodeReader, t_ns: np.ndarray) -> Int64[np.ndarray, "n 2"]:
+    """Number of touch samples of each hand in each frame, since the frame before."""
+    counts = np.zeros((len(t_ns), 2), dtype=np.int64)
+    for hand, side in enumerate(SIDES):
+        name = f"tactile_{side}"
+        if name in reader.streams:
+            ranges = step_ranges(reader.stamps_ns(name), t_ns, 0, len(t_ns))
+            counts[:, hand] = ranges[:, 1] - ranges[:, 0]
+    return counts
+
+
+def touch_samples(
+    reader: EpisodeReader, t_ns: np.ndarray, num_samples: int
+) -> dict[str, np.ndarray]:
+    """Columns SAMPLES, SAMPLES_DT and SAMPLES_COUNT of frames at `t_ns`.
+
+    Of more than `num_samples` since the frame before, the newest are kept; the count is of all.
+    """
+    shape = (len(t_ns), num_samples, 2)
+    kpa = np.zeros((*shape, reader.tactile_layout.num_taxels), dtype=np.float32)
+    offsets_ns = np.zeros(shape, dtype=np.int64)
+    for hand, side in enumerate(SIDES):
+        name = f"tactile_{side}"
+        if name not in reader.streams:
+            continue
+        data = reader.read(name)
+        ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns)).tolist()
+        for frame, (low, high) in enumerate(ranges):
+            first = max(low, high - num_samples)
+            kpa[frame, : high - first, hand] = data.values[first:high]
+            offsets_ns[frame, : high - first, hand] = data.t_ref_ns[first:high] - t_ns[frame]
+    counts = touch_counts(reader, t_ns)
+    return {SAMPLES: kpa, SAMPLES_DT: offsets_ns, SAMPLES_COUNT: counts}
 
 
 def value_statistics(values: np.ndarray) -> Statistics:

@@ -50,9 +50,11 @@ class CameraVideo:
     file's header holds. `shape` is [height, width, 3].
     """
 
-    def __init__(self, folder: Path, key: str, *, fps: int, shape: Sequence[int]) -> None:
+    def __init__(
+        self, folder: Path, key: str, *, fps: int, shape: Sequence[int], first_file: int = 0
+    ) -> None:
         self._folder, self._key, self._fps, self._shape = folder, key, fps, tuple(shape)
-        self._file_number = -1
+        self._file_number = first_file - 1
         self._num_images = self._num_bytes = 0
         self._parameters = b""
         self._file: tuple[OutputContainer, VideoStream] | None = None

@@ -1,3 +1,5 @@
+from .catalog_erasure import CATALOG_FOLDER as CATALOG_FOLDER
+from .catalog_erasure import remove_catalog as remove_catalog
 from .deletion import DeletionRequest as DeletionRequest
 from .deletion import delete_for_good as delete_for_good
 from .deletion import plan_deletion as plan_deletion

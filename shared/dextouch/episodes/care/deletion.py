@@ -8,26 +8,38 @@ remembered (`dextouch.episodes.care.deletion_records`), so that stations remove 
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
 
-from dextouch.data_folder import is_system_file
-from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts, take_start
-from dextouch.episodes.files import disk_errors, replace_file, try_lock
-from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE, Kind, sha256_hex
-from dextouch.episodes.spool_log import RECORDING_FILE
-from dextouch.episodes.trash import HOMES, REVIEW_FILE, TRASH, put_into_trash, remove_for_good
-from dextouch.episodes.writer import STAGING
+from dextouch.episodes.care.catalog_erasure import erase_from_catalog, search_catalog
+from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts
+from dextouch.episodes.care.item_facts import (
+    PLACES,
+    SIGNED_FILES,
+    Facts,
+    all_facts,
+    authors_in,
+    read_dict,
+    small_files,
+    without_author,
+)
+from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
+from dextouch.episodes.format import Kind, sha256_hex
+from dextouch.episodes.trash import (
+    TRASH,
+    put_into_trash,
+    remove_for_good,
+)
+from dextouch.episodes.writer import DOWNLOADS, sweep_downloads
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import OutstandingTakes
+from dextouch.schemas import MERGED, OutstandingTakes
 
 RECEIPT_VERSION = 1
 INTENTS = ".deletions"
@@ -36,116 +48,7 @@ _MAX_ROUNDS = 5
 _MAX_HEADER_BYTES = 64 << 20
 # Those that earlier releases completed after a crash are named `recovered`.
 _VERSION = re.compile(r"-(salvaged|recovered)-[0-9]+")
-# Folders of a store and the kind of group in each.
-PLACES: dict[str, str] = {
-    "episodes": "episode",
-    "recordings": "recording",
-    HOMES["upload"]: "recording",
-    STAGING: "",
-    TRASH: "",
-}
-MAX_BYTES = 16 << 20
-# Files with attributes, and the keys under which they lie.
-_ATTRIBUTES = {METADATA_FILE: ("attributes", ATTRIBUTES_KEY), RECORDING_FILE: ()}
-_SAMPLES = ".log"
 _WORD = "A-Za-z0-9_-"
-_AROUND = {
-    STAGING: re.compile(r"(episode|recording)-(.+)-[0-9a-f]{32}"),
-    TRASH: re.compile(r"(episode|recording|upload)\.(.+)\.[0-9]+"),
-}
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Identity of one folder of a store, even a damaged or unfinished one.
-
-    `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
-    its sources, `reviewer` the pseudonym in its review; `readable` is false where nothing could be
-    parsed. `started` is `take_start` of a recording.
-    """
-
-    folder: Path
-    place: str
-    kind: str
-    item_id: str
-    operator: str | None
-    reviewer: str | None
-    lineage: tuple[tuple[str, str, str | None], ...]
-    sha256: str | None
-    readable: bool
-    station: str | None = None
-    started: str = ""
-
-
-def all_facts(root: Path) -> list[Facts]:
-    """Facts of every group, upload, stage and trash entry below a store's folder."""
-    found = []
-    for place in PLACES:
-        with disk_errors(f"list {place}"):
-            paths = sorted((root / place).iterdir()) if (root / place).is_dir() else []
-        found += [_facts(path, place) for path in paths if not is_system_file(path.name)]
-    return found
-
-
-def _facts(folder: Path, place: str) -> Facts:
-    kind, item_id = _named(folder.name, place)
-    attributes = next(filter(None, (_dict(folder / n, *k) for n, k in _ATTRIBUTES.items())), {})
-    for known in ("episode", "recording"):
-        if isinstance(attributes.get(f"{known}_id"), str):
-            kind, item_id = known, attributes[f"{known}_id"]
-    entries = attributes.get("lineage")
-    lineage = tuple(
-        (str(entry.get("kind")), str(entry.get("id")), _text(entry.get("sha256")))
-        for entry in (entries if isinstance(entries, list) else [])
-        if isinstance(entry, dict)
-    )
-    return Facts(
-        folder=folder,
-        place=place,
-        kind=kind,
-        item_id=item_id,
-        operator=_text(attributes.get("operator")),
-        reviewer=_text(_dict(folder / REVIEW_FILE).get("reviewer")),
-        lineage=lineage,
-        sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
-        readable=bool(attributes) or not any(small_files(folder)),
-        station=_text(attributes.get("station")),
-        started=take_start(attributes.get("started_at"), attributes.get("started_t_host_ns")),
-    )
-
-
-def _named(name: str, place: str) -> tuple[str, str]:
-    match = _AROUND[place].fullmatch(name) if place in _AROUND else None
-    if match is None:
-        return PLACES[place], name.removesuffix(".new")
-    return {"upload": "recording"}.get(match[1], match[1]), match[2]
-
-
-def small_files(folder: Path) -> Iterator[Path]:
-    """Metadata files directly in a folder, without samples."""
-    if folder.is_file():
-        yield folder
-    with disk_errors(f"look through {folder.name}"):
-        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-            if path.suffix != _SAMPLES and path.is_file() and path.stat().st_size <= MAX_BYTES:
-                yield path
-
-
-def _dict(path: Path, *keys: str) -> dict[str, Any]:
-    """The object under nested keys of a JSON file; empty where there is none."""
-    with disk_errors(f"read {path.name}"):
-        data = path.read_bytes() if path.is_file() else b""
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError):
-        return {}
-    for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value if isinstance(value, dict) else {}
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 class IdentifierSearch:
@@ -166,6 +69,10 @@ class IdentifierSearch:
             escaped = {word for word in self._words if json.dumps(word)[1:-1] in text}
             return sorted(escaped.union(self.in_text(text)))
         return self.in_text(texts)
+
+    def in_column(self, text: str) -> list[str]:
+        """Identifiers in a text that may be JSON."""
+        return self.found_in(text.encode()) if text.startswith("{") else self.in_text(text)
 
     def in_text(self, text: str) -> list[str]:
         """Identifiers in a text."""
@@ -270,28 +177,74 @@ def plan_deletion(
     """
     waiting = all_facts(root)
     spreads = request.derived or request.operator is not None
-    names = {(victim.kind, victim.id) for victim in known if spreads}
-    hashes = {victim.sha256 for victim in known if spreads} - {None}
+    wanted = _Wanted(waiting)
+    for victim in known if spreads else ():
+        wanted.add(victim.kind, victim.id, victim.sha256)
     if spreads and request.recording is not None:
         # Derived data may outlive its source.
-        names.add(("recording", request.recording))
+        for one in wanted.stored("recording", request.recording) or [None]:
+            wanted.add("recording", request.recording, one)
     found: list[Victim] = []
     grown = True
     while grown:
         grown = False
         for facts in list(waiting):
-            reason = _reason(facts, request) or _reason_of_kin(facts, request, names, hashes)
+            reason = _reason(facts, request) or _reason_of_kin(facts, request, wanted)
             if reason is None:
                 continue
             waiting.remove(facts)
             found.append(_victim(facts, reason))
             if spreads:
                 grown = True
-                # And earlier versions, left behind by a repair.
-                versions = [(k, i, h) for k, i, h in facts.lineage if _is_version(facts, k, i)]
-                names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
-                hashes |= {facts.sha256, *(h for _, _, h in versions)} - {None}
+                wanted.add(facts.kind, facts.item_id, facts.sha256)
+                # And earlier versions, left behind by a repair or an edit.
+                for kind, item_id, digest, operation in facts.lineage:
+                    if kind == facts.kind and (operation or _is_version(facts, kind, item_id)):
+                        is_id = operation != MERGED and not wanted.is_other(kind, item_id, digest)
+                        wanted.add(kind, item_id if is_id else None, digest)
     return found
+
+
+class _Wanted:
+    """Items that a deletion has found, whose products go, too.
+
+    A hash names an item for certain. An id may since have become that of another item, or be that
+    of one in the store which this one was merged from.
+    """
+
+    def __init__(self, stored: Iterable[Facts]) -> None:
+        self._stored: dict[tuple[str, str], set[str]] = {}
+        for facts in stored:
+            if facts.sha256 is not None:
+                self._stored.setdefault((facts.kind, facts.item_id), set()).add(facts.sha256)
+        self.hashes: set[str] = set()
+        # Hashes by kind and id; none where those are not known.
+        self.names: dict[tuple[str, str], set[str]] = {}
+
+    def add(self, kind: str, item_id: str | None, sha256: str | None) -> None:
+        """Follow an item by its hash and its id, if these are known."""
+        known = set() if sha256 is None else {sha256}
+        self.hashes |= known
+        if item_id is not None:
+            self.names.setdefault((kind, item_id), set()).update(known)
+
+    def stored(self, kind: str, item_id: str) -> set[str]:
+        """Hashes of all items of an id."""
+        return self._stored.get((kind, item_id), set())
+
+    def is_other(self, kind: str, item_id: str, sha256: str | None) -> bool:
+        """Whether an id is, in the store, that of another item than the one of a hash."""
+        return sha256 is not None and bool(self.stored(kind, item_id) - {sha256})
+
+    def has(self, kind: str, item_id: str, sha256: str | None) -> bool:
+        """Whether a source is one of the items."""
+        if sha256 in self.hashes:
+            return True
+        hashes = self.names.get((kind, item_id))
+        if hashes is None or sha256 is None:
+            return hashes is not None
+        # The hash of the item is not known, and this is not the one of another stored item.
+        return not hashes and sha256 not in self.stored(kind, item_id)
 
 
 def _victim(facts: Facts, reason: str) -> Victim:
@@ -301,10 +254,10 @@ def _victim(facts: Facts, reason: str) -> Victim:
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
-    """Items whose review was written by the operator of a request."""
+    """Items with a review or notes by the operator of a request."""
     if request.operator is None:
         return []
-    return [facts for facts in all_facts(root) if facts.reviewer == request.operator]
+    return [facts for facts in all_facts(root) if request.operator in facts.authors]
 
 
 def _reason(facts: Facts, request: DeletionRequest) -> str | None:
@@ -318,16 +271,15 @@ def _reason(facts: Facts, request: DeletionRequest) -> str | None:
     return "damaged, names the operator" if named else None
 
 
-def _reason_of_kin(
-    facts: Facts, request: DeletionRequest, names: set[tuple[str, str]], hashes: set[str | None]
-) -> str | None:
-    for kind, item_id, sha256 in facts.lineage:
-        if (kind, item_id) in names or (sha256 is not None and sha256 in hashes):
+def _reason_of_kin(facts: Facts, request: DeletionRequest, wanted: _Wanted) -> str | None:
+    for kind, item_id, sha256, _ in facts.lineage:
+        if wanted.has(kind, item_id, sha256):
             return f"made from {kind} {item_id}"
-    if facts.sha256 is not None and facts.sha256 in hashes:
+    if facts.sha256 in wanted.hashes:
         return "same content"
     # An id that was reused by another operator is a different item.
-    if (facts.kind, facts.item_id) in names and facts.operator in {None, request.operator}:
+    named = (facts.kind, facts.item_id) in wanted.names
+    if named and facts.operator in {None, request.operator}:
         return "same id"
     return None
 
@@ -380,6 +332,9 @@ def delete_for_good(
     reviewed = _remove_all(root, request, known, remember, unsent=unsent)
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
     wanted = IdentifierSearch(words)
+    erase_from_catalog(root, wanted.in_column)
+    with disk_errors("remove downloads"):
+        sweep_downloads(root)
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
@@ -427,15 +382,21 @@ def _remove_all(
         remember()
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
-            # The verdict stays.
-            path = facts.folder / REVIEW_FILE
-            with disk_errors(f"remove the reviewer of {facts.item_id}"):
-                fields = json.loads(path.read_bytes())
-                replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
+            _unsign(facts, request.operator)
             reviewed.append(facts)
         if not any(went):
             break
     return reviewed
+
+
+def _unsign(facts: Facts, operator: str | None) -> None:
+    """Remove a name from a review and from notes, whose verdict and texts stay."""
+    what = f"remove the author of remarks on {facts.item_id}"
+    # Deleted meanwhile: the next round looks at what is left of it.
+    with disk_errors(what), suppress(FileNotFoundError), held_folder(facts.folder):
+        for path in (facts.folder / name for name in SIGNED_FILES):
+            if operator in set(authors_in(fields := read_dict(path))):
+                replace_file(path, json.dumps(without_author(fields, operator)).encode())
 
 
 def _nothing(root: Path, request: DeletionRequest) -> str:
@@ -453,8 +414,8 @@ def _search(
 ) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Searched are attributes files, names of folders, and of checkpoints JSON and safetensors'
-    headers.
+    Searched are attributes files, names of folders, the catalog, and of checkpoints JSON and
+    safetensors' headers.
     """
     found, files = [], []
     facts = all_facts(root)
@@ -467,8 +428,12 @@ def _search(
         with disk_errors(f"search {checkpoints}"):
             paths = [p for p in checkpoints.rglob("*") if p.suffix in {".safetensors", ".json"}]
             files += [(str(path), path) for path in sorted(paths) if path.is_file()]
+    with disk_errors(f"list {DOWNLOADS}"):
+        lists = sorted((root / DOWNLOADS).glob("*/items.json"))
+    files += [(path.relative_to(root).as_posix(), path) for path in lists]
     others = ((f"{INTENTS}/{p.name}", p) for p in small_files(root / INTENTS) if p != skip)
     found += _references(wanted, [*files, *others])
+    found += [Reference(*named) for named in search_catalog(root, wanted.in_column)]
     unreadable = [f"{item.place}/{item.folder.name}" for item in facts if not item.readable]
     return found, unreadable, len(files)
 

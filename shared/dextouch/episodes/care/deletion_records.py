@@ -98,7 +98,10 @@ def take_start(started_at: datetime | str | None, started_t_host_ns: int | None)
         with suppress(ValueError):
             started_at = datetime.fromisoformat(started_at)
     if isinstance(started_at, datetime):
-        started_at = started_at.astimezone(UTC).isoformat()
+        # Near the ends of the calendar a time may have no date in UTC.
+        with suppress(OverflowError):
+            started_at = started_at.astimezone(UTC)
+        started_at = started_at.isoformat()
     return f"{started_at}/{started_t_host_ns}"
 
 

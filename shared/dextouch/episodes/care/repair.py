@@ -4,7 +4,6 @@ A reader stops at the first damage; an inspection continues and lists all of it.
 reversible: damaged groups go to the trash, from where they can be restored.
 """
 
-import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +12,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
 from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
-from dextouch.episodes.files import GroupFiles, LocalGroup, disk_errors, replace_file, try_lock
+from dextouch.episodes.files import (
+    PARTIAL,
+    GroupFiles,
+    LocalGroup,
+    disk_errors,
+    replace_file,
+    try_lock,
+    unheld_folders,
+)
 from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
@@ -27,21 +35,34 @@ from dextouch.episodes.format import (
     Attributes,
     CommitRecord,
     Kind,
+    Version,
+    array_files,
     array_metadata,
     attributes_id,
     decode_commit,
     group_attributes,
     kind_of,
+    numbered_ids,
     sha256_hex,
     shard_path,
     stream_arrays,
+    version_of_group,
     with_rows,
 )
 from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
-from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
-from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage, unheld_folders
+from dextouch.episodes.store import EpisodeStore
+from dextouch.episodes.trash import (
+    HOMES,
+    NOTES_FILE,
+    REMARK_FILES,
+    REVIEW_FILE,
+    TrashKind,
+    put_into_trash,
+    read_remark,
+)
+from dextouch.episodes.writer import DOWNLOADS, STAGING, EpisodeWriter, new_stage
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -50,7 +71,15 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
-from dextouch.schemas import EpisodeAttributes, LedgerEntry, LineageEntry, RecordingAttributes
+from dextouch.schemas import (
+    EpisodeAttributes,
+    ItemNotes,
+    LedgerEntry,
+    LineageEntry,
+    RecordingAttributes,
+    Review,
+    superseded,
+)
 
 UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
@@ -62,11 +91,12 @@ LOST = "lost_to_damage"
 
 @dataclass(frozen=True)
 class Finding:
-    """One damaged part; without `array` the whole item, without `chunk` the whole array."""
+    """One damaged part: of an item, or of an array, or a storage chunk or an image of it."""
 
     message: str
     array: str | None = None
     chunk: int | None = None
+    image: int | None = None
     foreign: bool = False
 
 
@@ -114,7 +144,7 @@ def inspect_group(
         progress(size)
 
     findings = [
-        Finding(error.message, name, number)
+        Finding(error.message, name, number, _image_of(error))
         for name in contents.entries
         for number, error in contents.inspect_array(name, progress=count)
     ]
@@ -128,6 +158,11 @@ def inspect_group(
     if findings:
         contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
+
+
+def _image_of(error: StorageError) -> int | None:
+    image = error.details.get("image")
+    return image if isinstance(image, int) else None
 
 
 def _stamp_findings(contents: Group) -> list[Finding]:
@@ -146,9 +181,9 @@ def _stamp_findings(contents: Group) -> list[Finding]:
 
 def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
-    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES}
-    for name, entry in entries.items():
-        wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
+    # A killed program may have left a part of a remark, which the next one replaces.
+    partial = (name + PARTIAL for name in REMARK_FILES)
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES, *partial} | array_files(entries)
     folders = {str(parent) for path in wanted for parent in Path(path).parents}
     found = []
     with disk_errors(f"look through {folder.name}"):
@@ -208,9 +243,9 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
     return ItemReport("upload", folder.name, len(names), num_bytes, tuple(findings), busy)
 
 
-def inspect_stage(folder: Path) -> ItemReport:
-    """Say whether a stage is that of a running writer; a sweep removes it otherwise."""
-    return ItemReport("stage", folder.name, busy=is_held(folder))
+def inspect_stage(folder: Path, kind: str = "stage") -> ItemReport:
+    """Say whether a stage or download is a running one; a sweep removes it otherwise."""
+    return ItemReport(kind, folder.name, busy=is_held(folder))
 
 
 def is_held(folder: Path) -> bool:
@@ -223,8 +258,8 @@ def is_held(folder: Path) -> bool:
 
 
 def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
-    """Kind and folder of every upload and stage below a store's folder."""
-    for kind, name in (("upload", UPLOADS), ("stage", STAGING)):
+    """Kind and folder of every upload, stage and download below a store's folder."""
+    for kind, name in (("upload", UPLOADS), ("stage", STAGING), ("download", DOWNLOADS)):
         folder = root / name
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
@@ -297,7 +332,9 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
             streams = group_streams(folder, attributes, entries)
         item_id = attributes_id(attributes)
         source = LineageEntry(kind=kind_of(attributes), id=item_id, sha256=sha256)
-        new_id, lost = _write_salvaged(root, attributes, streams, source)
+        remarks = _remarks(folder)
+        new_id, lost = _write_salvaged(root, attributes, streams, source, remarks)
+        _supersede_sources(root, attributes, new_id)
     except DexTouchError as error:
         # Often the inspection has already found the same.
         notes = tuple(dict.fromkeys((*notes, error.message)))
@@ -307,7 +344,11 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
 
 
 def _write_salvaged(
-    root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
+    root: Path,
+    attributes: Attributes,
+    streams: Sequence[SalvagedStream],
+    source: LineageEntry,
+    remarks: Mapping[str, BaseModel],
 ) -> tuple[str, dict[str, int]]:
     """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
@@ -323,7 +364,7 @@ def _write_salvaged(
         with suppress(StorageError):
             if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
                 return folder.name, lost
-    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    names = numbered_ids(item_id, "salvaged")
     free = next(name for name in names if not (root / f"{kind}s" / name).exists())
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
@@ -335,7 +376,32 @@ def _write_salvaged(
         for stream in streams:
             for values, stamps in stream.blocks():
                 writer.append(stream.descriptor.name, values=values, **stamps)
+        for name, remark in remarks.items():
+            writer.add_remark(name, remark)
     return free, lost
+
+
+def _remarks(folder: Path) -> dict[str, BaseModel]:
+    """What people said of a damaged item that holds for its readable samples."""
+    found: dict[str, BaseModel | None] = {}
+    forms: dict[str, type[BaseModel]] = {REVIEW_FILE: Review, NOTES_FILE: ItemNotes}
+    for name, form in forms.items():
+        with suppress(StorageError):
+            found[name] = read_remark(LocalGroup(folder), name, form, what=folder.name)
+    return {name: remark for name, remark in found.items() if remark is not None}
+
+
+def _supersede_sources(root: Path, attributes: Attributes, new_id: str) -> None:
+    """Let what an edited item supersedes be superseded by what was salvaged of it."""
+    item_id, store = attributes_id(attributes), EpisodeStore(root)
+
+    def change(review: Review | None) -> Review | None:
+        is_of_it = review is not None and item_id in review.superseded_by
+        return superseded(review, new_id) if is_of_it else review
+
+    for entry in attributes.lineage:
+        if entry.is_edit and entry.kind == kind_of(attributes):
+            store.change_source_review(entry, change)
 
 
 def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, object]:
@@ -397,11 +463,13 @@ def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
         _put(files.folder, path, bytes(source.read(0, source.size() or 0)))
 
 
-def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[int | None]]:
-    found: dict[str, frozenset[int | None]] = {}
+def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[tuple[object, object]]]:
+    found: dict[str, frozenset[tuple[object, object]]] = {}
     for finding in inspect_group(files, kind).findings:
         if finding.array is not None:
-            found[finding.array] = found.get(finding.array, frozenset()) | {finding.chunk}
+            found[finding.array] = found.get(finding.array, frozenset()) | {
+                (finding.chunk, finding.image)
+            }
     return found
 
 
@@ -410,7 +478,10 @@ def _commit_of(files: LocalGroup, kind: Kind) -> tuple[CommitRecord, str] | None
     try:
         data = files.get(COMMIT_FILE)
         return None if data is None else decode_commit(data, what=what)
-    except CorruptDataError:
+    except CorruptDataError as error:
+        if "too_large" in error.details:
+            # It may be whole: a salvage would only be a copy.
+            raise
         return None
 
 
@@ -436,14 +507,14 @@ def _known(
         raise CorruptDataError(f"{what}: attributes are those of {attributes_id(attributes)!r}")
     if record is not None:
         return attributes, record[0].arrays, record[1]
-    return attributes, _entries(files, attributes), None
+    return attributes, _entries(files, attributes, version_of_group(group)), None
 
 
-def _entries(files: LocalGroup, attributes: Attributes) -> dict[str, ArrayEntry]:
+def _entries(files: LocalGroup, attributes: Attributes, version: Version) -> dict[str, ArrayEntry]:
     """Array entries without a commit record, with the lengths of the arrays' own metadata."""
     entries = {}
     for stream in attributes.streams:
-        for name, entry in stream_arrays(stream, kind_of(attributes)).items():
+        for name, entry in stream_arrays(stream, kind_of(attributes), version).items():
             try:
                 plain = json.loads(files.get(f"{name}/{METADATA_FILE}") or b"")
                 count = int(plain["shape"][0])

@@ -1,11 +1,11 @@
 """The readable samples of a damaged group or spool.
 
-Nothing is filled in: a damaged storage chunk or sample is dropped with its stamps.
+Nothing is filled in: a damaged storage chunk, image or sample is dropped with its stamps.
 """
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,19 +15,21 @@ import google_crc32c
 import numpy as np
 import zstandard
 
+from dextouch.episodes.encoded_images import GroupChunks
 from dextouch.episodes.files import LocalFile
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
     ArrayEntry,
     Attributes,
-    codec_of,
+    image_codec,
+    index_name,
     kind_of,
     shard_path,
 )
-from dextouch.episodes.groups import hashed_bytes
-from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.shards import CRC_BYTES, INDEX_ENTRY_BYTES, ShardReader, decode_rows
+from dextouch.episodes.image_codecs import ImageGroups
+from dextouch.episodes.inspection import hashed_bytes
+from dextouch.episodes.shards import CRC_BYTES, INDEX_ENTRY_BYTES, ShardReader
 from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch, read_seal
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
@@ -68,38 +70,82 @@ class SalvagedStream:
 
 
 class _SalvagedArray:
-    """An array of which some storage chunks are damaged."""
+    """An array of which some storage chunks are damaged; `groups` decodes encoded images of v2."""
 
-    def __init__(self, path: Path, entry: ArrayEntry, index: np.ndarray) -> None:
-        self.entry, self._what = entry, f"array {path.name!r}"
-        self._shard = ShardReader(LocalFile(path), entry, what=self._what, index=index)
+    def __init__(self, path: Path, entry: ArrayEntry, groups: ImageGroups | None = None) -> None:
+        self.chunk_rows, what = entry.chunk_rows, f"array {path.name!r}"
+        index = _salvaged_index(LocalFile(path), entry)
+        self._shard = ShardReader(LocalFile(path), entry, what=what, index=index)
+        self._images = None if groups is None else GroupChunks(groups, self._shard)
+        self._row_shape = entry.shape[1:]
         holds = [self._holds(number) for number in range(len(index))]
         self.rows_hold = np.repeat(np.array(holds, dtype=bool), entry.chunk_rows)[: entry.shape[0]]
 
     def _holds(self, number: int) -> bool:
         try:
-            hashed_bytes(self._shard.payload(number), self.entry, number, self._what)
+            hashed_bytes(self._shard, self._shard.payload(number), number, self._images)
         except CorruptDataError:
             return False
         return True
 
-    def values(self, number: int) -> np.ndarray:
-        """Rows of an intact storage chunk; for images the encoded bytes."""
-        payload = self._shard.payload(number)
-        if self.entry.codec == "zstd":
-            return decode_rows(payload, self.entry, what=self._what)
-        shape = self.entry.shape[1:]
-        chunks = ImageChunks(self.entry.codec, shape, self.entry.chunk_rows, self._what)
-        return encoded_values(chunks.unpack(payload, number))
+    def rows(self, start: int, stop: int, kept: np.ndarray) -> np.ndarray:
+        """Kept ones of rows start … stop−1, of one storage chunk; of images the bytes."""
+        number = start // self.chunk_rows
+        if self._images is not None:
+            return encoded_values(self._images.read_group(number))[kept]
+        return self._shard.rows_of(self._shard.payload(number), number)[kept]
 
     def column(self) -> np.ndarray:
-        """All rows; damaged ones are undefined."""
-        column, rows = np.zeros(self.entry.shape[0], dtype=np.int64), self.entry.chunk_rows
+        """All rows of numbers; damaged ones are zero."""
+        column, rows = np.zeros((len(self.rows_hold), *self._row_shape), np.int64), self.chunk_rows
         for number in range(-(-len(column) // rows)):
             if self.rows_hold[number * rows]:
-                part = column[number * rows : (number + 1) * rows]
-                part[:] = self.values(number)[: len(part)]
+                part = self._shard.rows_of(self._shard.payload(number), number)
+                column[number * rows : number * rows + len(part)] = part
         return column
+
+
+class _SalvagedImages:
+    """Encoded images of v3 of which some bytes are damaged, or some rows of their index.
+
+    An image is known by its checksum in the index, whatever is around it.
+    """
+
+    def __init__(
+        self, path: Path, entry: ArrayEntry, index: _SalvagedArray, groups: ImageGroups
+    ) -> None:
+        self.chunk_rows, self._places = groups.size, index.column()
+        # Each storage chunk has its place, so that no index of the shard is needed.
+        self._shard = ShardReader(
+            LocalFile(path), entry, what=groups.what, index=np.zeros((0, 2), np.uint64)
+        )
+        holds = np.array([self._image(n) is not None for n in range(len(self._places))], bool)
+        self.rows_hold = holds & index.rows_hold
+        for first in range(0, len(holds), groups.size):
+            here = slice(first, min(first + groups.size, len(holds)))
+            if self.rows_hold[here].all():
+                with suppress(CorruptDataError):
+                    images = self._images(range(here.start, here.stop))
+                    groups.check(images, first // groups.size)
+                    continue
+            self.rows_hold[here] = False
+
+    def _image(self, number: int) -> bytes | None:
+        start, stop, crc = self._places[number].tolist()
+        if not 0 <= start < stop <= self._shard.num_rows:
+            return None
+        try:
+            image = self._shard.read_bytes(start, stop)
+        except CorruptDataError:
+            return None
+        return image if google_crc32c.value(image) == crc else None
+
+    def rows(self, start: int, stop: int, kept: np.ndarray) -> np.ndarray:
+        """The bytes of those of images start … stop−1 that are kept."""
+        return encoded_values(self._images((start + np.flatnonzero(kept)).tolist()))
+
+    def _images(self, numbers: Iterable[int]) -> list[bytes]:
+        return [image for n in numbers if (image := self._image(n)) is not None]
 
 
 def group_streams(
@@ -107,24 +153,32 @@ def group_streams(
 ) -> list[SalvagedStream]:
     """The readable samples of a committed group; `entries` are what is known of its arrays."""
 
-    def array(name: str) -> _SalvagedArray:
-        entry = entries[name]
-        path = folder / name / shard_path(len(entry.shape))
-        return _SalvagedArray(path, entry, _salvaged_index(LocalFile(path), entry))
+    def array(name: str, groups: ImageGroups | None = None) -> _SalvagedArray:
+        return _SalvagedArray(_shard_of(folder, name, entries), entries[name], groups)
 
     found = []
     for stream in attributes.streams:
-        values = array(stream.name)
-        names = STAMPS[kind_of(attributes)]
-        stamps = {stamp: array(f"{stream.name}_{stamp}") for stamp in names}
+        name, codec = stream.name, image_codec(stream)
+        groups = None if codec is None else ImageGroups(codec, stream.shape, f"array {name!r}")
+        values: _SalvagedArray | _SalvagedImages
+        if groups is not None and entries[name].codec == "bytes":
+            path, index = _shard_of(folder, name, entries), array(index_name(name))
+            values = _SalvagedImages(path, entries[name], index, groups)
+        else:
+            values = array(name, groups)
+        stamps = {stamp: array(f"{name}_{stamp}") for stamp in STAMPS[kind_of(attributes)]}
         count = min(len(part.rows_hold) for part in (values, *stamps.values()))
         kept = values.rows_hold[:count].copy()
         for part in stamps.values():
             kept &= part.rows_hold[:count]
         columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
         read = partial(_read_rows, values, columns)
-        found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))
+        found.append(SalvagedStream(stream, kept, read, values.chunk_rows))
     return found
+
+
+def _shard_of(folder: Path, name: str, entries: Mapping[str, ArrayEntry]) -> Path:
+    return folder / name / shard_path(len(entries[name].shape))
 
 
 def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
@@ -147,14 +201,15 @@ def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
 
 
 def _read_rows(
-    array: _SalvagedArray,
+    array: _SalvagedArray | _SalvagedImages,
     columns: Mapping[str, np.ndarray],
     start: int,
     stop: int,
     kept: np.ndarray,
 ) -> Block:
-    rows = array.values(start // array.entry.chunk_rows)[: stop - start][kept]
-    return rows, {stamp: column[start:stop][kept] for stamp, column in columns.items()}
+    return array.rows(start, stop, kept), {
+        stamp: column[start:stop][kept] for stamp, column in columns.items()
+    }
 
 
 def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
@@ -208,7 +263,7 @@ def _spooled(
     kept = np.zeros(max(int(ends[-1]) if len(rows) else 0, num_sealed), dtype=bool)
     for row in rows:
         kept[int(row["first_sample"]) :][: int(row["num_samples"])] = True
-    if codec_of(descriptor) == "h264":
+    if image_codec(descriptor) == "h264":
         kept = _whole_groups(kept, GOP_IMAGES)
 
     def read(start: int, stop: int, wanted: np.ndarray) -> Block:

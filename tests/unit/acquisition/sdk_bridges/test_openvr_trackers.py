@@ -244,7 +244,7 @@ def test_our_structures_are_those_of_the_real_module():
 
 def test_a_missing_module_is_said_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "openvr", None)
-    with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[bridges\]'"):
+    with pytest.raises(UnavailableError, match="install SteamVR, and `pip install openvr`"):
         OpenVrTrackers({"LHR-LEFT": "left"}).open()
 
 

@@ -1,0 +1,342 @@
+"""Index of a store's items: rows that looks at the store bring up to date, for all processes.
+
+What is noticed when:
+
+- a look, before each query: items that were committed, deleted, restored or replaced. It costs one
+  `stat` while the folder of a kind is unchanged, one listing without a `stat` of each item
+  otherwise; a bucket is listed at most once per BUCKET_PERIOD_NS, by ids only; a look that lists
+  the same although the folder changed is a check: numbers of folders are used again;
+- a check: also reviews and clicks by other processes, files of an item that were exchanged or
+  edited by hand (time, size, inode; in a bucket the entity tag), and items of a bucket that were
+  deleted and written again, and those that could not be read at the last one. Each process checks
+  at its first look, the service also once per `check_period_s`, and in a folder of at most
+  ALWAYS_CHECKED items each look that lists it.
+"""
+
+import hashlib
+import json
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Final, NamedTuple, TypeVar
+
+import structlog
+
+from dextouch.episodes import COMMIT_FILE, KINDS, EpisodeStore, Kind, Stamps, disk_errors
+from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError, StorageError
+from services.episode_store.catalog_file import (
+    CatalogFile,
+    check_file,
+    is_unusable,
+    snapshot,
+    transaction,
+)
+from services.episode_store.catalog_rows import (
+    read_remarks,
+    read_row,
+    relink,
+    write_remarks,
+    write_row,
+)
+
+logger = structlog.get_logger(__name__)
+
+T = TypeVar("T")
+# Stamps of a file system can be this coarse: another change may get the same stamp.
+SETTLED_NS: Final = 2_000_000_000
+# Listing a bucket takes one request per 1000 ids, checking it one per 1000 objects.
+BUCKET_PERIOD_NS: Final = 5_000_000_000
+BUCKET_CHECK_PERIOD_S: Final = 600.0
+# Chosen: 10,000 items take 0.1 s of a processor.
+CHECK_PERIOD_S: Final = 60.0
+# Chosen: so many items are compared in 6 ms.
+ALWAYS_CHECKED: Final = 500
+# Items of one transaction: others can write in between, and a kill loses little.
+BATCH: Final = 200
+Progress = Callable[[list[str], str, int], Iterable[str]]
+Write = Callable[[sqlite3.Connection], None]
+
+
+class _Listing(NamedTuple):
+    """Items as they were found: what was known of some before that, all names, and stamps."""
+
+    kind: Kind
+    before: Mapping[str, Stamps]
+    found: Mapping[str, int]
+    stamps: Mapping[str, Stamps]
+
+
+class CatalogIndex:
+    """The rows of a store's items; thread-safe.
+
+    An item that cannot be read is omitted until the next check, and logged once by each process;
+    `verify` reports damage.
+
+    Args:
+        store: whose items they are.
+        progress: shows how many of many items were read.
+    """
+
+    def __init__(self, store: EpisodeStore, progress: Progress | None = None) -> None:
+        self._store, self._is_local = store, bool(store.folders)
+        self.check_period_s = CHECK_PERIOD_S if self._is_local else BUCKET_CHECK_PERIOD_S
+        tag = "" if self._is_local else hashlib.sha256(store.url.encode()).hexdigest()[:8]
+        self._file = CatalogFile(store.root, tag)
+        self._progress = progress or (lambda items, _what, _total: items)
+        self._guard = threading.RLock()
+        # Of this connection: stamps of the rows, those of omitted items, and when it looked; a mark
+        # is forgotten where something is left to the next look.
+        self._known: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
+        self._omitted: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
+        self._is_checked: dict[Kind, bool] = dict.fromkeys(KINDS, False)
+        self._marks: dict[Kind, int | None] = dict.fromkeys(KINDS, None)
+        self._listed: dict[Kind, tuple[int, Mapping[str, int]]] = {kind: (0, {}) for kind in KINDS}
+        self._told: set[tuple[Kind, str, str]] = set()
+        self._data_version = 0
+
+    def num_items(self, kind: Kind) -> int:
+        """Items at the last look, without another one."""
+        return len(self._known[kind])
+
+    def read(self, query: Callable[[sqlite3.Connection], T]) -> T:
+        """The result of a query, after a look at the store."""
+
+        def look_and_read(connection: sqlite3.Connection) -> T:
+            for kind in KINDS:
+                self._look(connection, kind)
+            with snapshot(connection):
+                if not _is_dirty(connection):
+                    return query(connection)
+            # What was changed, or a check, a killed process or an erasure has left to do.
+            with transaction(connection):
+                relink(connection)
+                return query(connection)
+
+        return self._run(look_and_read)
+
+    def check(self) -> None:
+        """Compare all items with their rows; others may read meanwhile."""
+        known = self._run(lambda _: {kind: dict(self._known[kind]) for kind in KINDS})
+        for kind in KINDS:
+            found = self._store.folder_numbers(kind=kind)
+            listing = _Listing(kind, known[kind], found, self._store.stamps(found, kind=kind))
+            self._run(partial(self._apply, listing=listing, again=True))
+            self._is_checked[kind] = True
+
+    def reread(self, kind: Kind, item_id: str) -> None:
+        """Take over remarks on an item that were changed just now."""
+
+        def reread(connection: sqlite3.Connection) -> None:
+            before = self._known[kind].get(item_id)
+            if before is not None:
+                found = {item_id: before.folder}
+                stamps = self._store.stamps(found, kind=kind)
+                self._apply(connection, _Listing(kind, {item_id: before}, found, stamps))
+
+        self._run(reread)
+
+    def verify(self) -> list[str]:
+        """What is wrong with the file: damage, and rows of other content than their items."""
+        rows = self.read(lambda c: c.execute("SELECT kind, id, sha256 FROM item").fetchall())
+        path, problems = self._file.path, []
+        if path is not None and (damage := check_file(path)):
+            problems.append(f"is damaged ({damage})")
+        for kind, name, sha256 in rows:
+            try:
+                commit = self._store.files(name, kind=kind).get_now(COMMIT_FILE) or b"{}"
+                if json.loads(commit).get("sha256") != sha256:
+                    problems.append(f"has a row of {kind} {name} that is not of its content")
+            except (DexTouchError, ValueError):
+                # Deleted or damaged meanwhile: the next look or check finds that.
+                continue
+        advice = f"; remove the folder {path.parent}, it is made anew" if path else ""
+        return [f"catalog {problem}{advice}" for problem in problems]
+
+    def _run(self, work: Callable[[sqlite3.Connection], T]) -> T:
+        """Work on the rows, and again after a file that cannot be used was given up."""
+        with self._guard:
+            for is_last in (False, False, True):
+                try:
+                    connection = self._connection()
+                    result = work(connection)
+                except sqlite3.Error as error:
+                    if is_last or not is_unusable(error):
+                        raise
+                    self._file.give_up(error)
+                else:
+                    return result
+        raise AssertionError("unreachable")
+
+    def _connection(self) -> sqlite3.Connection:
+        """A connection, with the stamps that are in its rows now."""
+        connection, is_new = self._file.connection()
+        (version,) = connection.execute("PRAGMA data_version").fetchone()
+        if is_new:
+            self._is_checked = dict.fromkeys(KINDS, False)
+            self._marks = dict.fromkeys(KINDS, None)
+        if is_new or version != self._data_version:
+            for kind in KINDS:
+                rows = connection.execute(
+                    "SELECT id, folder, content, remarks FROM item WHERE kind = ?", (kind,)
+                )
+                known = {name: Stamps(*stamps) for name, *stamps in rows}
+                if self._known[kind].keys() - known.keys():
+                    # An erasure removes rows of items that stay.
+                    self._marks[kind] = None
+                self._known[kind] = known
+        self._data_version = version
+        return connection
+
+    def _look(self, connection: sqlite3.Connection, kind: Kind) -> None:
+        """Find what changed since the last look; see the module."""
+        # Before the listing: what changes meanwhile is found by the next look.
+        mark, last = self._mark(kind), self._marks[kind]
+        is_check = not self._is_checked[kind] and not self._was_checked(connection, kind)
+        is_current = last is not None and (
+            mark == last if self._is_local else mark - last < BUCKET_PERIOD_NS
+        )
+        if is_current and not is_check:
+            return
+        known, found = self._known[kind], self._store.folder_numbers(kind=kind)
+        wanted = {
+            name: number
+            for name, number in found.items()
+            if name not in known or known[name][0] != number
+        }
+        if self._is_local:
+            last_mark, last_found = self._listed[kind]
+            is_odd = mark != last_mark and found == last_found
+            is_check = is_check or is_odd or len(known) <= ALWAYS_CHECKED
+            self._listed[kind] = mark, found
+        if is_check:
+            wanted = found
+        stamps = self._store.stamps(wanted, kind=kind)
+        names = known.keys() if is_check else (known.keys() - found.keys()) | wanted.keys()
+        before = {name: known[name] for name in names if name in known}
+        is_done = self._apply(connection, _Listing(kind, before, found, stamps), again=is_check)
+        if is_check:
+            self._is_checked[kind] = True
+            if not self._is_local:
+                fact = (kind, int(time.time()))
+                connection.execute("INSERT OR REPLACE INTO fact VALUES (?, ?)", fact)
+        is_settled = time.time_ns() - mark > SETTLED_NS if self._is_local else bool(found)
+        self._marks[kind] = mark if is_settled and is_done else None
+
+    def _mark(self, kind: Kind) -> int:
+        """Stamp of the folder of a kind, 0 without it; of a bucket the time."""
+        if not self._is_local:
+            return time.monotonic_ns()
+        with disk_errors(f"list {kind}s"):
+            try:
+                return (self._store.root / f"{kind}s").stat().st_mtime_ns
+            except FileNotFoundError:
+                return 0
+
+    def _was_checked(self, connection: sqlite3.Connection, kind: Kind) -> bool:
+        """Whether another process has checked the bucket a short time ago."""
+        if self._is_local:
+            return False
+        row = connection.execute("SELECT value FROM fact WHERE name = ?", (kind,)).fetchone()
+        # A clock that went back makes the time of the check one of the future.
+        return row is not None and 0 <= time.time() - row[0] < BUCKET_CHECK_PERIOD_S
+
+    def _apply(
+        self, connection: sqlite3.Connection, listing: "_Listing", *, again: bool = False
+    ) -> bool:
+        """Bring the rows of items up to date; they are linked before the next query.
+
+        `again` also tries those that could not be read at the last check. Returns whether nothing
+        is left to the next look.
+        """
+        kind, before, found, stamps = listing
+        omitted = {} if again else self._omitted[kind]
+        known = self._known[kind]
+        self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
+        # What another thread or process has changed since is left to the next look.
+        gone = [
+            name for name, one in before.items() if name not in stamps and known.get(name) == one
+        ]
+        changed = [
+            name
+            for name, one in stamps.items()
+            if known.get(name) == before.get(name) != one and omitted.get(name) != one
+        ]
+        if len(changed) > BATCH:
+            changed_now = self._progress(changed, f"read {kind}s", len(changed))
+        else:
+            changed_now = changed
+        writes: dict[str, Write] = {}
+        is_done = True
+        for number, name in enumerate(changed_now, start=1):
+            write = self._read(kind, name, stamps[name])
+            if write is not None and write is not _no_row:
+                writes[name] = write
+            elif write is _no_row and name in known:
+                gone.append(name)
+            if len(writes) == BATCH or (writes and number == len(changed)):
+                read = {each: stamps[each] for each in writes}
+                is_done &= self._write(connection, kind, read, writes)
+                writes = {}
+        if gone:
+            with transaction(connection):
+                connection.executemany(
+                    "DELETE FROM item WHERE kind = ? AND id = ?", [(kind, name) for name in gone]
+                )
+            for name in gone:
+                known.pop(name, None)
+        return is_done
+
+    def _write(
+        self,
+        connection: sqlite3.Connection,
+        kind: Kind,
+        stamps: Mapping[str, Stamps],
+        writes: Mapping[str, Write],
+    ) -> bool:
+        """Write rows of items that are still as they were read; returns whether all were."""
+        numbers = {name: one.folder for name, one in stamps.items()}
+        with transaction(connection):
+            # What was deleted since must not get a row, after its erasure from this file.
+            now = self._store.stamps(numbers, kind=kind) if self._is_local else stamps
+            done = {name: one for name, one in stamps.items() if now.get(name) == one}
+            for name in done:
+                writes[name](connection)
+        self._known[kind] |= done
+        return len(done) == len(writes)
+
+    def _read(self, kind: Kind, name: str, stamps: Stamps) -> Write | None:
+        """What writes the row of an item; `_no_row`, or None for one that is left as it is."""
+        before, store = self._known[kind].get(name), self._store
+        try:
+            if before is None or before[:2] != stamps[:2]:
+                return partial(write_row, row=read_row(store, kind, name, stamps))
+            review, clicks = read_remarks(store, kind, name)
+        except NotFoundError:
+            # Deleted while we were listing; one that comes back is read again.
+            return _no_row
+        except StorageError as error:
+            self._omitted[kind][name] = stamps
+            told = (kind, name, error.message)
+            if told not in self._told:
+                self._told.add(told)
+                logger.warning("omitted_from_catalog", kind=kind, id=name, reason=error.message)
+            # A disk or a limit of the system changes nothing of what was read before.
+            return _no_row if isinstance(error, CorruptDataError) else None
+        return partial(
+            write_remarks, name=(kind, name), stamps=stamps, review=review, clicks=clicks
+        )
+
+
+def _no_row(_: sqlite3.Connection) -> None:
+    """Stands for an item that has no row."""
+
+
+def _is_dirty(connection: sqlite3.Connection) -> bool:
+    """Whether rows were changed that do not fit each other yet."""
+    (found,) = connection.execute(
+        "SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)"
+        " OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"
+    ).fetchone()
+    return bool(found)

@@ -1,0 +1,169 @@
+"""Commands of `dextouch store` that edit items: trim, relabel, merge of stores, notes."""
+
+from dataclasses import asdict
+from typing import Any
+
+from pydantic import ValidationError
+
+from dextouch.command_line import say
+from dextouch.episodes import EpisodeStore, Kind
+from dextouch.episodes.editing import (
+    EditOptions,
+    MergeOptions,
+    MergeReport,
+    add_note,
+    merge_stores,
+    relabel_item,
+    remove_note,
+    steps_between,
+    trim_episode,
+    trim_recording,
+    zero_ns,
+)
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
+from dextouch.schemas import EditedItem, NewNote, TimedNote, first_problems, json_ready
+from services.episode_store.command_context import Context, Outcome
+
+EXIT_REFUSED = 1
+
+
+def trim(context: Context) -> Outcome:
+    """Write a span of an item as a new one."""
+    options, store = context.options, context.store
+    kind, edit = context.kind_of(options.id), _edit_options(context)
+    in_seconds = options.from_s is not None or options.to_s is not None
+    if options.steps is not None and (in_seconds or kind == "recording"):
+        raise InvalidInputError(
+            "trim: --steps goes without --from and --to, and with episodes only"
+        )
+    if options.steps is None and not in_seconds:
+        raise InvalidInputError("trim: got no span, expected --from, --to or --steps")
+    if kind == "recording":
+        result = trim_recording(
+            store, options.id, options.from_s, options.to_s, outcome=options.outcome, options=edit
+        )
+    else:
+        steps = options.steps
+        if steps is None:
+            steps = steps_between(store.open(options.id), options.from_s, options.to_s)
+        result = trim_episode(
+            store,
+            options.id,
+            (steps[0], steps[1]),
+            outcome=options.outcome,
+            exact=options.exact,
+            options=edit,
+        )
+    _say_edit(context, result)
+    return json_ready(result), 0
+
+
+def relabel(context: Context) -> Outcome:
+    """Write items with other attributes as new ones."""
+    options = context.options
+    changes = {
+        key: getattr(options, key)
+        for key in ("task", "instruction", "operator")
+        if getattr(options, key) is not None
+    }
+    if options.new_id is not None and len(options.ids) > 1:
+        raise InvalidInputError("relabel: --as names one item, got several ids")
+    edited: list[EditedItem] = []
+    refused: dict[str, str] = {}
+    for item_id in options.ids:
+        try:
+            result = relabel_item(
+                context.store,
+                item_id,
+                changes,
+                kind=context.kind_of(item_id),
+                outcome=options.outcome,
+                options=_edit_options(context),
+            )
+        except DexTouchError as error:
+            if len(options.ids) == 1:
+                raise
+            refused[item_id] = error.message
+            say(f"{item_id}  refused  {error.message}")
+        else:
+            edited.append(result)
+            _say_edit(context, result)
+    found = {"edited": [json_ready(one) for one in edited], "refused": refused}
+    return found, EXIT_REFUSED if refused else 0
+
+
+def _edit_options(context: Context) -> EditOptions:
+    options = context.options
+    return EditOptions(new_id=options.new_id, keep=options.keep, dry_run=options.dry_run)
+
+
+def _say_edit(context: Context, result: EditedItem) -> None:
+    counts = ", ".join(f"{name} {count}" for name, count in result.num_samples.items())
+    would = "would become" if context.options.dry_run else "is now"
+    say(f"{result.source_id}  {would} {result.id}  {result.operation}")
+    say(f"  samples: {counts}")
+    for message in result.messages:
+        say(f"  {message}")
+    say(f"  the source {'would be' * context.options.dry_run or 'is'} {result.source_is}")
+    if result.sha256 is not None:
+        say(f"  content {result.sha256}")
+
+
+def merge(context: Context) -> Outcome:
+    """Copy all items of stores into one."""
+    options = context.options
+    sources = [EpisodeStore(url) for url in options.sources]
+    for source in sources:
+        if source.folders and not source.root.is_dir():
+            raise NotFoundError(f"merge: store {source.root}: no such folder")
+
+    def show(report: MergeReport) -> None:
+        renamed = f"as {report.new_id}" if report.new_id not in {"", report.item_id} else ""
+        remarks = f"with its {', '.join(report.remarks)}" if report.remarks else ""
+        texts = (report.item_id, report.kind, report.action, renamed, remarks, report.reason)
+        say("  ".join(text for text in texts if text))
+
+    merge_options = MergeOptions(rename=options.rename, dry_run=options.dry_run)
+    reports = merge_stores(sources, context.store, options=merge_options, on_item=show)
+    counts = {
+        action: sum(one.action == action for one in reports)
+        for action in ("copied", "there", "refused")
+    }
+    what = "would be copied" if options.dry_run else "copied"
+    say(f"{counts['copied']} {what}, {counts['there']} there, {counts['refused']} refused")
+    return {"items": [asdict(r) for r in reports], **counts}, int(counts["refused"] > 0)
+
+
+def note(context: Context) -> Outcome:
+    """Add, remove or list notes on time ranges of an item."""
+    options, store = context.options, context.store
+    kind: Kind = context.kind_of(options.id)
+    reader = store.open_item(kind, options.id)
+    zero = zero_ns(reader)
+    if options.text is not None and options.remove is not None:
+        raise InvalidInputError("note: --text and --remove exclude each other")
+    if options.text is not None:
+        from_s = options.from_s
+        if from_s is None:
+            raise InvalidInputError("note: got no time, expected --from (and --to)")
+        to_s = from_s if options.to_s is None else options.to_s
+        times = {"start_ns": zero + round(from_s * 1e9), "stop_ns": zero + round(to_s * 1e9)}
+        fields: dict[str, Any] = {**times, "text": options.text, "author": options.author}
+        try:
+            given = NewNote.model_validate(fields)
+        except ValidationError as error:
+            raise InvalidInputError(f"note: {first_problems(error)}") from error
+        add_note(store, options.id, given, kind=kind)
+    elif options.from_s is not None or options.to_s is not None or options.author is not None:
+        raise InvalidInputError("note: --from, --to and --author go with --text")
+    elif options.remove is not None:
+        remove_note(store, options.id, options.remove, kind=kind)
+    notes = store.notes(options.id, kind=kind).notes
+    for one in notes:
+        say(_note_line(one, zero))
+    return {"notes": [json_ready(one) for one in notes]}, 0
+
+
+def _note_line(one: TimedNote, zero: int) -> str:
+    span = f"{(one.start_ns - zero) / 1e9:.3f} … {(one.stop_ns - zero) / 1e9:.3f} s"
+    return f"{one.number}  {span}  {one.author or '-'}  {one.text}"

@@ -1,0 +1,155 @@
+"""Images in files of other tools: JPEG kept, PNG and raw pixels to arrays.
+
+Sizes are read from headers and checked before anything is decoded.
+"""
+
+import struct
+from collections.abc import Mapping
+from typing import Any, Final
+
+import av
+import numpy as np
+
+from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
+from dextouch.images import jpeg_size
+from dextouch.streams import JPEG_UNIT
+
+MAX_SIDE_PX: Final = 8192
+MAX_PIXELS: Final = 1 << 25
+JPEG_START: Final = b"\xff\xd8\xff"
+_JPEG_END = b"\xff\xd9"
+PNG_START: Final = b"\x89PNG\r\n\x1a\n"
+# ROS' compressed_depth_image_transport puts a header of this size before the PNG.
+_DEPTH_HEADER_BYTES = 12
+# Colour types of PNG (ISO/IEC 15948, 11.2.2) with 8 bits and what they become.
+_PNG_GRAY, _PNG_RGB, _PNG_PALETTE, _PNG_RGBA = 0, 2, 3, 6
+# Raw encodings: dtype, channels, and which channels are red, green and blue.
+RAW: Final[Mapping[str, tuple[str, int, tuple[int, ...]]]] = {
+    "rgb8": ("uint8", 3, (0, 1, 2)),
+    "bgr8": ("uint8", 3, (2, 1, 0)),
+    "8UC3": ("uint8", 3, (2, 1, 0)),
+    "rgba8": ("uint8", 4, (0, 1, 2)),
+    "bgra8": ("uint8", 4, (2, 1, 0)),
+    "mono8": ("uint8", 1, ()),
+    "8UC1": ("uint8", 1, ()),
+    "mono16": ("uint16", 1, ()),
+    "16UC1": ("uint16", 1, ()),
+    "32FC1": ("float32", 1, ()),
+}
+# Names of Foxglove for the codecs of PyAV.
+VIDEO_CODECS: Final = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}
+
+
+def check_pixels(height_px: int, width_px: int) -> None:
+    """Raise for an image without pixels, or with more than MAX_SIDE_PX or MAX_PIXELS."""
+    if height_px < 1 or width_px < 1:
+        raise InvalidInputError(f"image of {height_px} x {width_px} pixels")
+    if max(height_px, width_px) > MAX_SIDE_PX or height_px * width_px > MAX_PIXELS:
+        raise LimitExceededError(
+            f"image of {height_px} x {width_px} pixels, expected at most {MAX_SIDE_PX} a side and "
+            f"{MAX_PIXELS} in all"
+        )
+
+
+def compressed_form(data: bytes) -> tuple[str, str, tuple[int, ...], bytes]:
+    """Unit, dtype and shape of a compressed image, and the image without a header of ROS.
+
+    Raises InvalidInputError for formats other than JPEG and PNG.
+    """
+    if data[_DEPTH_HEADER_BYTES : _DEPTH_HEADER_BYTES + 8] == PNG_START:
+        data = data[_DEPTH_HEADER_BYTES:]
+    if data.startswith(JPEG_START):
+        height_px, width_px = jpeg_size(data)
+        check_pixels(height_px, width_px)
+        if data.rfind(_JPEG_END, -4096) < 0:
+            raise CorruptDataError("JPEG image without its end marker: it was cut")
+        return JPEG_UNIT, "uint8", (height_px, width_px, 3), data
+    if data.startswith(PNG_START) and len(data) > 26:
+        width_px, height_px, bits, color = struct.unpack_from(">IIBB", data, 16)
+        check_pixels(height_px, width_px)
+        if color == _PNG_GRAY and bits in {8, 16}:
+            return f"mono{bits}", f"uint{bits}", (height_px, width_px), data
+        if bits == 8 and color in {_PNG_RGB, _PNG_PALETTE, _PNG_RGBA}:
+            return "rgb8", "uint8", (height_px, width_px, 3), data
+        raise InvalidInputError(
+            f"PNG image of colour type {color} with {bits} bits; expected gray of 8 or 16 bits, or "
+            "RGB, RGBA or a palette of 8"
+        )
+    raise InvalidInputError(f"image that begins with {data[:4].hex()}; expected JPEG or PNG")
+
+
+def decode_png(data: bytes, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+    """Decode a PNG without loss to the shape and dtype of `compressed_form`; alpha is left out.
+
+    Raises CorruptDataError if it is damaged.
+    """
+    form = "rgb24" if len(shape) == 3 else "gray" if dtype == "uint8" else "gray16be"
+    context: Any = av.CodecContext.create("png", "r")
+    context.thread_count = 1
+    context.options = {"max_pixels": str(MAX_PIXELS), "err_detect": "crccheck+explode"}
+    try:
+        frames = [*context.decode(av.Packet(data)), *context.decode(None)]
+    except (av.FFmpegError, ValueError) as error:
+        raise CorruptDataError(f"PNG image is damaged ({error})") from error
+    if len(frames) != 1 or (frames[0].height, frames[0].width) != shape[:2]:
+        raise CorruptDataError(f"PNG image is damaged: {len(frames)} images")
+    frame = frames[0]
+    if frame.is_corrupt:
+        raise CorruptDataError("PNG image is damaged")
+    if frame.format.name != form:
+        frame = frame.reformat(format=form)
+    plane = frame.planes[0]
+    rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
+    wire = np.dtype(">u2") if form == "gray16be" else np.dtype(np.uint8)
+    row_bytes = shape[1] * wire.itemsize * (3 if form == "rgb24" else 1)
+    pixels = np.ascontiguousarray(rows[: shape[0], :row_bytes]).view(wire)
+    return pixels.astype(dtype).reshape(shape)
+
+
+def raw_form(
+    encoding: str, height_px: int, width_px: int, step: int, data: bytes
+) -> tuple[str, str, tuple[int, ...]]:
+    """Unit, dtype and shape of a raw image.
+
+    Raises InvalidInputError for other pixel formats than those of RAW, or a size that does not fit.
+    """
+    if encoding not in RAW:
+        raise InvalidInputError(f"pixel format {encoding!r}; expected one of {', '.join(RAW)}")
+    check_pixels(height_px, width_px)
+    dtype, channels, colours = RAW[encoding]
+    row_bytes = width_px * channels * np.dtype(dtype).itemsize
+    # The last row may end without its padding.
+    if step < row_bytes or len(data) < step * (height_px - 1) + row_bytes:
+        raise CorruptDataError(
+            f"{encoding} image of {height_px} x {width_px} pixels with rows of {step} bytes, "
+            f"and {len(data)} bytes in all"
+        )
+    if colours:
+        return "rgb8", dtype, (height_px, width_px, 3)
+    unit = {"uint8": "mono8", "uint16": "mono16", "float32": "m"}[dtype]
+    return unit, dtype, (height_px, width_px)
+
+
+def decode_raw(
+    encoding: str, shape: tuple[int, ...], step: int, data: bytes, *, big_endian: bool
+) -> np.ndarray:
+    """Pixels of a raw image that `raw_form` accepted."""
+    name, channels, colours = RAW[encoding]
+    dtype = np.dtype(name).newbyteorder(">" if big_endian else "<")
+    height_px, width_px = shape[:2]
+    whole = np.zeros(height_px * step, dtype=np.uint8)
+    given = np.frombuffer(data, dtype=np.uint8)[: len(whole)]
+    whole[: len(given)] = given
+    rows = whole.reshape(height_px, step)[:, : width_px * channels * dtype.itemsize]
+    pixels = np.ascontiguousarray(rows).view(dtype).astype(name)
+    if not colours:
+        return pixels.reshape(shape)
+    return np.ascontiguousarray(pixels.reshape(height_px, width_px, channels)[..., colours])
+
+
+def check_codec(codec: str) -> None:
+    """Raise InvalidInputError for a video format that this reader does not decode."""
+    if codec not in VIDEO_CODECS:
+        raise InvalidInputError(
+            f"video format {codec!r}; expected one of {', '.join(VIDEO_CODECS)}"
+        )

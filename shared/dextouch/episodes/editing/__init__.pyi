@@ -1,0 +1,12 @@
+from .edits import EditOptions as EditOptions
+from .edits import shifted_notes as shifted_notes
+from .merge import MergeOptions as MergeOptions
+from .merge import MergeReport as MergeReport
+from .merge import merge_stores as merge_stores
+from .notes import add_note as add_note
+from .notes import remove_note as remove_note
+from .notes import zero_ns as zero_ns
+from .relabel import relabel_item as relabel_item
+from .trim import steps_between as steps_between
+from .trim import trim_episode as trim_episode
+from .trim import trim_recording as trim_recording
