@@ -59,6 +59,7 @@ from .splits import scene_of as scene_of
 from .splits import split_by_scene as split_by_scene
 from .splits import split_of as split_of
 from .splits import split_of_scene as split_of_scene
+from .stages import DOWNLOADS as DOWNLOADS
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
 from .store import write_rollout as write_rollout
@@ -75,6 +76,5 @@ from .validity import interpolated_actions as interpolated_actions
 from .validity import interpolated_spans as interpolated_spans
 from .validity import measured_actions as measured_actions
 from .validity import measured_taxels as measured_taxels
-from .writer import DOWNLOADS as DOWNLOADS
 from .writer import ContentDigest as ContentDigest
 from .writer import EpisodeWriter as EpisodeWriter

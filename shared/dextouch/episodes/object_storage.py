@@ -30,8 +30,9 @@ from dextouch.episodes.format import (
     decode_commit,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
+from dextouch.episodes.stages import new_stage, sweep_stages
 from dextouch.episodes.trash import REMARK_FILES
-from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
+from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
     DexTouchError,

@@ -33,6 +33,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.groups import A, GroupContents, read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
+from dextouch.episodes.stages import new_stage, sweep_stages
 from dextouch.episodes.trash import (
     CLICKS_FILE,
     NOTES_FILE,
@@ -48,7 +49,7 @@ from dextouch.episodes.trash import (
     remove_for_good,
     restore_from_trash,
 )
-from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
+from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,

@@ -1,22 +1,13 @@
 """MCAP files of others: written by mcap's and rosbags' writers, with Foxglove's own schemas."""
 
 import base64
-import contextlib
-import importlib
-import io
-import json
-import random
 import struct
 import tracemalloc
-from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from PIL import Image
 
 from dextouch.bridges import foreign_mcap, foreign_streams
 from dextouch.bridges.foreign import ImportAttributes
@@ -25,139 +16,25 @@ from dextouch.bridges.foreign_messages import items_of
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
-    ConflictError,
-    CorruptDataError,
-    DexTouchError,
     InvalidInputError,
-    LimitExceededError,
+)
+from tests.unit.bridges.foreign_files import (
+    GOLDEN,
+    PIXELS,
+    STEP,
+    T0,
+    Recorder,
+    encoded,
+    foxglove_file,
+    json_file,
+    video,
 )
 from tests.unit.bridges.takes import K_HEAD, write_episode, write_recording
-
-GOLDEN = Path(__file__).parents[2] / "golden" / "ros2_rosbags.mcap"
-T0 = 1_700_000_000_000_000_000
-STEP = 33_333_333
-PIXELS = np.random.default_rng(5).integers(0, 255, (8, 48, 64, 3), dtype=np.uint8)
 
 
 @pytest.fixture
 def store(tmp_path):
     return EpisodeStore(tmp_path / "store")
-
-
-def schema_of(name):
-    return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
-
-
-class Recorder:
-    """A file by mcap's writer, with topics of Foxglove's protobuf messages or JSON."""
-
-    def __init__(self, path, compression=CompressionType.LZ4):
-        self.path, self.channels = path, {}
-        self.writer = Writer(str(path), compression=compression, chunk_size=4096)
-        self.writer.start()
-
-    def channel(self, topic, name, encoding="protobuf", schema=None, message_encoding=None):
-        if schema is None:
-            schema = self.schema(name) if name else b""
-        number = self.writer.register_schema(name, encoding, schema) if encoding else 0
-        said = message_encoding or ("protobuf" if encoding == "protobuf" else "json")
-        self.channels[topic] = self.writer.register_channel(topic, said, number)
-
-    @staticmethod
-    def schema(name):
-        files = {}
-
-        def add(file):
-            for dependency in file.dependencies:
-                add(dependency)
-            files.setdefault(file.name, file)
-
-        add(schema_of(name.removeprefix("foxglove.")).DESCRIPTOR.file)
-        found = FileDescriptorSet()
-        for file in files.values():
-            file.CopyToProto(found.file.add())
-        return found.SerializeToString()
-
-    def add(self, topic, name, t_ns, *, log_ns=None, **fields):
-        if topic not in self.channels:
-            self.channel(topic, f"foxglove.{name}")
-        message = schema_of(name)(**fields)
-        if "timestamp" in message.DESCRIPTOR.fields_by_name:
-            message.timestamp.FromNanoseconds(t_ns)
-        self.raw(topic, message.SerializeToString(), t_ns + 5 if log_ns is None else log_ns)
-
-    def raw(self, topic, data, t_ns):
-        data = data if isinstance(data, bytes) else json.dumps(data).encode()
-        self.writer.add_message(self.channels[topic], t_ns, data, t_ns)
-
-    def done(self):
-        self.writer.finish()
-        return self.path
-
-
-def encoded(pixels, form):
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, form)
-    return file.getvalue()
-
-
-def video(num_images, *, keyint, codec="libx264", bframes=0, tune="zerolatency"):
-    """Access units of an encoder that is not the store's; image k has level 20 (k mod 10)."""
-    av = pytest.importorskip("av")
-    encoder = av.CodecContext.create(codec, "w")
-    encoder.width, encoder.height, encoder.pix_fmt = 64, 48, "yuv420p"
-    encoder.time_base = Fraction(1, 30)
-    option = {"libx264": "x264-params", "libx265": "x265-params"}[codec]
-    encoder.options = {
-        "tune": tune,
-        option: f"keyint={keyint}:min-keyint={keyint}:scenecut=0:bframes={bframes}:log-level=none",
-    }
-    units = []
-    for index in range(num_images):
-        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * (index % 10), np.uint8))
-        frame.pts = index
-        units += [bytes(packet) for packet in encoder.encode(frame)]
-    return units + [bytes(packet) for packet in encoder.encode(None)]
-
-
-def foxglove_file(path):
-    recorder = Recorder(path)
-    recorder.channel("/nothing", "foxglove.PoseInFrame")
-    for k in range(8):
-        t, add = T0 + k * STEP, recorder.add
-        for topic, form in (("/cam/jpeg", "jpeg"), ("/cam/png", "png")):
-            data = encoded(PIXELS[k], form)
-            add(topic, "CompressedImage", t, data=data, format=form, frame_id="cam")
-        size = {"width": 64, "height": 48, "frame_id": "cam"}
-        rows = np.pad(PIXELS[k, ..., ::-1].reshape(48, 192), ((0, 0), (0, 8)))
-        add("/cam/raw", "RawImage", t, data=rows.tobytes(), encoding="bgr8", step=200, **size)
-        deep = (PIXELS[k, ..., 0].astype("<u2") * 256 + k).tobytes()
-        add("/cam/deep", "RawImage", t, data=deep, encoding="mono16", step=128, **size)
-        hands = [
-            {
-                "parent_frame_id": "world",
-                "child_frame_id": child,
-                "translation": {"x": k, "y": 2, "z": 3},
-                "rotation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.9},
-                "timestamp": {"seconds": t // 10**9, "nanos": t % 10**9},
-            }
-            for child in ("left", "right")
-        ]
-        add("/tf", "FrameTransforms", t, transforms=hands)
-        pose = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"w": 1}}
-        add("/pose", "PoseInFrame", t, pose=pose, frame_id="map")
-        add("/poses", "PosesInFrame", t, poses=[pose] * 25, frame_id="wrist")
-        points = np.arange(4 * (2 + k % 2), dtype="<f4")
-        fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate("xyzi")]
-        cloud = {"point_stride": 16, "fields": fields, "data": points.tobytes()}
-        add("/points", "PointCloud", t, frame_id="lidar", **cloud)
-        joints = [{"name": "a", "position": 0.5}, {"name": "b", "position": 1.5, "velocity": 2}]
-        add("/joints", "JointStates", t, joints=joints[:: 1 - 2 * (k % 2)])
-        add("/log", "Log", t, message="hello", line=4)
-    K = [50, 0, 31.5, 0, 50, 23.5, 0, 0, 1]
-    D = [0.1, 0.2, 0, 0, 0]
-    add("/cam/info", "CameraCalibration", T0, K=K, D=D, distortion_model="plumb_bob", **size)
-    return recorder.done()
 
 
 def test_foxglove_protobuf_arrives_sample_by_sample(store, tmp_path):
@@ -368,16 +245,6 @@ def test_a_stripped_export_of_ours_has_its_matrices_stamps_and_types(store, tmp_
         assert found.streams[name].dtype == recording.streams[name].dtype
 
 
-def json_file(path, messages):
-    """A file of JSON messages without a schema: topic, schema and message, a millisecond apart."""
-    recorder = Recorder(path)
-    for k, (topic, schema, message) in enumerate(messages):
-        if topic not in recorder.channels:
-            recorder.channel(topic, schema, "jsonschema" if schema else "", b"{}")
-        recorder.raw(topic, message, T0 + k * 10**6)
-    return recorder.done()
-
-
 def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
     stamped = {"header": {"stamp": {"sec": 1, "nsec": 2}, "seq": 7}, "v": 1}
     messages = [
@@ -555,122 +422,3 @@ def test_video_with_b_frames_is_refused(codec, store, tmp_path):
         recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format=form)
     with pytest.raises(InvalidInputError, match="B-frames"):
         import_any_mcap(recorder.done(), store, ImportAttributes())
-
-
-def test_what_cannot_be_read_is_named(store, tmp_path):
-    recorder = Recorder(tmp_path / "odd.mcap", CompressionType.ZSTD)
-    recorder.channel("/ros1", "std_msgs/String", "ros1msg", b"string data", "ros1")
-    recorder.channel("/bad", "foxglove.Log", "protobuf", b"\xff\xff")
-    recorder.channel("/idl", "x/msg/Y", "ros2idl", b"struct", "cdr")
-    for topic in ("/ros1", "/bad", "/idl"):
-        recorder.raw(topic, b"\x00\x01\x00\x00", T0)
-    jpeg, big = encoded(PIXELS[0], "jpeg"), {"width": 60000, "height": 60000, "step": 180000}
-    recorder.add("/cut", "CompressedImage", T0, data=jpeg[: len(jpeg) // 2])
-    recorder.add("/webp", "CompressedImage", T0, data=encoded(PIXELS[0], "webp"))
-    recorder.add("/huge", "RawImage", T0, data=b"abc", encoding="rgb8", **big)
-    recorder.add("/bayer", "RawImage", T0, data=b"abc", encoding="bayer_rggb8")
-    png = encoded(PIXELS[0], "png")
-    recorder.add("/damaged", "CompressedImage", T0, data=png[:500] + b"\0" * 90 + png[590:])
-    recorder.add("/vp8", "CompressedVideo", T0, data=b"abc", format="vp8")
-    recorder.add("/pose", "PoseInFrame", T0, frame_id="a")
-    recorder.add("/pose", "PoseInFrame", T0 + 1, frame_id="a")
-    recorder.add("/pose", "PoseInFrame", T0 + 2, frame_id="b")
-    report = import_any_mcap(recorder.done(), store, ImportAttributes())
-    reasons = {one.source: one.reason for one in report.refused}
-    expected = {
-        "/ros1": "rosbags-convert",
-        "/bad": "schema 'foxglove.Log' is not valid",
-        "/idl": "ros2idl",
-        "/cut": "was cut",
-        "/webp": "expected JPEG or PNG",
-        "/huge": "60000 x 60000 pixels",
-        "/bayer": "pixel format 'bayer_rggb8'",
-        "/damaged": "damaged",
-        "/vp8": "video format 'vp8'",
-        "/pose": "in 'b'",
-    }
-    assert reasons.keys() == expected.keys()
-    for source, part in expected.items():
-        assert part in reasons[source], source
-    counts = {one.stream: one.num_samples for one in report.imported}
-    assert counts == {"pose": 2, "damaged": 0}
-
-
-def test_limits_and_mistakes_are_errors(store, tmp_path, monkeypatch):
-    path = foxglove_file(tmp_path / "fox.mcap")
-    for mapping, part in (
-        ({"wrist_left": "/nowhere"}, "valid: /cam/deep"),
-        ({"wrist_left": "/cam/jpeg"}, "expected poses of one body"),
-        ({"camera_head": "/pose"}, "expected images"),
-        ({"keypoints_left": "/log"}, "expected points"),
-        ({"tactile_left": "/joints"}, "expected the 320 taxels in kPa of 'dextouch_v1'"),
-    ):
-        with pytest.raises(InvalidInputError, match=part):
-            import_any_mcap(path, store, ImportAttributes(mapping=mapping))
-    monkeypatch.setattr(foreign_streams, "MAX_SAMPLES", 20)
-    with pytest.raises(LimitExceededError, match="more than 20 samples"):
-        import_any_mcap(path, store, ImportAttributes())
-    monkeypatch.undo()
-    monkeypatch.setattr(foreign_streams, "MAX_STREAMS", 2)
-    mapping = {"camera_head": "/cam/png"}
-    report = import_any_mcap(path, store, ImportAttributes(mapping=mapping))
-    assert report.imported[0].stream == "camera_head"
-    assert len(report.imported) == 2
-    assert "--map those" in {one.source: one.reason for one in report.refused}["/points"]
-    with pytest.raises(ConflictError, match="--id-prefix"):
-        import_any_mcap(path, store, ImportAttributes())
-    write_recording(store, "own", count=5)
-    export_mcap(store.recording("own"), tmp_path / "own.mcap")
-    with pytest.raises(InvalidInputError, match="leave --map out"):
-        import_any_mcap(tmp_path / "own.mcap", store, ImportAttributes(mapping=mapping))
-    other = EpisodeStore(tmp_path / "other")
-    assert import_any_mcap(tmp_path / "own.mcap", other, ImportAttributes()).recording_id == "own"
-
-
-def test_a_cut_file_says_where_and_what_was_readable(store, tmp_path):
-    path = foxglove_file(tmp_path / "fox.mcap")
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-    said = r"at byte \d+: .* bytes requested.*[1-9]\d* samples of \d+ streams were readable before"
-    with pytest.raises(CorruptDataError, match=said):
-        import_any_mcap(path, store, ImportAttributes())
-    assert store.list(kind="recording") == []
-
-
-def test_a_forged_count_allocates_nothing(store, tmp_path):
-    """A ROS 2 array that announces 4 billion numbers, of which the message has none."""
-    pytest.importorskip("mcap_ros2")
-    recorder = Recorder(tmp_path / "forged.mcap")
-    text = b"float64[] data\nuint8[] raw\nstring[] names"
-    recorder.channel("/forged", "x/msg/Y", "ros2msg", text, "cdr")
-    for start in (b"\xff\xff\xff\xff", b"\0\0\0\0\xff\xff\xff\xff", b"\0\0\0\0" * 2 + b"\xff" * 4):
-        recorder.raw("/forged", b"\0\1\0\0" + start + b"\0" * 40, T0)
-    recorder.done()
-    tracemalloc.start()
-    with pytest.raises(InvalidInputError, match="not a x/msg/Y"):
-        import_any_mcap(recorder.path, store, ImportAttributes())
-    assert tracemalloc.get_traced_memory()[1] < 1 << 24
-    tracemalloc.stop()
-
-
-def test_damaged_files_give_our_errors(store, tmp_path):
-    """Bits flipped anywhere, in chunks without checksums too: errors of ours, or an import."""
-    pytest.importorskip("mcap_ros2")
-    chance = random.Random(3)
-    plain = tmp_path / "plain.mcap"
-    recorder = Recorder(plain, CompressionType.NONE)
-    recorder.writer._Writer__enable_crcs = False
-    recorder.add("/pose", "PoseInFrame", T0, frame_id="a")
-    recorder.add("/joints", "JointStates", T0, joints=[{"name": "a", "position": 1}])
-    recorder.add("/cloud", "PointCloud", T0, point_stride=4, data=bytes(40))
-    recorder.done()
-    for source, count in ((plain.read_bytes(), 100), (GOLDEN.read_bytes(), 15)):
-        for number in range(count):
-            data = bytearray(source)
-            for _ in range(chance.choice((1, 1, 4))):
-                data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-            path = tmp_path / f"flipped-{number}.mcap"
-            path.write_bytes(data)
-            with contextlib.suppress(DexTouchError):
-                import_any_mcap(path, store, ImportAttributes(id_prefix=f"{len(source)}-"))
-            path.unlink()

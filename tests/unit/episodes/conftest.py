@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import actions as act
@@ -127,3 +127,8 @@ def file_size_limit():
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
     return limit
+
+
+def chosen(store):
+    """Ids of the episodes that learners take."""
+    return [reader.item_id for reader in select_episodes([store])]

@@ -17,6 +17,7 @@ from dextouch.bridges.foreign import (
     ImportReport,
     Refused,
     file_sha256,
+    printable,
     stream_names,
 )
 from dextouch.bridges.lerobot import layout
@@ -101,8 +102,7 @@ class DatasetImport:
 
     def lines(self) -> Iterator[str]:
         """The result for a terminal: all of the first recording, of others what is new."""
-        for line in self._lines():
-            yield "".join(one if one.isprintable() else "\ufffd" for one in line)
+        return map(printable, self._lines())
 
     def _lines(self) -> Iterator[str]:
         yield from self.notes

@@ -30,12 +30,12 @@ from dextouch.episodes.care.item_facts import (
 )
 from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
+from dextouch.episodes.stages import DOWNLOADS, sweep_downloads
 from dextouch.episodes.trash import (
     TRASH,
     put_into_trash,
     remove_for_good,
 )
-from dextouch.episodes.writer import DOWNLOADS, sweep_downloads
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
 from dextouch.frozen_model import FrozenModel

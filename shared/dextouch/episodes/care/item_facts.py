@@ -12,8 +12,8 @@ from dextouch.episodes.care.deletion_records import take_start
 from dextouch.episodes.files import MAX_METADATA_BYTES, disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
 from dextouch.episodes.spool_log import RECORDING_FILE
+from dextouch.episodes.stages import STAGING
 from dextouch.episodes.trash import HOMES, NOTES_FILE, REVIEW_FILE, TRASH
-from dextouch.episodes.writer import STAGING
 
 # Folders of a store and the kind of group in each.
 PLACES: dict[str, str] = {

@@ -52,6 +52,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.groups import GroupContents, read_group
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
+from dextouch.episodes.stages import DOWNLOADS, STAGING, new_stage
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import (
     HOMES,
@@ -62,7 +63,7 @@ from dextouch.episodes.trash import (
     put_into_trash,
     read_remark,
 )
-from dextouch.episodes.writer import DOWNLOADS, STAGING, EpisodeWriter, new_stage
+from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
