@@ -41,6 +41,7 @@ from services.evaluation.studies.results import (
     read_definition,
 )
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
+from services.evaluation.studies.study_pictures import write_pictures
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
@@ -218,6 +219,7 @@ def _own_probes(
 
 def _finish(results: StudyResults, json_path: Path | None) -> int:
     figures = write_reports(results, json_path)
+    write_pictures(results)
     print_scores(figures)
     print_failures(figures, results.path)
     print(f"\nreport: {results.path.with_name(REPORT_FILE)}")

@@ -11,6 +11,7 @@ from torch.nn import functional
 from dextouch.errors import EndedError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
+    BOUND_SHARE,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -279,7 +280,19 @@ class StateWorld(BatchWorld[StateRollout]):
         if selector.wants(HEAD_CAMERA):
             shown = slice(len(chunk) - len(observation), None)
             drawing = self._drawing(state, chunk[shown], poses[shown])
-        return SteppedRollout(state, observation), drawing
+        info = {BOUND_SHARE: self._bound_share(state, steps, index)}
+        return SteppedRollout(state, observation, info), drawing
+
+    def _bound_share(self, state: StateRollout, steps: ImaginedSteps, index: int) -> float:
+        """The largest figure of `_uncertainty` as a share of its bound; above 1 it is outside."""
+        bounds = self._metadata.bounds
+        disagreement_m = float(steps.disagreement_m[index].max())
+        shares = (
+            state.num_moving / (UNRELIABLE_HORIZONS * bounds.horizon_latents),
+            disagreement_m / max(bounds.disagreement_m, 1e-9),
+            float(steps.distance[index].max()) / bounds.latent_distance,
+        )
+        return max(shares)
 
     def _drawing(
         self, state: StateRollout, actions: np.ndarray, poses: Float32[np.ndarray, "n objects 7"]

@@ -142,6 +142,7 @@ TABLE = {
         "GET /v1/studies": "study_read",
         "GET /v1/studies/{name}": "study_read",
         "GET /v1/studies/{name}/rollouts": "study_read",
+        "GET /v1/studies/{name}/picture": "study_read",
     },
     "rating": {
         "GET /v1/rating/next": "rate",

@@ -1,9 +1,10 @@
-// Real against imagined: starts a replay, follows it as its chunks arrive, and goes back to any step.
+// Real against imagined: replays an episode or moves hands, follows the chunks as they arrive, and goes back to any step.
 
 import { chunkOf, difference, uncertaintyAt, firstUnreliable, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
 import { ComparisonCharts } from "./comparison_charts.js";
 import { element, setText } from "./dom.js";
 import { number } from "./format.js";
+import { HandDriving } from "./hand_driving.js";
 import { HandCanvas } from "./hands.js";
 import { drawRgb } from "./rgb_canvas.js";
 import { badge, uncertaintyOf } from "./rollout_rows.js";
@@ -20,40 +21,69 @@ export class ComparisonPanel {
     this.loading = false;
     this.hands = Object.fromEntries(SIDES.map((world) => [world, Object.fromEntries(["left", "right"].map((side) =>
       [side, new HandCanvas(find(`${world}_${side}`), { summary: find(`${world}_${side}_text`) }, side, heatmap)]))]));
-    this.charts = new ComparisonCharts(find("charts"), (step) => this.goTo(step));
+    this.charts = new ComparisonCharts(find("charts"), find("uncertainty_strip"), (step) => this.goTo(step));
     this.player = new StepPlayer({ show: (step) => this.showStep(step) });
+    this.driving = new HandDriving(find("drive_pad"), find("drive_sides"), async (moves) => {
+      const view = await this.post(`/v1/comparisons/${this.view.id}/moves`, moves);
+      if (view) this.show(view);
+    });
     find("replay").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.start(find("replay_episode").value.trim());
+      this.start({ episode_id: find("replay_episode").value });
+    });
+    find("drive").addEventListener("submit", async (event) => {
+      event.preventDefault();
+      if (await this.start({ task: find("drive_task").value, seed: Number(find("drive_seed").value) })) find("drive_pad").focus();
     });
     find("replay_stop").addEventListener("click", () => this.post("/v1/comparisons/stop"));
     find("comparison_step").addEventListener("input", (event) => this.goTo(Number(event.target.value)));
     find("comparison_pause").addEventListener("click", () => this.pause(!this.player.paused));
-    find("replay_episode").addEventListener("focus", () => this.suggest(), { once: true });
-    const wanted = new URLSearchParams(location.search).get("replay");
-    if (wanted) find("replay_episode").value = wanted;
+    find("go_to_moment").addEventListener("click", () => this.goTo(this.charts.left));
   }
 
+  // The answer's body, where there is one, or null where the request was refused.
   async post(path, body) {
     const options = { method: "POST" };
     if (body) Object.assign(options, { headers: { "content-type": "application/json" }, body: JSON.stringify(body) });
     const answer = await ask(path, options);
-    if (!answer.ok) this.note((await answer.json()).detail ?? `refused (${answer.status})`, "ERROR");
-    return answer.ok;
+    if (answer.status === 204) return {};
+    const said = await answer.json();
+    if (!answer.ok) this.note(said.detail ?? `refused (${answer.status})`, "ERROR");
+    return answer.ok ? said : null;
   }
 
-  async start(episode_id) {
+  async start(asked) {
     this.note("Starting.");
-    if (await this.post("/v1/comparisons", { episode_id })) this.note("");
+    const view = await this.post("/v1/comparisons", asked);
+    if (view) {
+      this.note("");
+      this.show(view);
+    }
+    return view;
   }
 
-  async suggest() {
-    const answer = await ask("/v1/episode_store/episodes?domain=robot&limit=50").catch(() => null);
-    if (!answer?.ok) return;
-    const { episodes } = await answer.json();
+  // Robot episodes of tasks that the world model knows, with one that the address names, and tasks to move hands in.
+  async offer(worlds) {
+    const tasksOf = (kind) => worlds.find((one) => one.kind === kind)?.tasks ?? [];
+    const [real, imagined] = [tasksOf("twin"), tasksOf("model")];
+    const key = JSON.stringify([real, imagined]);
+    if (key === this.offered) return;
+    this.offered = key;
+    const answer = await ask("/v1/episode_store/episodes?domain=robot&limit=100").catch(() => null);
+    const found = answer?.ok ? (await answer.json()).episodes : [];
     // Those of a station have no seed, by which the twin places its objects.
-    const seeded = episodes.filter((one) => one.origin !== "recorded");
-    find("episodes").replaceChildren(...seeded.map((one) => element("option", { value: one.episode_id }, one.task)));
+    const suitable = found.filter(({ task, origin }) => imagined.includes(task) && (origin === "recorded" || real.includes(task)));
+    const outcomes = { true: "success", false: "failure", null: "outcome unknown" };
+    const wanted = new URLSearchParams(location.search).get("replay");
+    const named = wanted && !suitable.some((one) => one.episode_id === wanted) ? [element("option", { value: wanted }, wanted)] : [];
+    find("replay_episode").replaceChildren(...named, ...suitable.map((one) => element("option", { value: one.episode_id },
+      `${one.task}: ${one.episode_id}, ${one.duration_s.toFixed(1)} s, ${outcomes[one.success]}, against ${one.origin === "recorded" ? "its recording" : "the twin"}`)));
+    if (wanted) find("replay_episode").value = wanted;
+    find("replay_button").disabled = !find("replay_episode").value;
+    const both = real.filter((task) => imagined.includes(task));
+    find("drive_task").replaceChildren(...both.map((task) => element("option", {}, task)));
+    find("drive").hidden = both.length === 0;
+    setText(find("offer_note"), !imagined.length ? "Replays need a world model: dextouch up serves one." : suitable.length ? "" : "No robot episode of a task that the world model knows yet: dextouch demo records one, dextouch twin record as many as you want.");
   }
 
   note(text, level = "") {
@@ -81,13 +111,30 @@ export class ComparisonPanel {
       this.pause(false);
     }
     find("comparison_state").replaceChildren(badge({ level: LEVELS[view.state], word: view.state }),
-      element("span", {}, `${view.task}, ${view.episode_id}`),
+      element("span", {}, `${view.task}, ${view.episode_id || `hands moved by you, seed ${view.seed}`}`),
       element("span", { class: "quiet" }, `step ${Math.max(0, view.pixel_error.length - 1)} of ${view.num_steps}`));
     find("replay_stop").hidden = view.state !== "running";
+    find("drive_pad").hidden = view.state !== "running" || view.episode_id !== "";
+    for (const name of document.querySelectorAll(".real_name")) setText(name, view.worlds.real === "recording" ? "Recording" : "Twin");
     if (view.note) this.note(view.note, view.state === "failed" ? "ERROR" : "WARN");
     find("compared").hidden = view.pixel_error.length === 0;
     this.charts.show(view);
+    this.showMoment();
     this.load();
+  }
+
+  // When the imagination left what its model knows, in words, and what both worlds say about the outcome.
+  showMoment() {
+    const { uncertainties, rate_hz, real_success, num_steps } = this.view;
+    const first = uncertainties.find((one) => one.uncertainty?.outside);
+    const shares = uncertainties.map((one) => one.bound_share).filter((share) => share !== null);
+    const within = shares.length ? `Within what it knows so far: at most ${number(100 * Math.max(...shares), 0)} % of its bound.` : "This world model reports no share of a bound.";
+    setText(find("moment"), first ? `Leaves what it knows at ${(first.first_step / rate_hz).toFixed(1)} s (step ${first.first_step}): ${first.uncertainty.reason}. What follows is unreliable.` : within);
+    find("moment").dataset.level = first ? "WARN" : "";
+    find("go_to_moment").hidden = !first;
+    const imagined = uncertainties.at(-1)?.uncertainty?.success_probability ?? null;
+    const isWhole = this.view.pixel_error.length > num_steps;
+    setText(find("outcomes"), isWhole && real_success !== null ? `Real: ${real_success ? "success" : "failure"}. Imagined: ${imagined === null ? "no estimate" : `success with ${(100 * imagined).toFixed(0)} %`}.` : "");
   }
 
   // Chunks are fetched one after the other, in order, and played as they come.
@@ -122,7 +169,7 @@ export class ComparisonPanel {
     const said = uncertaintyAt(this.view.uncertainties, step);
     const earlier = firstUnreliable(this.view.uncertainties, step);
     const uncertainty = said ? uncertaintyOf({ doubt: said.uncertainty, rollout_doubt: earlier, kind: "model", next_chunk: 1 }) : { text: "given, not imagined", reason: "" };
-    find("imagined_uncertainty").dataset.outside = Boolean(earlier);
+    find("imagined_uncertainty").closest("figure").dataset.outside = Boolean(earlier);
     const words = said?.uncertainty?.outside ? `unreliable: ${uncertainty.reason}` : earlier ? uncertainty.reason : said ? `uncertainty ${uncertainty.text}` : uncertainty.text;
     setText(find("imagined_uncertainty"), words);
     const { pixel_error, pressure_error_kpa, contact_f1, in_contact } = this.view;

@@ -5,7 +5,7 @@ import { element, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
+import { badge, outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
 import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
@@ -16,7 +16,7 @@ const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = Object.fromEntries(["left", "right"].map((side) =>
   [side, new HandCanvas(find(`hand_${side}`), { summary: find(`hand_${side}_text`) }, side, heatmap)]));
 
-let listed = { worlds: [], rollouts: [], problems: [], num_open: 0 };
+let listed = { worlds: [], rollouts: [], over: [], problems: [], num_open: 0 };
 let watched = null; // { topic, rollout } of the rollout that is shown
 let steps = null;
 
@@ -59,15 +59,17 @@ function about(rollout) {
   find("watched_about").replaceChildren(badge(stateOf(rollout)),
     element("strong", {}, `${rollout.world}: ${rollout.task}`),
     element("span", { class: "quiet" }, rollout.instruction),
+    rollout.isOver ? element("strong", {}, outcomeOf(rollout)) : "",
     element("span", { class: "quiet" }, `policy ${rollout.client || "not named"}, seed ${rollout.seed}`));
 }
 
 function showTable() {
-  showRollouts(find("rollout_rows"), listed.rollouts, watched?.rollout.watch_id, watch);
+  showRollouts(find("rollout_rows"), listed, watched?.rollout.watch_id, watch);
 }
 
 function showListed(view) {
   listed = view;
+  comparison.offer(view.worlds);
   setText(find("summary"), `${view.num_open} open`);
   find("world_list").replaceChildren(...view.worlds.map((world) => element("li", { title: world.tasks.join(", ") },
     element("strong", {}, world.name), element("span", { class: "quiet" }, `${world.kind}, ${world.tasks.length} tasks`))));
@@ -76,6 +78,9 @@ function showListed(view) {
   if (now) {
     watched.rollout = now;
     about(now);
+  } else if (watched && steps) {
+    // What was shown last stays, with the state that it has now.
+    about({ ...(view.over.find((one) => topicOf(one) === watched.topic) ?? watched.rollout), isOver: true });
   } else if (!watched) {
     const wanted = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
     if (wanted) {
@@ -158,6 +163,7 @@ find("step").addEventListener("input", (event) => {
 const draw = () => {
   player.tick();
   comparison.player.tick();
+  comparison.driving.tick();
   requestAnimationFrame(draw);
 };
 requestAnimationFrame(draw);

@@ -1,4 +1,4 @@
-// One study: its tables, sorted as the operator wants, and its rollouts, disagreements first.
+// One study: its tables, sorted as the operator wants, and its rollouts, disagreements first; what it has none of is hidden.
 
 import { element, setText } from "./dom.js";
 import { LiveLink } from "./live.js";
@@ -16,7 +16,7 @@ const base = `/v1/studies/studies/${encodeURIComponent(name)}`;
 const playable = new Map(); // episode id → whether the dashboard's store has it
 let figures = null;
 let order = { key: "task", descending: false };
-let filter = { disagreements: true };
+let filter = null; // disagreements where there are any, else all, until the operator chooses
 let rows = [];
 
 async function read(path) {
@@ -56,18 +56,40 @@ function showFigures() {
   const { summary, meanings } = figures;
   setText(find("study_title"), summary.title || summary.name);
   find("study_state").replaceChildren(badge(stateOf(summary)), progress(summary));
-  setText(find("summary"), `${figures.num_disagreements} imagined outcomes differ from the real ones`);
+  setText(find("summary"), summary.worlds.length ? `${figures.num_disagreements} imagined outcomes differ from the real ones` : "no imagined world to compare");
   setText(find("rate_meaning"), `${meanings.rate} Cannot tell: ${meanings.unreliable}`);
   const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
   find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
   showRates();
-  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["Mean absolute error", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["", ""]];
+  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["Mean absolute error", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["Comments", ""]];
   const chance = "share of all pairings of the policies' rates that correlate at least as well";
   find("agreement").tHead.replaceChildren(element("tr", {}, ...heads.map(([label, kind]) =>
     element("th", { scope: "col", class: kind || null, title: label === "Chance" ? chance : null }, label))));
-  const shown = figures.agreement.map(agreementRow);
-  find("agreement").tBodies[0].replaceChildren(...(shown.length ? shown
-    : [element("tr", {}, element("td", { colspan: 9, class: "free" }, "This study has no imagined world."))]));
+  find("agreement").tBodies[0].replaceChildren(...figures.agreement.map(agreementRow));
+  showChoices(summary);
+  find("agreement_section").hidden = figures.agreement.length === 0;
+  find("rollouts_section").hidden = summary.num_done === 0;
+  find("only_disagreements").hidden = figures.num_disagreements === 0 && !filter?.disagreements;
+}
+
+// The picture that goes into a paper, in the colours of this page; its links give it on white.
+async function showPicture() {
+  const query = { world: find("picture_world").value, task: find("picture_task").value };
+  const address = (form) => `${base}/picture?${new URLSearchParams({ ...query, form })}`;
+  for (const form of ["svg", "png", "tex"]) find(`picture_${form}`).href = address(form);
+  const answer = await ask(address("svg"));
+  if (!answer.ok) return;
+  const drawn = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
+  find("picture").replaceChildren(document.importNode(drawn, true));
+}
+
+function showChoices({ worlds, tasks }) {
+  const options = (values) => values.map((value) => element("option", { value }, value || "all tasks"));
+  if (find("picture_world").length === 0) {
+    find("picture_world").replaceChildren(...options(worlds));
+    find("picture_task").replaceChildren(...options(tasks.length > 1 ? ["", ...tasks] : tasks));
+  }
+  if (worlds.length) showPicture();
 }
 
 async function findPlayable(found) {
@@ -83,7 +105,7 @@ async function findPlayable(found) {
 
 function showRollouts(total) {
   const kept = new Set([...playable].filter(([, has]) => has).map(([id]) => id));
-  const heads = ["", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Cannot tell", "Play"];
+  const heads = ["Agrees", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Cannot tell", "Play"];
   find("rollouts").tHead.replaceChildren(element("tr", {}, ...heads.map((label) =>
     element("th", { scope: "col", class: ["Seed", "Probe"].includes(label) ? "number" : null }, label))));
   find("rollouts").tBodies[0].replaceChildren(...rows.map((row) => rolloutRow(row, kept)));
@@ -121,7 +143,9 @@ async function refresh() {
   try {
     figures = await read(base);
     showFigures();
-    note("study_note", "");
+    const none = figures.summary.num_done ? "" : "No rollout has a result yet; the first ones appear here as the study runs.";
+    note("study_note", none);
+    filter ??= figures.num_disagreements ? { disagreements: true } : {};
     if (rows.length <= PAGE) await load(0);
   } catch (error) {
     note("study_note", error.message, "ERROR");
@@ -149,4 +173,5 @@ document.addEventListener("visibilitychange", () => link.sendView());
 find("only_disagreements").addEventListener("click", () => open({ disagreements: true }));
 find("all_rollouts").addEventListener("click", () => open({}));
 find("more").addEventListener("click", () => load(rows.length));
+for (const name of ["picture_world", "picture_task"]) find(name).addEventListener("change", showPicture);
 startTheme(find("theme"), () => {});

@@ -60,7 +60,9 @@ export function rolloutRow(rollout, playable) {
   const play = (id, label) => (id && playable.has(id)
     ? element("a", { href: pagePath(`/episodes/episode/${encodeURIComponent(id)}`) }, label) : null);
   const links = [play(rollout.episode_id, rollout.world === "real" ? "Play" : `Play ${rollout.world}`),
-    rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real")].filter(Boolean);
+    rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real"),
+    rollout.real_episode_id && playable.has(rollout.real_episode_id)
+      ? element("a", { href: pagePath(`/rollouts?replay=${encodeURIComponent(rollout.real_episode_id)}`), title: "Replay in the twin and in the world model, side by side" }, "Compare") : null].filter(Boolean);
   return element("tr", {},
     element("td", {}, rollout.disagrees ? badge({ level: "WARN", word: "differs" }) : ""),
     element("td", {}, rollout.world), element("td", {}, rollout.task), element("td", {}, rollout.policy),

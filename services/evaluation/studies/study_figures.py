@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -146,6 +147,24 @@ class StudyFigures(FrozenModel):
     agreement: tuple[StudyAgreement, ...]
     num_disagreements: int
     meanings: dict[str, str] = MEANINGS
+
+
+def study_summary(
+    name: str, definition: StudyDefinition, results: StudyResults, changed_at: datetime
+) -> StudySummary:
+    """What the list of studies shows of one whose results can be read."""
+    outcomes = results.outcomes.values()
+    return StudySummary(
+        name=name,
+        title=definition.name,
+        tasks=definition.tasks,
+        worlds=tuple(definition.imagined),
+        policies=tuple(definition.policies),
+        num_rollouts=definition.num_rollouts,
+        num_done=len(outcomes),
+        num_failed=sum(isinstance(one, RolloutFailure) for one in outcomes),
+        changed_at=changed_at,
+    )
 
 
 def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[StudyRollout, ...]:
