@@ -38,8 +38,9 @@ class WorldSide:
     async def start(self, request: schemas.StartRequest, first: Begun | None) -> Begun:
         """The first observation, with anchor and camera matrix; `first` is the other side's."""
         request = request.model_copy(update={"world": self.world.name})
-        given = {} if first is None else {"observation": first[0], "origin": first[1]}
-        body = schemas.encode_start(request, schemas.start_from(request, **given))
+        seen, origin = (None, None) if first is None else first
+        begin = schemas.start_from(request, observation=seen, origin=origin)
+        body = schemas.encode_start(request, begin)
         answer = await self._post("/v1/rollouts", MSGPACK, body)
         self.rollout_id = answer.rollout.id
         if answer.origin is None:

@@ -105,4 +105,4 @@ class HandDriver:
     def _limited(self, shares: Sequence[float], speed: float) -> Float64[np.ndarray, " n"]:
         """The step along several axes, together no faster than `speed`."""
         direction = np.array(shares, np.float64)
-        return direction / max(1.0, np.linalg.norm(direction)) * speed * self._period_s
+        return direction / max(1.0, float(np.linalg.norm(direction))) * speed * self._period_s
