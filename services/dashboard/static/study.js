@@ -111,7 +111,7 @@ function showRollouts(total) {
   find("rollouts").tBodies[0].replaceChildren(...rows.map((row) => rolloutRow(row, kept)));
   const of = filter.world ? ` of ${filter.policy} in ${filter.world}, ${filter.task}` : "";
   const what = filter.disagreements ? "outcomes that differ between a world and the real one" : "rollouts, those that differ from the real one first";
-  const missing = rows.some((row) => row.episode_id) && !rows.some((row) => kept.has(row.episode_id) || kept.has(row.real_episode_id))
+  const missing = rows.some((row) => row.episode_id) && rows.every((row) => !row.episode_id || playable.has(row.episode_id)) && !rows.some((row) => kept.has(row.episode_id) || kept.has(row.real_episode_id))
     ? " They are not in this dashboard's episode store, so they cannot be played here: run the study with --store." : "";
   note("rollouts_note", `${rows.length} of ${total} ${what}${of}.${missing}`);
   find("more").hidden = rows.length >= total;
@@ -124,10 +124,11 @@ async function load(offset) {
   const query = new URLSearchParams({ ...filter, limit: PAGE, offset });
   try {
     const { rollouts, num_matching } = await read(`${base}/rollouts?${query}`);
-    await findPlayable(rollouts);
     if (asked !== filter) return;
     rows = offset ? [...rows, ...rollouts] : rollouts;
     showRollouts(num_matching);
+    await findPlayable(rollouts);
+    if (asked === filter) showRollouts(num_matching);
   } catch (error) {
     note("rollouts_note", error.message, "ERROR");
   }

@@ -10,6 +10,8 @@ import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
 import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
 import { FetchQueue } from "./static/player/fetch_queue.js";
 import { BONES, frameOfMatrix, frameOfPose, Orbit, toWorld } from "./static/player/geometry.js";
+import { moveOf } from "./static/hand_driving.js";
+import { outcomeOf } from "./static/rollout_rows.js";
 import { unpack } from "./static/packed.js";
 import { PlayClock } from "./static/player/play_clock.js";
 import { allAfter, clockText, parseSeconds, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
@@ -186,4 +188,17 @@ test("a selection without an item of the kind has no command to export", () => {
   assert.equal(exportCommand({ format: "mcap", kind: "episode", ids, filters: {} }), "");
   assert.match(exportCommand({ format: "mcap", kind: "recording", ids: ["a"], filters: {} }), / a --to a.mcap$/);
   assert.match(exportCommand({ format: "mcap", kind: "episode", ids: null, filters: { task: "wipe" } }), /--task=wipe/);
+});
+
+test("held keys and a gamepad move hands, opposite keys cancel, and a stick at rest does not", () => {
+  assert.deepEqual(moveOf(new Set(["w", "d", " ", "x"])), { forward: 1, right: 1, close: 1 });
+  assert.equal(moveOf(new Set(["w", "s"])).forward, 0);
+  const pad = { axes: [0.5, -1, 0.1, 0.4], buttons: Array.from({ length: 8 }, (_, index) => ({ value: index === 6 ? 1 : 0 })) };
+  assert.deepEqual(moveOf(new Set(), pad), { right: 0.5, forward: 1, up: -0.4, close: -1 });
+  assert.deepEqual(moveOf(new Set(["w"]), pad).forward, 1);
+});
+
+test("an outcome is what the world knows, else its own estimate", () => {
+  const words = [{ success: true }, { success: false }, { success: null, rollout_doubt: { success_probability: 0.256 } }, { success: null }].map(outcomeOf);
+  assert.deepEqual(words, ["success", "no success", "success with 26 %, imagined", "–"]);
 });
