@@ -346,14 +346,16 @@ def _page(
     limit = min(limit, MAX_LIMIT)
     found = f"SELECT i.row, i.aligned, {order.key} AS k, {order.name} AS n FROM {where.tables}"
     place = [limit + 1, min(order.page.offset, MAX_LIMIT)]
-    if where.is_tallied:
-        count = f"SELECT coalesce(sum(num), 0) FROM tally i WHERE {where.sql}"
+    if not where.is_rare:
+        count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
+        if where.is_tallied:
+            count = f"SELECT coalesce(sum(num), 0) FROM tally i WHERE {where.sql}"
         (num_matching,) = connection.execute(count, where.values).fetchone()
         later, values = order.go_on(where, (order.key, order.name))
         text = f"{found} WHERE {later} ORDER BY {order.columns} LIMIT ? OFFSET ?"
         rows = connection.execute(text, [*values, *place]).fetchall()
     else:
-        # One scan for both.
+        # One scan for both: finding the page takes all rows, too.
         later, values = order.go_on(Condition(terms=["TRUE"]), ("k", "n"))
         text = f"""WITH m AS MATERIALIZED ({found} WHERE {where.sql})
           SELECT count(*), NULL, NULL, NULL FROM m UNION ALL SELECT * FROM (

@@ -41,11 +41,12 @@ class Condition:
     """An SQL condition on a row `i` of the catalog with its parameters.
 
     In the list of takes (`of_takes`) a recording's last episode is the row `a`. With `is_tallied`
-    its terms have only columns of `tally`.
+    its terms have only columns of `tally`; few rows match one that `is_rare`.
     """
 
     of_takes: bool = False
     is_tallied: bool = True
+    is_rare: bool = False
     tables: str = "item i"
     terms: list[str] = field(default_factory=list)
     values: list[object] = field(default_factory=list)
@@ -119,6 +120,7 @@ class CatalogFilter(FrozenModel):
                 to.join_episode()
                 column = "i.text || coalesce(char(10) || a.text, '')"
             to.add(f"instr({column}, ?) > 0", self.text.casefold())
+            to.is_rare = True
         for name, least in map(quality_bound, self.min_quality):
             if least > -math.inf:
                 figure = f"({_FIGURE} AND row = i.row)"
