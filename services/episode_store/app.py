@@ -1,7 +1,6 @@
 """Application of the episode store, with its threads in the background."""
 
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Final
@@ -41,21 +40,25 @@ RETRY_PERIOD_S: Final = 30.0
 WATCH_PERIOD_S: Final = 1.0
 
 
-class PeriodicThread(ABC):
-    """Calls `work` again and again, between `start` and `stop`.
+class PeriodicThread:
+    """Calls `work` once a period from `start` on; `stop` waits for it, at most `patience_s`.
 
     A failure, such as a bucket that cannot be reached or a read-only folder, is logged as `event`
     when it begins or changes; the service still serves everything else.
     """
 
-    def __init__(self, event: str, period_s: float) -> None:
-        self._event, self._period_s = event, period_s
+    def __init__(
+        self,
+        event: str,
+        period_s: float,
+        work: Callable[[], None],
+        *,
+        patience_s: float | None = None,
+    ) -> None:
+        self._event, self._period_s, self._work = event, period_s, work
+        self._patience_s = patience_s
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=event, daemon=True)
-
-    @abstractmethod
-    def work(self) -> None:
-        """What is done once a period."""
 
     def start(self) -> None:
         """Begin in the background."""
@@ -64,13 +67,13 @@ class PeriodicThread(ABC):
     def stop(self) -> None:
         """End the thread, after the work that is under way."""
         self._stopping.set()
-        self._thread.join()
+        self._thread.join(self._patience_s)
 
     def _run(self) -> None:
         problem = ""
         while not self._stopping.is_set():
             try:
-                self.work()
+                self._work()
                 problem = ""
             except DexTouchError as error:
                 if error.message != problem:
@@ -88,7 +91,7 @@ class PendingUploads(PeriodicThread):
     """Uploads what waits in a store's outbox, and removes the stages of killed writers once."""
 
     def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
-        super().__init__("uploads_not_completed", period_s)
+        super().__init__("uploads_not_completed", period_s, self.work)
         self._store, self._is_swept = store, False
 
     def work(self) -> None:
@@ -118,7 +121,7 @@ class DeletionWatch(PeriodicThread):
     def __init__(
         self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
     ) -> None:
-        super().__init__("fail_deletions", WATCH_PERIOD_S)
+        super().__init__("fail_deletions", WATCH_PERIOD_S, self.work)
         self._records, self._drop, self._ended = records, drop, ended
         self._revision = ""
 
@@ -129,23 +132,6 @@ class DeletionWatch(PeriodicThread):
             for recording_id in self._drop():
                 self._ended(recording_id)
             self._revision = revision
-
-
-class CatalogCheck(PeriodicThread):
-    """Compares a catalog with its store: at once, as a large one takes time, and now and then."""
-
-    def __init__(self, catalog: Catalog) -> None:
-        super().__init__("catalog_not_checked", catalog.index.check_period_s)
-        self._index = catalog.index
-
-    def work(self) -> None:
-        """Check once."""
-        self._index.check()
-
-    def stop(self) -> None:
-        """End soon: reading a large store takes minutes, and can be interrupted anywhere."""
-        self._stopping.set()
-        self._thread.join(timeout=2.0)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
@@ -161,7 +147,9 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
     watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
-    pending, check = PendingUploads(store), CatalogCheck(catalog)
+    pending, index = PendingUploads(store), catalog.index
+    # Reading a large store takes minutes, and can be interrupted anywhere.
+    check = PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0)
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager

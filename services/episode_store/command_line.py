@@ -48,24 +48,17 @@ from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
-    EpisodeList,
-    EpisodeSummary,
     RecordingAttributes,
-    RecordingList,
-    RecordingSummary,
     SceneObject,
     SceneObjects,
     json_ready,
     load_object_clicks,
 )
 from dextouch.serving import configure_logging, load_settings
-from services.episode_store.catalog import Catalog
+from services.episode_store.catalog import Catalog, ListedRow
 from services.episode_store.command_context import Context, Outcome
-from services.episode_store.deletions import deletion_statuses
-from services.episode_store.editing_commands import merge, note, relabel, trim
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
-from services.episode_store.settings import EpisodeStoreSettings
 
 EXIT_DAMAGED = 1
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
@@ -81,10 +74,25 @@ def main(argv: Sequence[str]) -> int:
     options = store_parser().parse_args(list(argv))
     # Items that the catalog leaves out are reported on stderr.
     configure_logging(service="episode_store", log_format="auto", level="warning")
-    url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options))
+    url = options.store or _configured_url()
+    run = _COMMANDS.get(options.command) or _editing_command(options.command)
+    result, status = run(Context(EpisodeStore(url), url, options))
     write_result(options.json, result)
     return status
+
+
+# Imported where they are needed: `list` should not wait for FastAPI and all that edits items.
+def _configured_url() -> str:
+    from services.episode_store.settings import EpisodeStoreSettings
+
+    return load_settings(EpisodeStoreSettings, []).store_url
+
+
+def _editing_command(name: str) -> Callable[[Context], Outcome]:
+    from services.episode_store import editing_commands
+
+    command: Callable[[Context], Outcome] = getattr(editing_commands, name)
+    return command
 
 
 def readable_size(num_bytes: int) -> str:
@@ -132,30 +140,19 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
     """List matching items of a kind; returns them and the number of all."""
     options = context.options
     query = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    if kind == "episode":
-        episodes = catalog.episodes(query, limit=sys.maxsize)
-        for row in episodes.episodes:
-            facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
-            say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
-        return _result_of(context, episodes), catalog.index.num_items(kind)
-    recordings = catalog.recordings(query, limit=sys.maxsize)
-    for each in recordings.recordings:
-        facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
-        say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
-    return _result_of(context, recordings), catalog.index.num_items(kind)
+    rows = catalog.rows(kind, query)
+    for row in rows:
+        is_episode = kind == "episode"
+        size = f"{row.origin}  {row.size} steps" if is_episode else f"{row.size} samples"
+        say(f"{row.id}  {kind}  {row.task}  {row.domain}  {size}  {_outcome(row)}")
+    result: dict[str, Any] = {"num_matching": len(rows)}
+    if context.options.json is not None:
+        read = catalog.episodes if kind == "episode" else catalog.recordings
+        result = json_ready(read(query, limit=sys.maxsize))
+    return result, catalog.index.num_items(kind)
 
 
-def _result_of(context: Context, found: EpisodeList | RecordingList) -> dict[str, Any]:
-    # Of many items it takes as long as listing them.
-    if context.options.json is None:
-        return {"num_matching": found.num_matching}
-    result: dict[str, Any] = json_ready(found)
-    return result
-
-
-def _outcome(
-    row: EpisodeSummary | RecordingSummary | EpisodeAttributes | RecordingAttributes,
-) -> str:
+def _outcome(row: ListedRow | EpisodeAttributes | RecordingAttributes) -> str:
     return _OUTCOMES[row.success] + "  recovered" * row.recovered
 
 
@@ -404,6 +401,8 @@ def _outstanding_line(station: str, recordings: Sequence[str], *, has_answered: 
 
 def deletions(context: Context) -> Outcome:
     """List permanent deletions and what stations have yet to remove."""
+    from services.episode_store.deletions import deletion_statuses
+
     options, records = context.options, DeletionRecords(context.need_local_root())
     if options.readmit is not None:
         if not records.readmit(options.readmit):
@@ -497,8 +496,4 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "restore": restore,
     "purge": purge,
     "repair": repair,
-    "trim": trim,
-    "relabel": relabel,
-    "merge": merge,
-    "note": note,
 }

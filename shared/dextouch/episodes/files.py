@@ -47,14 +47,17 @@ def disk_errors(what: str, *, advice: str = "free space and try again") -> Itera
         raise StorageError(f"{what}: {error}") from error
 
 
-def write_parts(descriptor: int, *parts: bytes) -> None:
+def write_parts(descriptor: int, *parts: bytes | memoryview) -> None:
     """Write every byte of all parts in order, without joining them first (writev)."""
     views = [memoryview(part) for part in parts if part]
-    while views:
+    num_left = sum(map(len, views))
+    while num_left:
         num_written = os.writev(descriptor, views)
-        while views and num_written >= len(views[0]):
+        num_left -= num_written
+        # Rarely: a call takes all, unless the disk is full.
+        while num_left and num_written >= len(views[0]):
             num_written -= len(views.pop(0))
-        if views:
+        if num_left:
             views[0] = views[0][num_written:]
 
 

@@ -77,8 +77,7 @@ if TYPE_CHECKING:
 
 
 _OBJECT_SCHEME = "s3://"
-# The files of a group that a catalog is made of: its content, and remarks beside it.
-_STAMPED = (COMMIT_FILE, METADATA_FILE, *REMARK_FILES)
+_IS_ID = re.compile(ID_PATTERN).fullmatch
 
 
 class EpisodeStore:
@@ -429,18 +428,22 @@ class _LocalStorage:
                 return {}
 
     def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
-        folder, found = f"{self.root}/{kind}s", {}
+        found, none = {}, " ".join([""] * len(REMARK_FILES))
         with disk_errors(f"look at {kind}s"):
-            for name, number in numbers.items():
-                if not re.fullmatch(ID_PATTERN, name):
-                    continue
+            for name in filter(_IS_ID, numbers):
+                folder = f"{self.root}/{kind}s/{name}/"
                 try:
-                    commit, *others = (_stamp(f"{folder}/{name}/{file}") for file in _STAMPED)
+                    commit = _stamp(folder + COMMIT_FILE)
+                    content = f"{commit} {_stamp(folder + METADATA_FILE)}"
+                    # Most have none, and raising errors would take as long as all the rest.
+                    remarks = none
+                    if any(os.access(folder + file, os.F_OK) for file in REMARK_FILES):
+                        remarks = " ".join(_stamp(folder + file) for file in REMARK_FILES)
                 except PermissionError:
                     # Reading it says what is wrong.
-                    commit, others = "?", ["", "", ""]
+                    commit, content, remarks = "?", "? ", none
                 if commit:
-                    found[name] = Stamps(number, f"{commit} {others[0]}", " ".join(others[1:]))
+                    found[name] = Stamps(numbers[name], content, remarks)
         return found
 
     def delete(self, kind: Kind, item_id: str) -> None:
@@ -504,7 +507,7 @@ def _is_committed(folder: Path) -> bool:
     try:
         return (folder / COMMIT_FILE).is_file()
     except PermissionError:
-        return re.fullmatch(ID_PATTERN, folder.name) is not None
+        return _IS_ID(folder.name) is not None
 
 
 def write_rollout(
