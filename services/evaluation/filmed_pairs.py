@@ -28,12 +28,15 @@ def film(
     """Play the telling pair of every task again, with the images of all steps.
 
     The evaluation renders only what policies and the success classifier use. The arguments are
-    those of `evaluate`, and `report` what it returned; a pair that fails now is left out.
+    those of `evaluate`, and `report` what it returned; a pair that fails now is left out, and a
+    robot is not moved for a picture.
     """
     if not imagined:
         return ()
     world = report.imagined_worlds[0]
     worlds = StudyWorlds.ask(real, {world: imagined[world]})
+    if worlds.descriptions[REAL].kind == "robot":
+        return ()
     runner = RolloutRunner(worlds, probe, plan.num_steps, shows_all=True)
     found = []
     for task, pair in telling_pairs(report, world).items():

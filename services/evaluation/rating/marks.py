@@ -3,7 +3,7 @@
 import json
 import sqlite3
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -76,6 +76,15 @@ class StoredMark:
     number: int
     rated_at: datetime
     mark: Mark
+
+
+def by_people(marks: Iterable[Mark]) -> dict[str, list[Mark]]:
+    """Marks of people by episode, without those of rollouts that they were shown again."""
+    found: dict[str, list[Mark]] = {}
+    for mark in marks:
+        if mark.kind == "human" and mark.presentation != REPEAT:
+            found.setdefault(mark.episode_id, []).append(mark)
+    return found
 
 
 @dataclass(frozen=True)

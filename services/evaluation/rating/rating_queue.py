@@ -24,6 +24,7 @@ from services.evaluation.rating.marks import (
     MarkLog,
     Rubric,
     StoredMark,
+    by_people,
     vote,
 )
 from services.evaluation.reporting.pictures import hands_image
@@ -105,7 +106,7 @@ class RatingQueue:
             key=lambda stored: stored.number,
         )
         seen = [one.mark.episode_id for one in mine if one.mark.presentation != REPEAT]
-        given = _people(latest.values())
+        given = by_people(stored.mark for stored in latest.values())
         raters = {
             episode_id: sum(one.presentation == FIRST for one in marks)
             for episode_id, marks in given.items()
@@ -136,7 +137,8 @@ class RatingQueue:
             ConflictError: they are not, or the rater is one of them.
         """
         rollout = self.rollout(token)
-        marks = _people(self._marks.latest().values()).get(rollout.episode_id, [])
+        latest = (stored.mark for stored in self._marks.latest().values())
+        marks = by_people(latest).get(rollout.episode_id, [])
         others = [one for one in marks if one.presentation == FIRST]
         if rater in {one.rater for one in others} or not vote(others).tied:
             raise ConflictError(
@@ -161,15 +163,6 @@ class RatingQueue:
         known = [self._rollouts[t] for t in map(token_of, old) if t in self._rollouts]
         fresh = [one for one in known if one.episode_id not in repeats]
         return min(fresh, key=lambda one: _order(rater, one.episode_id), default=None)
-
-
-def _people(marks: Iterable[StoredMark]) -> dict[str, list[Mark]]:
-    """Marks of people by episode, without those of rollouts that they were shown again."""
-    found: dict[str, list[Mark]] = {}
-    for stored in marks:
-        if stored.mark.kind == "human" and stored.mark.presentation != REPEAT:
-            found.setdefault(stored.mark.episode_id, []).append(stored.mark)
-    return found
 
 
 def _order(rater: str, episode_id: str) -> str:

@@ -19,6 +19,7 @@ from services.evaluation.rating.marks import (
     Mark,
     Rubric,
     StoredMark,
+    by_people,
     rubric_of,
     vote,
 )
@@ -219,12 +220,8 @@ def _decided(
     marks: list[Mark], task_of: Mapping[str, str], rubrics: Mapping[str, Rubric]
 ) -> dict[str, dict[str, Any]]:
     """Of each rollout with marks of people the score of their majority, and what is tied."""
-    people: dict[str, list[Mark]] = defaultdict(list)
-    for mark in marks:
-        if mark.kind == "human" and mark.presentation != REPEAT:
-            people[mark.episode_id].append(mark)
     found: dict[str, dict[str, Any]] = {}
-    for episode_id, given in people.items():
+    for episode_id, given in by_people(marks).items():
         most, score = vote(given), UNDEFINED
         if most.holds and not most.tied:
             rubric = rubric_of(task_of[episode_id], rubrics)

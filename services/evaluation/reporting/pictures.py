@@ -216,15 +216,21 @@ def moving_picture(pair: PredictionPicture) -> Moving:
     frames = [_frame(pair, index, index / max(1, len(shown) - 1)) for index in shown.tolist()]
     data = b""
     for quality, stride in ((70, 1), (40, 1), (40, 2), (20, 4)):
-        file, (first, *others) = io.BytesIO(), frames[::stride]
-        options = {"quality": quality, "duration": round(step_ms * stride), "loop": 0}
-        first.save(file, "WEBP", save_all=True, append_images=others, method=2, **options)
-        data = file.getvalue()
+        data = _webp(frames[::stride], quality, round(step_ms * stride))
         if len(data) <= MAX_MOVING_BYTES:
             break
-    address = "data:image/webp;base64," + base64.b64encode(data).decode()
-    still = data_address(np.asarray(frames[len(frames) // 2]))
-    return Moving(pair.title, address, still, step_ms * len(shown) / 1000)
+    moving, still = (
+        "data:image/webp;base64," + base64.b64encode(one).decode()
+        for one in (data, _webp([frames[len(frames) // 2]], 80, 0))
+    )
+    return Moving(pair.title, moving, still, step_ms * len(shown) / 1000)
+
+
+def _webp(frames: Sequence[Image.Image], quality: int, duration_ms: int) -> bytes:
+    file, (first, *others) = io.BytesIO(), frames
+    moving = {"save_all": True, "append_images": others, "duration": duration_ms, "loop": 0}
+    first.save(file, "WEBP", quality=quality, method=2, **(moving if others else {}))
+    return file.getvalue()
 
 
 def _frame(pair: PredictionPicture, index: int, progress: float) -> Image.Image:
