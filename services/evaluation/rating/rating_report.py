@@ -34,7 +34,7 @@ Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
 UNDEFINED = "undefined"
 # Of a rollout without marks of people.
-_UNDECIDED: Final[Mapping[str, Any]] = {"decided_score": UNDEFINED, "tied": [], "was_tied": False}
+_UNDECIDED: Final[dict[str, Any]] = {"decided_score": UNDEFINED, "tied": [], "was_tied": False}
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,8 @@ def _decided(
     """Of each rollout with marks of people the score of their majority, and what is tied."""
     found: dict[str, dict[str, Any]] = {}
     for episode_id, given in by_people(marks).items():
-        most, score = vote(given), UNDEFINED
+        most = vote(given)
+        score: float | str = UNDEFINED
         if most.holds and not most.tied:
             rubric = rubric_of(task_of[episode_id], rubrics)
             score = rubric.score(most.holds, is_inconsistent=most.is_inconsistent)

@@ -46,6 +46,7 @@ MAX_MOVING: Final = 8
 # A hand and its unloaded taxels, seen on light and on dark pages.
 _HAND: Final = (138, 144, 156, 64)
 _UNLOADED: Final = (138, 144, 156, 132)
+_BEHIND: Final = (24, 27, 34)
 _GAP_PX: Final = 16
 # S2 of every finger is abduction; the other three joints are flexion.
 _FLEXION_HINGES = [0, 2, 3]
@@ -242,17 +243,18 @@ def _frame(pair: PredictionPicture, index: int, progress: float) -> Image.Image:
     columns = []
     for images, tactile_kpa in worlds:
         hands = Image.fromarray(hands_image(tactile_kpa[index], cell_px=5, layout=pair.layout))
-        image = Image.fromarray(images[index]).convert("RGBA")
+        image = Image.fromarray(images[index])
         size = (hands.width, round(image.height * hands.width / image.width))
         columns.append((image.resize(size, Image.Resampling.BICUBIC), hands))
     width = columns[0][1].width
     height = max(image.height + hands.height for image, hands in columns)
-    frame = Image.new("RGBA", (2 * width + _GAP_PX, height + _GAP_PX), (*_HAND[:3], 0))
+    # Opaque, since a translucent frame would be blended with the one before it.
+    frame = Image.new("RGB", (2 * width + _GAP_PX, height + _GAP_PX), _BEHIND)
     for left, (image, hands) in zip((0, width + _GAP_PX), columns, strict=True):
         frame.paste(image, (left, 0))
-        frame.paste(hands, (left, height - hands.height))
+        frame.paste(hands, (left, height - hands.height), hands)
     line = (0, height + 6, round(progress * (frame.width - 1)), height + 10)
-    ImageDraw.Draw(frame).rectangle(line, (128, 134, 146, 255))
+    ImageDraw.Draw(frame).rectangle(line, _HAND[:3])
     return frame
 
 

@@ -311,7 +311,7 @@ def kept_pairs(
     for pair in telling_pairs(report, world).values():
         ids = [rollout_episode_id(results.header, cell_of(score)) for score in pair]
         if all(map(store.exists, ids)):
-            found.append(episode_pair(title_of(pair), *map(store.open, ids)))
+            found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
     return tuple(found)
 
 

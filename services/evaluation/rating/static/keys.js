@@ -17,7 +17,7 @@ try {
 // Show the keys in the hints and in the list, with those of the criteria that there are.
 export function showKeys(criteria = numCriteria) {
   numCriteria = criteria;
-  const nameOf = (action) => NAMES[keys[action]] ?? keys[action].toUpperCase();
+  const nameOf = (action) => NAMES[keys[action]] ?? (keys[action].length === 1 ? keys[action].toUpperCase() : keys[action]);
   for (const hint of document.querySelectorAll("kbd[data-action]")) hint.textContent = nameOf(hint.dataset.action);
   const shown = Object.keys(USUAL).filter((action) => !(Number(action) > numCriteria));
   at("key_list").replaceChildren(...shown.map((action) => {

@@ -8,13 +8,16 @@ const range = (pair) => (Array.isArray(pair) ? `${number(pair[0])} … ${number(
 const made = (tag, fields) => Object.assign(document.createElement(tag), fields);
 const small = (textContent) => made("small", { textContent });
 
-function fill(table, rows) {
+function fill(table, [head, ...others]) {
   const line = (cells, tag) => {
     const row = made("tr");
-    for (const cell of cells) row.appendChild(made(tag)).append(...[cell].flat());
+    cells.forEach((cell, column) => {
+      const one = row.appendChild(made(tag));
+      if (tag === "td") one.dataset.head = head[column];
+      one.append(...[cell].flat());
+    });
     return row;
   };
-  const [head, ...others] = rows;
   at(table).replaceChildren(line(head, "th"), ...others.map((cells) => line(cells, "td")));
 }
 
@@ -33,7 +36,7 @@ function revoke(name) {
 
 async function show() {
   const [{ rollouts, tasks }, links] = await Promise.all([ask("agreement"), ask("invitations")]);
-  fill("agreement", [["task", "rated", "score", "alpha", "", "ties open / settled"], ...Object.entries(rollouts).map(([name, total]) => {
+  fill("agreement", [["task", "rated", "score", "alpha", "agreement", "ties open / settled"], ...Object.entries(rollouts).map(([name, total]) => {
     const task = tasks[name] ?? { num_rollouts: 0, conflicts: { open: 0, settled: 0 }, comment: "Nothing is rated yet." };
     const agreed = [typeof task.alpha === "number" ? bar(task) : "", small(task.comment)];
     return [name.replaceAll("_", " "), `${task.num_rollouts} of ${total}`, [number(task.score), small(range(task.score_interval))],
@@ -43,7 +46,7 @@ async function show() {
   for (const { rater } of links) counts[rater] = 0;
   for (const { marks } of Object.values(tasks)) for (const [rater, count] of Object.entries(marks)) counts[rater] = (counts[rater] ?? 0) + count;
   const biases = Object.entries(tasks).flatMap(([task, { raters }]) => raters.map((one) => ({ ...one, task: task.replaceAll("_", " ") })));
-  fill("raters", [["rater", "rollouts", "scores more (+) or less (−) than others", "link", ""], ...Object.keys(counts).sort().map((name) => {
+  fill("raters", [["rater", "rollouts", "scores more (+) or less (−) than others", "link", "action"], ...Object.keys(counts).sort().map((name) => {
     const link = links.find(({ rater }) => rater === name);
     const told = biases.filter(({ rater }) => rater === name).map((one) => small(`${one.task}: ${one.bias > 0 ? "+" : ""}${number(one.bias)} (${range(one.bias_interval)})`));
     const state = link ? `${link.state.replace("_link", "")}, until ${link.ends_at.slice(0, 10)}` : "none, has a key";
