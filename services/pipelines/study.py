@@ -32,6 +32,7 @@ from services.evaluation.studies.engine import (
     run_study,
 )
 from services.evaluation.studies.results import (
+    KEPT_FOLDER,
     PlannedRollout,
     StudyDefinition,
     StudyHeader,
@@ -71,7 +72,7 @@ def _run(options: argparse.Namespace) -> int:
     definition = read_definition(options.study)
     folder = options.folder or options.study.with_suffix("")
     refuse_training_seeds(definition)
-    store_url = str(options.store or folder / "rollouts") if definition.keep_rollouts else None
+    store_url = str(options.store or folder / KEPT_FOLDER) if definition.keep_rollouts else None
     addresses = dict[str, ServedWorld]()
     parts, digests = _parts(definition, addresses, store_url)
     with served_worlds(definition) as served:

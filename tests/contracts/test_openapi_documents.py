@@ -37,7 +37,9 @@ OPERATIONS = {
         check_takes confirm_deletions list_enrolments issue_enrolment exchange_enrolment
         revoke_enrolment trim_episode_steps relabel_items list_notes save_note delete_note
         download_items""",
-    "rating": "get_next_rollout get_step_image submit_mark",
+    "rating": """
+        get_next_rollout get_step_image submit_mark get_agreement list_invitations invite_rater
+        revoke_rater""",
     "studies": "list_studies get_study list_study_rollouts",
     "teleoperation": "stop_hand",
     "worlds": """

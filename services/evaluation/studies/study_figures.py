@@ -9,8 +9,15 @@ from typing import Any, Final
 from pydantic import AwareDatetime
 
 from dextouch.command_line import write_result
+from dextouch.episodes import EpisodeStore
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.filmed_pairs import telling_pairs, title_of
+from services.evaluation.reporting import (
+    PredictionPicture,
+    ReportPictures,
+    episode_pair,
+    write_report,
+)
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import (
     LEAST_DECIDED,
@@ -23,9 +30,11 @@ from services.evaluation.scores import (
     undefined_by,
 )
 from services.evaluation.studies.results import (
+    KEPT_FOLDER,
     PlannedRollout,
     StudyDefinition,
     StudyResults,
+    cell_of,
     cells_of,
     rollout_episode_id,
     study_report,
@@ -313,6 +322,18 @@ def _agreed(
     )
 
 
+def kept_pairs(
+    report: ClosedLoopReport, world: str, results: StudyResults
+) -> tuple[PredictionPicture, ...]:
+    """The telling pairs of a study of those rollouts that its folder keeps."""
+    store, found = EpisodeStore(str(results.path.with_name(KEPT_FOLDER))), []
+    for pair in telling_pairs(report, world).values():
+        ids = [rollout_episode_id(results.header, cell_of(score)) for score in pair]
+        if all(map(store.exists, ids)):
+            found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
+    return tuple(found)
+
+
 def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, Any]:
     """Write all reports beside the results of a study, finished or not, and return the figures.
 
@@ -331,6 +352,7 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
             report.scores, (world, *others), report.policies, report.failures
         ).to_report()
         title = f"{definition.name}: {world} and the real world"
-        write_report(page | {"title": title}, ReportPictures(), folder / f"report {world}.html")
+        shown = ReportPictures(moving=kept_pairs(report, world, results))
+        write_report(page | {"title": title}, shown, folder / f"report {world}.html")
     (folder / TABLES_FILE).write_text(latex_tables(report), encoding="utf-8")
     return figures

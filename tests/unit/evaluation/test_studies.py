@@ -32,6 +32,7 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
+from services.evaluation.studies.study_figures import kept_pairs, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
@@ -428,6 +429,13 @@ def test_kept_rollouts_hold_what_the_worlds_returned(tmp_path, url, study, parts
         np.testing.assert_allclose(array, expected, atol=1e-5)
     images = np.concatenate([one.images["camera_head"] for one in seen]).astype(float)
     assert np.abs(window.images["camera_head"] - images).mean() < 3
+    # The report shows a pair of every task, of the rollouts that were kept.
+    pairs = kept_pairs(report, "dream", results)
+    assert [pair.title.split(",")[0] for pair in pairs] == list(toy.TASKS)
+    assert {pair.true_images.shape[0] for pair in pairs} == {81}
+    write_reports(results, None)
+    page = (tmp_path / "report dream.html").read_text(encoding="utf-8")
+    assert page.count("data:image/webp") == len(toy.TASKS)
     np.testing.assert_allclose(
         episode.read("action_commanded").values[1:], demonstration.commanded[1:]
     )
