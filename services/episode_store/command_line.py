@@ -62,7 +62,14 @@ from dextouch.serving import configure_logging, load_settings
 from services.episode_store.catalog import Catalog
 from services.episode_store.command_context import Context, Outcome
 from services.episode_store.deletions import deletion_statuses
-from services.episode_store.editing_commands import merge, note, relabel, trim
+from services.episode_store.editing_commands import (
+    backup,
+    merge,
+    note,
+    relabel,
+    restore_of_backup,
+    trim,
+)
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 from services.episode_store.settings import EpisodeStoreSettings
@@ -500,5 +507,7 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "trim": trim,
     "relabel": relabel,
     "merge": merge,
+    "backup": backup,
+    "restore-backup": restore_of_backup,
     "note": note,
 }
