@@ -250,11 +250,8 @@ class _Backup:
         """Remove what the source lacks; what was permanently deleted there, from the trash, too."""
         records = DeletionRecords(self.source.root)
         for kind, name in sorted(gone):
-            covered = None
-            with suppress(CorruptDataError):
-                covered = deletion_of(records, self.target.open_item(kind, name).attributes)
-            self.target.delete(name, kind=kind, for_good=covered is not None)
-            self._note(BackupReport(kind, name, "retired" if covered is None else "erased"))
+            self.target.delete(name, kind=kind)
+            self._note(BackupReport(kind, name, "retired"))
         for entry in self.target.trash_list() if self.target.folders else ():
             if entry.kind != "upload":
                 files = LocalGroup(entry.folder)
