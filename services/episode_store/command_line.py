@@ -186,7 +186,9 @@ def show(context: Context) -> Outcome:
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
     streams = {}
-    rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
+    rows: list[tuple[str, ...]] = [
+        ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
+    ]
     for name, descriptor in reader.streams.items():
         entry = contents.entries[name]
         codec = entry.attributes.get("encoding", entry.codec)
@@ -196,7 +198,9 @@ def show(context: Context) -> Outcome:
         shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
+        per_hour = round(3600 * rate_hz * num_bytes / max(1, num_samples))
         streams[name] = {
+            "bytes_per_hour": per_hour,
             "rate_hz": rate_hz,
             "num_samples": num_samples,
             "num_gaps": num_gaps,
@@ -204,8 +208,9 @@ def show(context: Context) -> Outcome:
             "codec": codec,
             "encoder": entry.encoder,
         }
-        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
-        rows.append((name, *numbers, codec, entry.encoder or ""))
+        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps))
+        sizes = (readable_size(num_bytes), readable_size(per_hour))
+        rows.append((name, *numbers, *sizes, codec, entry.encoder or ""))
     result = {
         "attributes": json_ready(reader.attributes),
         "num_samples": {name: reader.num_samples(name) for name in reader.streams},
@@ -219,6 +224,7 @@ def show(context: Context) -> Outcome:
         say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
+    say(f"{readable_size(sum(one['bytes_per_hour'] for one in streams.values()))} per hour")
     say(f"content {reader.content_sha256}")
     return result, 0
 

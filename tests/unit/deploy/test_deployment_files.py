@@ -15,6 +15,7 @@ import yaml
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.take import STALL_NS
 from services.cli.main import COMMANDS, find_command
+from services.episode_store.parser import store_parser
 from tests.containers import engine
 from tests.containers.engine import PACKAGES
 from tests.system.compose_processes import VARIABLE, keys_of
@@ -343,4 +344,5 @@ def test_units_start_commands_that_exist_on_the_ports_of_the_tls_examples(name, 
 def test_the_backup_is_made_by_a_command_that_exists():
     unit = (ROOT / "deploy/systemd/dextouch-backup.service").read_text()
     (words,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
-    assert find_command(words.split())[0] == "store backup"
+    command, rest = find_command(words.split())
+    assert (command, store_parser().parse_args(rest).command) == ("store", "backup")

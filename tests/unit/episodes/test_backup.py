@@ -57,7 +57,12 @@ def test_a_backup_is_incremental_and_restores_every_byte(stores):
     source.set_review("take-aligned", ACCEPTED)
     source.set_clicks("take-aligned", EpisodeClicks.model_validate({"objects": {}}))
     source.change_notes("take", lambda _: NOTES, kind="recording")
+    # Neither an item, nor damage.
+    (source.root / "episodes/.DS_Store").touch()
+    (source.root / "episodes/half").mkdir()
     assert set(actions(back_up(source, backup)).values()) == {"copied"}
+    (source.root / "episodes/.DS_Store").unlink()
+    (source.root / "episodes/half").rmdir()
     assert not differences(source, backup)
     assert not (backup.root / "episodes/take-aligned/action/c/0/0").samefile(
         source.root / "episodes/take-aligned/action/c/0/0"

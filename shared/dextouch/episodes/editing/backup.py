@@ -11,13 +11,7 @@ from typing import Final, Literal
 
 from pydantic import AwareDatetime, Base64Bytes, Field, ValidationError
 
-from dextouch.episodes.care import (
-    CATALOG_FOLDER,
-    DeletionRecords,
-    Finding,
-    inspect_group,
-    open_contents,
-)
+from dextouch.episodes import care
 from dextouch.episodes.editing.merge import copy_item, deletion_of
 from dextouch.episodes.files import LocalGroup, disk_errors, held_folder, replace_file
 from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, stated_sha256
@@ -36,12 +30,7 @@ from dextouch.frozen_model import FrozenModel
 BACKUP_FILE: Final = "backup.json"
 # What a store must not forget, beside its items. The journals of running deletions stay: they name
 # operators, and the records say enough.
-_KEPT: Final = (
-    "enrolments.json",
-    ".deleted/salt",
-    ".deleted/records/*.json",
-    ".deleted/stations/*.json",
-)
+_KEPT: Final = ("enrolments.json", ".deleted/salt", ".deleted/records/*", ".deleted/stations/*")
 # An episode is listed before the recording that it was made of can have been missed.
 _ORDER: Final[tuple[Kind, ...]] = ("episode", "recording")
 Action = Literal["copied", "there", "updated", "retired", "erased", "refused", "damaged"]
@@ -66,6 +55,7 @@ class BackupList(FrozenModel):
     items: tuple[BackedUpItem, ...] = ()
     files: dict[str, Base64Bytes] = Field(default={})
 
+    @property
     def by_name(self) -> dict[tuple[Kind, str], BackedUpItem]:
         """Items by kind and id."""
         return {(item.kind, item.id): item for item in self.items}
@@ -126,15 +116,15 @@ def back_up(
     # Another backup to the same place ends first; in a bucket, one from this machine.
     with held_folder(target.root):
         former = read_backup_list(target) or _begin(source, target)
-        found: dict[tuple[Kind, str], str] = {}
+        known, found = former.by_name, dict[tuple[Kind, str], str]()
         for kind in _ORDER:
             numbers = source.folder_numbers(kind=kind)
             stamps = source.stamps(numbers, kind=kind)
-            # An item whose commit record was lost is damaged, not gone.
-            found |= {
-                (kind, name): " ".join(stamps.get(name, ("", "", ""))[1:]) for name in numbers
-            }
-        gone = former.by_name().keys() - found.keys()
+            for name in numbers:
+                if name in stamps or (kind, name) in known:
+                    # Without a stamp its commit record was lost: it is damaged, not gone.
+                    found[kind, name] = " ".join(stamps[name][1:]) if name in stamps else ""
+        gone = known.keys() - found.keys()
         if 2 * len(gone) > len(former.items) and not accept_deletions:
             raise ConflictError(
                 f"backup: {len(gone)} of {len(former.items)} items of {target.url} are gone from "
@@ -173,7 +163,7 @@ def restore_backup(
             f"restore-backup: {backup.url} has no {BACKUP_FILE}: it is no backup; `dextouch store "
             "merge` copies other stores"
         )
-    wanted = listing.by_name()
+    wanted = listing.by_name
     present = [(kind, name) for kind in KINDS for name in target.list(kind=kind)]
     if others := [name for kind, name in present if (kind, name) not in wanted]:
         raise ConflictError(
@@ -215,7 +205,7 @@ class _Backup:
     reports: list[BackupReport] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._before = self.former.by_name()
+        self._before = self.former.by_name
         self._held = {kind: set(self.target.list(kind=kind)) for kind in KINDS}
 
     def follow(self, kind: Kind, name: str, stamp: str) -> None:
@@ -241,14 +231,14 @@ class _Backup:
             self._note(BackupReport(kind, name, action), item)
         except NotFoundError as error:
             # Otherwise deleted since it was listed: the next backup retires what was copied of it.
-            if not stamp.strip() and before is not None:
+            if not stamp and before is not None:
                 self._note(BackupReport(kind, name, "refused", error.message), before)
         except DexTouchError as error:
             self._note(BackupReport(kind, name, "refused", error.message), before)
 
     def retire(self, gone: set[tuple[Kind, str]]) -> None:
         """Remove what the source lacks; what was permanently deleted there, from the trash, too."""
-        records = DeletionRecords(self.source.root)
+        records = care.DeletionRecords(self.source.root)
         for kind, name in sorted(gone):
             self.target.delete(name, kind=kind)
             self._note(BackupReport(kind, name, "retired"))
@@ -257,12 +247,12 @@ class _Backup:
                 files = LocalGroup(entry.folder)
                 files.item_id = entry.item_id
                 with suppress(StorageError):
-                    if deletion_of(records, open_contents(files, entry.kind).attributes):
+                    if deletion_of(records, care.open_contents(files, entry.kind).attributes):
                         remove_for_good(entry.folder)
                         self._note(BackupReport(entry.kind, entry.item_id, "erased"))
         if any(one.action == "erased" for one in self.reports):
             # A cache, which `store list` may have made here.
-            shutil.rmtree(self.target.root / CATALOG_FOLDER, ignore_errors=True)
+            shutil.rmtree(self.target.root / care.CATALOG_FOLDER, ignore_errors=True)
 
     def _note(self, report: BackupReport, item: BackedUpItem | None = None) -> None:
         if item is not None:
@@ -278,8 +268,8 @@ def _content(store: EpisodeStore, kind: Kind, name: str) -> str | None:
     return stated_sha256(store.files(name, kind=kind).get_now(COMMIT_FILE))
 
 
-def _damage(store: EpisodeStore, item: BackedUpItem) -> tuple[Finding, ...]:
-    return inspect_group(store.files(item.id, kind=item.kind), item.kind).findings
+def _damage(store: EpisodeStore, item: BackedUpItem) -> tuple[care.Finding, ...]:
+    return care.inspect_group(store.files(item.id, kind=item.kind), item.kind).findings
 
 
 def _check_apart(source: EpisodeStore, target: EpisodeStore) -> None:
