@@ -185,7 +185,7 @@ def show(context: Context) -> Outcome:
     reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
-    streams = {}
+    streams, total_per_hour = {}, 0
     rows: list[tuple[str, ...]] = [
         ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
     ]
@@ -199,6 +199,7 @@ def show(context: Context) -> Outcome:
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
         per_hour = round(3600 * rate_hz * num_bytes / max(1, num_samples))
+        total_per_hour += per_hour
         streams[name] = {
             "bytes_per_hour": per_hour,
             "rate_hz": rate_hz,
@@ -224,7 +225,7 @@ def show(context: Context) -> Outcome:
         say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
-    say(f"{readable_size(sum(one['bytes_per_hour'] for one in streams.values()))} per hour")
+    say(f"{readable_size(total_per_hour)} per hour")
     say(f"content {reader.content_sha256}")
     return result, 0
 

@@ -108,9 +108,10 @@ def test_at_a_terminal_the_service_ends_with_it(handler, monkeypatch):
             return True
 
     monkeypatch.setattr(sys, "stdin", Terminal())
+    before = signal.getsignal(signal.SIGHUP)
     app = create_service_app(name="probe", settings=ServiceSettings(), routers=[])
     reload_keys_at_hangup(app, ServiceSettings)
-    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGHUP) == before
 
 
 async def test_a_session_ends_with_its_key(tmp_path):
