@@ -85,6 +85,8 @@ def create_app(
     num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
     num_sessions.set_function(lambda: sessions.num_open)
     app.state.sessions = sessions
+    # The same keys, also after they were exchanged.
+    sessions.access = app.state.access
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app

@@ -246,7 +246,9 @@ class Sessions:
 
     def _grant(self, token: str) -> Grant | None:
         grant, end_s = self._open.get(token, (None, 0.0))
-        return grant if end_s > self.clock_s() else None
+        # A key that the settings no longer have takes its sessions along.
+        is_open = grant is not None and end_s > self.clock_s() and grant.name in self.access.names
+        return grant if is_open else None
 
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""

@@ -36,6 +36,7 @@ logger = structlog.get_logger(__name__)
 ENROLMENTS_FILE = "enrolments.json"
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
 RETRY_PERIOD_S: Final = 30.0
+TRASH_PERIOD_S: Final = 3600.0
 # How soon a deletion reaches an upload that nobody continues.
 WATCH_PERIOD_S: Final = 1.0
 
@@ -109,6 +110,21 @@ class PendingUploads(PeriodicThread):
                 logger.info("unfinished_writes_removed", count=removed)
 
 
+class TrashRetention(PeriodicThread):
+    """Permanently deletes what has been in the trash of a store in a folder for some days."""
+
+    def __init__(self, store: EpisodeStore, keep_days: float | None) -> None:
+        super().__init__("trash_not_purged", TRASH_PERIOD_S)
+        self._store, self._keep_days = store, keep_days
+
+    def work(self) -> None:
+        """Purge once."""
+        if self._keep_days is None or not self._store.folders:
+            return
+        for entry in self._store.purge(older_than_s=86_400.0 * self._keep_days):
+            logger.info("trash_purged", kind=entry.kind, id=entry.item_id)
+
+
 class DeletionWatch(PeriodicThread):
     """Drops uploads of deleted takes that nobody continues, soon after the deletion.
 
@@ -146,23 +162,25 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     )
     metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
-    watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
-    pending, index = PendingUploads(store), catalog.index
-    # Reading a large store takes minutes, and can be interrupted anywhere.
-    check = PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0)
+    index = catalog.index
+    threads = (
+        PendingUploads(store),
+        # Reading a large store takes minutes, and can be interrupted anywhere.
+        PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0),
+        DeletionWatch(deletions, ingest.drop_deleted, limits.end),
+        TrashRetention(store, settings.keep_trash_days),
+    )
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        pending.start()
-        check.start()
-        watch.start()
+        for thread in threads:
+            thread.start()
         try:
             yield
         finally:
-            pending.stop()
-            check.stop()
-            watch.stop()
+            for thread in threads:
+                thread.stop()
             ingest.close()
 
     app = create_service_app(

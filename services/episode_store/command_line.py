@@ -91,7 +91,8 @@ def _configured_url() -> str:
 def _editing_command(name: str) -> Callable[[Context], Outcome]:
     from services.episode_store import editing_commands
 
-    command: Callable[[Context], Outcome] = getattr(editing_commands, name)
+    of_name = "restore_of_backup" if name == "restore-backup" else name
+    command: Callable[[Context], Outcome] = getattr(editing_commands, of_name)
     return command
 
 
@@ -175,8 +176,10 @@ def show(context: Context) -> Outcome:
     reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
-    streams = {}
-    rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
+    streams, total_per_hour = {}, 0
+    rows: list[tuple[str, ...]] = [
+        ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
+    ]
     for name, descriptor in reader.streams.items():
         entry = contents.entries[name]
         codec = entry.attributes.get("encoding", entry.codec)
@@ -186,7 +189,10 @@ def show(context: Context) -> Outcome:
         shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
+        per_hour = round(3600 * rate_hz * num_bytes / max(1, num_samples))
+        total_per_hour += per_hour
         streams[name] = {
+            "bytes_per_hour": per_hour,
             "rate_hz": rate_hz,
             "num_samples": num_samples,
             "num_gaps": num_gaps,
@@ -194,8 +200,9 @@ def show(context: Context) -> Outcome:
             "codec": codec,
             "encoder": entry.encoder,
         }
-        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
-        rows.append((name, *numbers, codec, entry.encoder or ""))
+        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps))
+        sizes = (readable_size(num_bytes), readable_size(per_hour))
+        rows.append((name, *numbers, *sizes, codec, entry.encoder or ""))
     result = {
         "attributes": json_ready(reader.attributes),
         "num_samples": {name: reader.num_samples(name) for name in reader.streams},
@@ -209,6 +216,7 @@ def show(context: Context) -> Outcome:
         say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
+    say(f"{readable_size(total_per_hour)} per hour")
     say(f"content {reader.content_sha256}")
     return result, 0
 

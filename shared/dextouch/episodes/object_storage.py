@@ -284,6 +284,14 @@ class ObjectStorage:
         else:
             self._bucket.put(key, content)
 
+    def get_file(self, name: str) -> bytes | None:
+        """An object beside the groups; None if it does not exist."""
+        return self._bucket.get(name)
+
+    def put_file(self, name: str, content: bytes) -> None:
+        """Put an object beside the groups in place of an earlier one."""
+        self._bucket.put(name, content)
+
     def held(self, kind: Kind, item_id: str, *, waits: bool) -> AbstractContextManager[None]:
         """Nothing: a bucket has no locks; only that the group exists."""
         self.group(kind, item_id)

@@ -262,6 +262,29 @@ class EpisodeStore:
             self._set_remark(kind, item_id, NOTES_FILE, found if found.notes else None)
         return found
 
+    def copy_remarks(self, source: "EpisodeStore", item_id: str, *, kind: Kind) -> bool:
+        """Make the remarks on an item those of another store, byte for byte; whether any changed.
+
+        Raises NotFoundError without the id in both.
+        """
+        theirs, ours = source.files(item_id, kind=kind), self.files(item_id, kind=kind)
+        changed = {
+            name: content
+            for name in REMARK_FILES
+            if (content := theirs.get(name)) != ours.get(name)
+        }
+        for name, content in changed.items():
+            self._storage.set_remark(kind, item_id, name, content)
+        return bool(changed)
+
+    def get_file(self, name: str) -> bytes | None:
+        """A small file of the store as a whole, beside its items; None where there is none."""
+        return self._storage.get_file(name)
+
+    def put_file(self, name: str, content: bytes) -> None:
+        """Replace a file that `get_file` reads; nobody but its owner may read it."""
+        self._storage.put_file(name, content)
+
     def held(self, item_id: str, *, kind: Kind = "episode") -> AbstractContextManager[None]:
         """Hold an item while it is edited, so that no other program edits it; not in a bucket.
 
@@ -462,6 +485,16 @@ class _LocalStorage:
             except FileNotFoundError as error:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
+
+    def get_file(self, name: str) -> bytes | None:
+        path = self.root / name
+        with disk_errors(f"read {path}"):
+            return path.read_bytes() if path.is_file() else None
+
+    def put_file(self, name: str, content: bytes) -> None:
+        with disk_errors(f"write {self.root / name}"):
+            self.root.mkdir(parents=True, exist_ok=True)
+            replace_file(self.root / name, content, mode=0o600)
 
     @contextmanager
     def held(self, kind: Kind, item_id: str, *, waits: bool) -> Iterator[None]:

@@ -369,11 +369,16 @@ class HealthHistory(FrozenModel):
 
 
 class EnrolStation(FrozenModel):
-    """Request for a token; the station's key will have the station's name."""
+    """Request for a token; the station's key will have the station's name.
+
+    Attributes:
+        renew: for a station that has a key, which stays valid beside the new one.
+    """
 
     model_config = example(station="bench-1")
 
     station: KeyName
+    renew: bool = False
 
 
 class EnrolmentToken(FrozenModel):

@@ -119,8 +119,12 @@ class AccessControl:
     """The keys of one service; without keys (loopback only, see settings) access is open."""
 
     def __init__(self, api_keys: Sequence[ApiKey]) -> None:
-        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
         self._enrolled: tuple[tuple[bytes, Grant], ...] = ()
+        self.set_keys(api_keys)
+
+    def set_keys(self, api_keys: Sequence[ApiKey]) -> None:
+        """Accept these keys in place of those of the settings."""
+        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
 
     @property
     def has_keys(self) -> bool:
