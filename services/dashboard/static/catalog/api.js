@@ -1,20 +1,14 @@
 // Requests to the store and to alignment through the dashboard; refusals become errors with their reason.
 
-import { ask } from "../session.js";
-
-async function read(answer) {
-  if (answer.ok) return answer.json();
-  const problem = await answer.json().catch(() => ({}));
-  throw new Error(problem.detail ?? `The dashboard answered ${answer.status}.`, { cause: answer.status });
-}
+import { ask, checked } from "../session.js";
 
 export async function get(path) {
-  return read(await ask(path));
+  return (await checked(await ask(path))).json();
 }
 
 export async function post(path, body) {
   const headers = { "content-type": "application/json" };
-  return read(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }));
+  return (await checked(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }))).json();
 }
 
 // Services that this dashboard was started without are not asked again.

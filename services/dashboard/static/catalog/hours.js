@@ -1,9 +1,9 @@
 // Hours of recorded episodes by task, operator, station and day, by what was said of them in review.
 
-import { element, setText } from "../dom.js";
+import { date } from "../dates.js";
+import { element, find, repeat, setText } from "../dom.js";
 import { number, plural } from "../format.js";
 import { pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
 import { get } from "./api.js";
 import { bars, counted, withGoals } from "./hours_rows.js";
 import { readQuery, storeQuery } from "./query.js";
@@ -11,7 +11,6 @@ import { readQuery, storeQuery } from "./query.js";
 const REFRESH_MS = 30000;
 const FIELDS = ["task", "operator", "station", "day"];
 const NAMES = ["origin", "domain", "task", "operator", "from", "to"];
-const find = (id) => document.getElementById(id);
 const form = find("filters");
 const goals = JSON.parse(find("hours").dataset.goals);
 let asked = 0;
@@ -36,10 +35,10 @@ function bar({ parts, goal }) {
   return node;
 }
 
-function row(data, drawn) {
+function row(field, data, drawn) {
   const cell = (text, name = "number") => element("td", { class: name }, text);
   const goal = data.goal_h === null ? "" : `${Math.round(100 * drawn.reached)} % of ${hours(data.goal_h)}`;
-  const label = data.value ?? "not known";
+  const label = data.value === null ? "not known" : field === "day" ? date(`${data.value}T00:00`, "day") : data.value;
   return element("tr", {}, element("th", { scope: "row", title: label }, element("span", { class: "clipped" }, label)), element("td", { class: "bars" }, bar(drawn)),
     cell(hours(data.accepted_h)), cell(hours(data.not_reviewed_h)), cell(hours(data.rejected_h)), cell(hours(drawn.total_h)),
     cell(String(data.num_episodes)), cell(goal, "number goal"));
@@ -50,7 +49,7 @@ function show(field, rows) {
   const listed = field === "task" ? withGoals(rows, wantedGoals()) : rows.map((one) => ({ ...one, goal_h: null }));
   if (field === "day") listed.reverse();
   const drawn = bars(listed);
-  find(`${field}_rows`).replaceChildren(...listed.map((one, index) => row(one, drawn[index])));
+  find(`${field}_rows`).replaceChildren(...listed.map((one, index) => row(field, one, drawn[index])));
   find(`${field}_empty`).hidden = listed.length > 0;
   return listed;
 }
@@ -115,8 +114,6 @@ form.addEventListener("input", () => {
   refresh();
 });
 form.addEventListener("submit", (event) => event.preventDefault());
-setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);
-startTheme(find("theme"), () => {});
 await showChoices();
 showAddress();
-await refresh();
+await repeat(refresh, REFRESH_MS);

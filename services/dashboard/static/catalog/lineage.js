@@ -8,7 +8,8 @@ import { under } from "./cells.js";
 const RELATIONS = [["source", "Made from"], ["self", "This item"], ["product", "Made from this item"]];
 const PLAYED = ["recording", "episode"];
 
-function nodeItem(node) {
+// A line of an item's lineage.
+export function nodeItem(node) {
   const name = node.is_stored && PLAYED.includes(node.kind)
     ? element("a", { href: pagePath(`/episodes/${node.kind}/${encodeURIComponent(node.id)}`) }, node.id)
     : element("strong", {}, node.id);

@@ -1,8 +1,7 @@
 // The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
 
-import { element, setText } from "../dom.js";
+import { element, find, repeat, setText } from "../dom.js";
 import { pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
 import { get, getIfServed, post } from "./api.js";
 import * as cells from "./cells.js";
 import { Grid } from "./grid.js";
@@ -14,7 +13,6 @@ import { playerPath, reasonOf, subjectOf } from "./stage.js";
 const REFRESH_MS = 5000;
 const MAX_ROWS = 100;
 const MAX_ITEMS = 500;
-const find = (id) => document.getElementById(id);
 const form = find("filters");
 const dialog = find("reject_dialog");
 const reasons = dialog.querySelector("form").elements;
@@ -27,7 +25,7 @@ function row({ item, job }) {
   const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
   if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, `alignment failed: ${reasonOf(job)}`));
   const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
-  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item), cells.taskCell(item),
+  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item.at), cells.taskCell(item),
     cells.nameCell(item, pagePath(playerPath(item))), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
 }
 
@@ -170,7 +168,4 @@ form.elements.task.append(...values.tasks.map((value) => element("option", { val
 form.elements.task.value = given.get("task") ?? "";
 form.elements.origin.value = given.get("origin") === "any" ? "" : given.get("origin") ?? "recorded";
 form.elements.reviewer.value = localStorage.getItem("reviewer") ?? "";
-document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
-setInterval(() => { if (!document.hidden && !dialog.open) refresh(); }, REFRESH_MS);
-startTheme(find("theme"), () => {});
-await refresh();
+await repeat(async () => { if (!dialog.open) await refresh(); }, REFRESH_MS);
