@@ -19,6 +19,7 @@ _SPEC = importlib.util.spec_from_file_location(
 )
 items = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(items)
+KEYS = {"a": "the-key-of-one-person", "b": "the-key-of-another"}
 QUALITY = {
     "origin_after_start_ns": 250_000_007.0,
     "camera_head_num_gaps": 1.0,
@@ -38,7 +39,7 @@ def played(tmp_path_factory):
 def serve_people(serve, played):
     """A dashboard of two stations, and the keys of two people."""
     store = serve(create_store(EpisodeStoreSettings(store_url=str(played[0]))))
-    keys = [{"name": name, "key": f"key-of-{name}", "scopes": ("operate",)} for name in "ab"]
+    keys = [{"name": name, "key": KEYS[name], "scopes": ("operate",)} for name in KEYS]
     settings = DashboardSettings(
         episode_store_url=store, api_keys=keys, stations={"desk_2": "http://127.0.0.1:9"}
     )
@@ -83,8 +84,9 @@ def test_actions_have_names_and_units(page, address):
     page.locator("#signal_value").fill("left thumb mcp")
     page.get_by_role("button", name="Plot").click()
     expect(page.locator(".plot[data-signal='action.20'] .plot_note")).to_have_text("rad")
-    bars = page.locator(".action_view").bounding_box()
-    page.mouse.move(bars["x"] + 20.5 / 67 * bars["width"], bars["y"] + 40)
+    bars = page.locator(".action_view")
+    width = bars.bounding_box()["width"]
+    bars.hover(position={"x": 20.5 / 67 * width, "y": 60})
     expect(page.locator("#action .readout")).to_contain_text("left thumb mcp: ")
 
 
@@ -124,7 +126,7 @@ def test_figures_lead_to_their_worst_second(page, address, played):
 
 def sign_in(page, address, name):
     page.goto(address)
-    page.get_by_label("Key", exact=True).fill(f"key-of-{name}")
+    page.get_by_label("Key", exact=True).fill(KEYS[name])
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Sign out")).to_be_visible()
 

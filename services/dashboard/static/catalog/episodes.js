@@ -3,7 +3,7 @@
 import { element, find, repeat, setText } from "../dom.js";
 import { bytes, plural } from "../format.js";
 import { pagePath } from "../session.js";
-import { get, getIfServed, newestJobs, post } from "./api.js";
+import { get, getIfServed, listChoices, newestJobs, post } from "./api.js";
 import * as cells from "./cells.js";
 import { ExportDialog } from "./export.js";
 import { Grid } from "./grid.js";
@@ -87,23 +87,11 @@ async function refresh() {
     grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
     find("empty").hidden = made.length > 0;
     find("empty").replaceChildren(...nothing());
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
     showPager();
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The list is not up to date: ${error.message}`);
-  }
-}
-
-async function showChoices() {
-  const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [], operators: [], stations: [] }));
-  for (const [name, found] of [["task", values.tasks], ["operator", values.operators], ["station", values.stations]]) {
-    const select = form.elements[name];
-    const chosen = query.filters[name];
-    const all = chosen && !found.includes(chosen) ? [...found, chosen] : found;
-    select.replaceChildren(element("option", { value: "" }, "all"), ...all.map((value) => element("option", { value }, value)));
-    select.value = chosen;
   }
 }
 
@@ -259,7 +247,8 @@ form.addEventListener("input", (event) => {
   clearTimeout(typed);
   const isTyping = event.target.name === "text";
   typed = setTimeout(() => {
-    go({ filters: { ...query.filters, [event.target.name]: event.target.value } }, { isTyping });
+    // All of them: a field that was changed a moment before is not lost.
+    go({ filters: Object.fromEntries(FILTERS.map((name) => [name, form.elements[name].value])) }, { isTyping });
   }, isTyping ? TYPING_MS : 0);
 });
 form.addEventListener("submit", (event) => { event.preventDefault(); document.activeElement?.blur(); grid.focus(); });
@@ -271,5 +260,6 @@ for (const head of document.querySelectorAll("[data-sort]")) {
 listen(grid, { form, actions: KEYS, buttons: [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"], ["export", "e"]] });
 window.addEventListener("popstate", () => { query = readQuery(location.search); showQuery(); refresh(); });
 showQuery();
-await showChoices();
+const { task, operator, station } = query.filters;
+await listChoices(form, { task, operator, station });
 await repeat(refresh, REFRESH_MS);

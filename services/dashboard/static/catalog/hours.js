@@ -4,7 +4,7 @@ import { date } from "../dates.js";
 import { element, find, repeat, setText } from "../dom.js";
 import { number, plural } from "../format.js";
 import { pagePath } from "../session.js";
-import { get } from "./api.js";
+import { get, listChoices } from "./api.js";
 import { bars, counted, withGoals } from "./hours_rows.js";
 import { readQuery, storeQuery } from "./query.js";
 
@@ -87,10 +87,9 @@ async function refresh() {
     const sum = (of) => shown[0].reduce((total, one) => total + of(one), 0);
     const kept = plural(sum((one) => one.num_episodes), "episode");
     setText(find("total"), shown[0].length ? `${hours(sum(counted))} in ${kept}, hours without rejected ones` : "no episodes");
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The hours are not up to date: ${error.message}`);
   }
 }
@@ -102,18 +101,12 @@ function showAddress() {
   form.elements.origin.value = origin === "any" ? "" : origin;
 }
 
-async function showChoices() {
-  const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [], operators: [] }));
-  for (const [name, found] of [["task", values.tasks], ["operator", values.operators]]) {
-    form.elements[name].replaceChildren(element("option", { value: "" }, "all"), ...found.map((value) => element("option", { value }, value)));
-  }
-}
-
 form.addEventListener("input", () => {
   history.replaceState(null, "", pagePath(`${location.pathname}?${address()}`));
   refresh();
 });
 form.addEventListener("submit", (event) => event.preventDefault());
-await showChoices();
+const { task, operator } = readQuery(location.search).filters;
+await listChoices(form, { task, operator });
 showAddress();
 await repeat(refresh, REFRESH_MS);

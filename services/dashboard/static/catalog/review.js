@@ -2,7 +2,7 @@
 
 import { element, find, repeat, setText } from "../dom.js";
 import { pagePath } from "../session.js";
-import { get, getIfServed, post } from "./api.js";
+import { get, getIfServed, listChoices, post } from "./api.js";
 import * as cells from "./cells.js";
 import { Grid } from "./grid.js";
 import { listen, say, showSelected } from "./grid_keys.js";
@@ -62,10 +62,9 @@ async function refresh() {
     setText(find("left"), queue.length ? `${queue.length + more} to review${more ? `, the first ${queue.length} listed` : ""}` : "");
     find("empty").hidden = queue.length > 0;
     setText(find("few"), fewWords(groups, { task: form.elements.task.value, origin: form.elements.origin.value }));
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The queue is not up to date: ${error.message}`);
   }
 }
@@ -163,9 +162,7 @@ form.addEventListener("input", (event) => {
 });
 
 const given = new URLSearchParams(location.search);
-const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [] }));
-form.elements.task.append(...values.tasks.map((value) => element("option", { value }, value)));
-form.elements.task.value = given.get("task") ?? "";
+await listChoices(form, { task: given.get("task") ?? "" });
 form.elements.origin.value = given.get("origin") === "any" ? "" : given.get("origin") ?? "recorded";
 form.elements.reviewer.value = localStorage.getItem("reviewer") ?? "";
 await repeat(async () => { if (!dialog.open) await refresh(); }, REFRESH_MS);

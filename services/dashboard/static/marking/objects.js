@@ -138,9 +138,8 @@ async function open(name) {
     const more = queue.num_matching - queue.episodes.length;
     setText(find("more"), more > 0 ? `${more} more could be marked; 10 to 30 are enough to begin with.` : "");
     find("empty").hidden = queue.episodes.length > 0;
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
-    find("list_error").hidden = false;
     setText(find("list_error"), error.message);
     Object.assign(state, { objects: [], episodes: [] });
   }

@@ -1,11 +1,11 @@
 // Facts about the item: what was done by whom, how it ended, its quality, clocks, lineage and exports.
 
 import { downloadControl } from "../catalog/download.js";
+import { nodeItem } from "../catalog/lineage.js";
 import { commandLine } from "../command.js";
 import { date } from "../dates.js";
 import { element, levelBadge } from "../dom.js";
 import { number, plural } from "../format.js";
-import { pagePath } from "../session.js";
 import { byStage, worstOf } from "./figures.js";
 import { fetchFacts } from "./item.js";
 
@@ -99,10 +99,7 @@ const RELATIONS = { source: "made from", product: "used in" };
 function lineage(nodes) {
   const others = nodes.filter((node) => node.relation !== "self");
   if (!others.length) return null;
-  const link = ({ kind, id, is_stored }) => (is_stored && ["recording", "episode"].includes(kind)
-    ? element("a", { href: pagePath(`/episodes/${kind}/${encodeURIComponent(id)}`) }, id) : element("span", {}, `${id}${is_stored ? "" : " (not in this store)"}`));
-  return block("Lineage", element("ul", { class: "lineage" },
-    ...others.map((node) => element("li", {}, `${RELATIONS[node.relation]} ${node.kind} `, link(node), node.summary ? element("span", { class: "quiet" }, ` ${node.summary}`) : null))));
+  return block("Lineage", element("ul", { class: "lineage" }, ...others.map((node) => nodeItem(node, RELATIONS[node.relation]))));
 }
 
 function exports({ kind, id }) {

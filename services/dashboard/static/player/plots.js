@@ -10,7 +10,6 @@ const HEIGHT_PX = 110;
 const MAX_POINTS = 2000;
 const MAX_PER_REQUEST = 16;
 const DELAY_MS = 120;
-const LABEL_PX = 18;
 const FONT = "11px system-ui";
 
 function sizeOf(root, name) {
@@ -147,7 +146,7 @@ export class Plots {
   chart(plot, data, { has_raw, has_own_scale, unit, raw_unit }) {
     const curve = (colour, scale, width = 1.25) => ({ scale, stroke: () => css(colour), width, points: { show: false }, spanGaps: false });
     const raw_scale = has_own_scale ? "raw" : "y";
-    const axis = (label, gutter, more) => ({ label, labelSize: LABEL_PX, labelFont: FONT, labelGap: 0, size: sizeOf(this.root, gutter) - LABEL_PX, font: FONT, stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, ...more });
+    const axis = (axis_unit, gutter, more) => ({ values: (_, splits) => splits.map((value) => `${Number(value.toPrecision(6))} ${axis_unit}`), size: sizeOf(this.root, gutter), font: FONT, stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, ...more });
     const right = has_raw && has_own_scale;
     const chart = new uPlot({
       width: this.root.clientWidth,
@@ -157,7 +156,7 @@ export class Plots {
       cursor: { drag: { x: false, y: false }, points: { show: false } },
       scales: { x: { time: false, auto: false }, y: {}, ...(right ? { raw: {} } : {}) },
       axes: [
-        axis(null, "--gutter_left", { label: undefined, size: 0, values: () => [] }),
+        axis("", "--gutter_left", { size: 0, values: () => [] }),
         axis(unit, "--gutter_left", { scale: "y" }),
         ...(right ? [axis(raw_unit, "--gutter_right", { scale: "raw", side: 1, grid: { show: false } })] : []),
       ],
