@@ -65,7 +65,7 @@ function range() {
   const start_s = end_s - view.range_s;
   // What is live begins with its first row: a station that just started fills the plots.
   const first_s = view.end_s === null ? history.times_s[0] ?? start_s : start_s;
-  return [Math.min(Math.max(start_s, first_s), end_s - LEAST_RANGE_S), end_s];
+  return [Math.min(Math.max(start_s, first_s), end_s - Math.min(LEAST_RANGE_S, view.range_s)), end_s];
 }
 
 function data(name) {

@@ -243,12 +243,14 @@ function lineageSubject() {
 const exporting = new ExportDialog(find("export_dialog"));
 const grid = new Grid(find("rows"), { onChange: () => showSelection(), onOpen: open });
 let typed = null;
+let changed = {};
 form.addEventListener("input", (event) => {
   clearTimeout(typed);
+  changed[event.target.name] = event.target.value;
   const isTyping = event.target.name === "text";
   typed = setTimeout(() => {
-    // All of them: a field that was changed a moment before is not lost.
-    go({ filters: Object.fromEntries(FILTERS.map((name) => [name, form.elements[name].value])) }, { isTyping });
+    go({ filters: { ...query.filters, ...changed } }, { isTyping });
+    changed = {};
   }, isTyping ? TYPING_MS : 0);
 });
 form.addEventListener("submit", (event) => { event.preventDefault(); document.activeElement?.blur(); grid.focus(); });
