@@ -353,6 +353,7 @@ def _shown(
             settings=settings,
             goals=json.dumps(settings.goal_hours),
             signed_in=sessions.needs_key,
+            person=sessions.person(request) or "",
             document=document,
         )
 

@@ -113,7 +113,7 @@ def test_a_relabel_changes_what_was_typed_and_nothing_else(page, address, store)
     dialog.locator("[name=instruction]").fill("it's up")
     dialog.locator("[name=instruction]").blur()
     expect(dialog.locator("code")).to_have_text(
-        """dextouch store relabel take --instruction 'it'"'"'s up'"""
+        r"""dextouch store relabel take --instruction 'it'\''s up'"""
     )
     dialog.get_by_role("button", name="Relabel").click()
     expect(dialog.locator("a.result")).to_have_text("take-relabelled-1")

@@ -5,7 +5,6 @@ import {
 } from "./calibration_words.js";
 import { element, levelBadge, setText, showChildren } from "./dom.js";
 import { ask } from "./session.js";
-import { startTheme } from "./theme.js";
 
 const PERIOD_MS = 300;
 const API = "/v1/alignment/calibration";
@@ -299,6 +298,5 @@ find("run_close").addEventListener("click", () => {
   sessionStorage.setItem("closed_run", closed);
   find("run").hidden = true;
 });
-startTheme(find("theme"), () => {});
 await showItems();
 poll();

@@ -9,12 +9,34 @@ export function element(tag, attributes = {}, ...children) {
   return node;
 }
 
+export const find = (id) => document.getElementById(id);
+
 export function levelBadge(level) {
   return element("span", { class: "level", "data-level": level }, level);
 }
 
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
+}
+
+// A note in the colour of its level, if it has one.
+export function say(node, text, level = null) {
+  if (level) node.dataset.level = level;
+  else delete node.dataset.level;
+  setText(node, text);
+}
+
+// Work now, and again and again while somebody looks at the page.
+export function repeat(work, period_ms) {
+  let timer = null;
+  const tick = async () => {
+    clearTimeout(timer);
+    if (!document.hidden) await work();
+    clearTimeout(timer);
+    timer = setTimeout(tick, period_ms);
+  };
+  document.addEventListener("visibilitychange", () => { if (!document.hidden) tick(); });
+  return tick();
 }
 
 function isSame(old, fresh) {

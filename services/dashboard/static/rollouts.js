@@ -9,7 +9,7 @@ import { badge, outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollou
 import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
-import { startTheme } from "./theme.js";
+import { onTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
@@ -139,14 +139,12 @@ const link = new LiveLink({
     if (message) showSteps(message);
   },
   onState: (connected) => {
-    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) showListed({ ...listed, problems: ["No link to the dashboard: what you see is old."] });
   },
 });
 
 link.show("rollouts", true);
 link.show("comparison", true);
-document.addEventListener("visibilitychange", () => link.sendView());
 new IntersectionObserver((entries) => {
   for (const entry of entries) if (watched) link.show(watched.topic, entry.isIntersecting);
 }).observe(find("watched"));
@@ -167,7 +165,7 @@ const draw = () => {
   requestAnimationFrame(draw);
 };
 requestAnimationFrame(draw);
-startTheme(find("theme"), () => {
+onTheme(() => {
   for (const hand of Object.values(hands)) hand.request();
   comparison.redraw();
 });

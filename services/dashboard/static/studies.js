@@ -1,10 +1,10 @@
 // The list of studies, with the progress of those that run.
 
+import { date } from "./dates.js";
 import { element, setText, showChildren } from "./dom.js";
 import { LiveLink } from "./live.js";
 import { pagePath } from "./session.js";
 import { badge, progress, stateOf, why } from "./study_parts.js";
-import { startTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
 
@@ -19,7 +19,7 @@ function row(study) {
     element("td", { class: "free" }, study.tasks.join(", ")),
     element("td", { class: "free" }, study.worlds.join(", ")),
     element("td", { class: "free" }, study.policies.join(", ")),
-    element("td", {}, new Date(study.changed_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" })));
+    element("td", {}, date(study.changed_at)));
 }
 
 function show({ studies, note }) {
@@ -32,9 +32,5 @@ function show({ studies, note }) {
 
 const link = new LiveLink({
   onTopic: (topic, data) => { if (topic === "studies") show(data); },
-  onBinary: () => {},
-  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
 });
 link.show("studies", true);
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => {});

@@ -6,7 +6,6 @@ import { ask } from "./session.js";
 import { sorted } from "./sorting.js";
 import { badge, progress, stateOf } from "./study_parts.js";
 import { agreementRow, rateCell, rateRows, rolloutRow } from "./study_tables.js";
-import { startTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
 const PAGE = 50;
@@ -166,13 +165,9 @@ const link = new LiveLink({
       refresh();
     }
   },
-  onBinary: () => {},
-  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
 });
 link.show("studies", true);
-document.addEventListener("visibilitychange", () => link.sendView());
 find("only_disagreements").addEventListener("click", () => open({ disagreements: true }));
 find("all_rollouts").addEventListener("click", () => open({}));
 find("more").addEventListener("click", () => load(rows.length));
 for (const name of ["picture_world", "picture_task"]) find(name).addEventListener("change", showPicture);
-startTheme(find("theme"), () => {});

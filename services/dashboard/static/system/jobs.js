@@ -1,7 +1,7 @@
 // Alignments that wait or run, which can be cancelled in two steps, and studies that run.
 
 import { get, getIfServed, post } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
+import { element, repeat, say, setText } from "../dom.js";
 import { age } from "../format.js";
 import { pagePath } from "../session.js";
 import { badge, progress, why } from "../study_parts.js";
@@ -29,22 +29,12 @@ export class Jobs {
   }
 
   start() {
-    const tick = async () => {
-      if (!document.hidden) await this.refresh();
-      setTimeout(tick, PERIOD_MS);
-    };
-    tick();
+    repeat(() => this.refresh(), PERIOD_MS);
   }
 
   showStudies(studies) {
     this.studies = studies.filter((one) => one.is_running);
     this.draw();
-  }
-
-  say(text, level = null) {
-    if (level === null) this.note.removeAttribute("data-level");
-    else this.note.dataset.level = level;
-    setText(this.note, text);
   }
 
   async refresh() {
@@ -56,7 +46,7 @@ export class Jobs {
       this.numHidden = running.num_matching + waiting.num_matching - this.alignments.length;
       this.draw();
     } catch (error) {
-      this.say(`Alignments: ${error.message}`, "ERROR");
+      say(this.note, `Alignments: ${error.message}`, "ERROR");
     }
   }
 
@@ -64,10 +54,10 @@ export class Jobs {
     const path = `/v1/alignment/alignments/${encodeURIComponent(job.alignment_id)}`;
     try {
       await post(`${path}/cancel`, {});
-      this.say(`Alignment of ${job.recording_id} cancelled.`);
+      say(this.note, `Alignment of ${job.recording_id} cancelled.`);
     } catch (error) {
       const now = await get(path).catch(() => null);
-      this.say(`Alignment of ${job.recording_id}: ${error.message}${now ? ` (it is ${now.state})` : ""}`, "ERROR");
+      say(this.note, `Alignment of ${job.recording_id}: ${error.message}${now ? ` (it is ${now.state})` : ""}`, "ERROR");
     }
     await this.refresh();
   }

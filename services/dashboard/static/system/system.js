@@ -1,16 +1,14 @@
 // The page System: state of services, disks and queues; jobs and the audit log have files of their own.
 
-import { element, levelBadge, setText, showChildren } from "../dom.js";
-import { age, count, plural } from "../format.js";
+import { element, find, levelBadge, setText, showChildren } from "../dom.js";
+import { age, bytes, count, plural } from "../format.js";
 import { LiveLink } from "../live.js";
 import { badge, why } from "../study_parts.js";
-import { startTheme } from "../theme.js";
 import { AuditTable } from "./audit_table.js";
-import { bytes, cpu, filling, latency, retention } from "./figures.js";
+import { cpu, filling, latency, retention } from "./figures.js";
 import { Jobs } from "./jobs.js";
 import { StationKeys } from "./stations.js";
 
-const find = (id) => document.getElementById(id);
 const LEVELS = { ready: "OK", waiting: "WARN", down: "ERROR" };
 
 function number(text) {
@@ -83,13 +81,9 @@ const link = new LiveLink({
     if (topic === "system") show(data);
     if (topic === "studies") jobs.showStudies(data.studies);
   },
-  onBinary: () => {},
-  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
 });
 link.show("system", true);
 link.show("studies", true);
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => {});
 jobs.start();
 stations.start();
 new AuditTable(find).start();

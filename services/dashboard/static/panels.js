@@ -1,0 +1,51 @@
+// Panels of a page can be hidden and enlarged; what was chosen is kept in this browser for each person, station and screen.
+
+import { element } from "./dom.js";
+
+const main = document.querySelector("main");
+const { person, station, screen } = main.dataset;
+const KEY = `panels ${JSON.stringify([person, station, screen])}`;
+// What says whether something is recorded or played stays.
+const found = [...main.querySelectorAll(".panel[aria-labelledby]:not(.recorder)")].map((panel) => [panel.getAttribute("aria-labelledby"), panel]);
+const panels = new Map(found.length > 1 ? found : []);
+const nameOf = (panel) => panel.querySelector("h2").textContent || panel.id;
+const away = element("p", { class: "panels_away quiet", hidden: "" });
+let kept = { hidden: [], enlarged: null };
+
+function show() {
+  for (const [id, panel] of panels) {
+    panel.classList.toggle("put_away", kept.hidden.includes(id));
+    panel.classList.toggle("enlarged", id === kept.enlarged);
+    panel.querySelector(".panel_tools [data-tool=enlarge]").setAttribute("aria-pressed", String(id === kept.enlarged));
+  }
+  const hidden = kept.hidden.filter((id) => panels.has(id));
+  away.hidden = !hidden.length;
+  away.replaceChildren("Hidden panels: ", ...hidden.map((id) => button(nameOf(panels.get(id)), `Show ${nameOf(panels.get(id))}`, () => keep({ hidden: kept.hidden.filter((one) => one !== id) }))));
+}
+
+function keep(change) {
+  kept = { ...kept, ...change };
+  localStorage.setItem(KEY, JSON.stringify(kept));
+  show();
+}
+
+function button(text, label, act) {
+  const made = element("button", { type: "button", class: "plain", "aria-label": label, title: label }, text);
+  made.addEventListener("click", act);
+  return made;
+}
+
+for (const [id, panel] of panels) {
+  const enlarge = button("⤢", `Enlarge ${nameOf(panel)}`, () => keep({ enlarged: kept.enlarged === id ? null : id }));
+  enlarge.dataset.tool = "enlarge";
+  const hide = button("×", `Hide ${nameOf(panel)}`, () => keep({ hidden: [...kept.hidden, id], enlarged: kept.enlarged === id ? null : kept.enlarged }));
+  panel.append(element("div", { class: "panel_tools" }, enlarge, hide));
+}
+main.insertBefore(away, main.querySelector(":scope > .deck"));
+try {
+  const { hidden, enlarged } = JSON.parse(localStorage.getItem(KEY)) ?? kept;
+  if (Array.isArray(hidden)) kept = { hidden, enlarged };
+} catch {
+  // What cannot be read is as nothing kept.
+}
+show();
