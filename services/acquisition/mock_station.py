@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import structlog
 
@@ -30,7 +30,7 @@ from services.acquisition.mocks.cameras_and_robot import (
     RobotStateSource,
     video_camera,
 )
-from services.acquisition.mocks.faults import FaultScript, Ledger
+from services.acquisition.mocks.faults import Edit, FaultScript, Ledger
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -53,7 +53,7 @@ LIVE_LEAD_NS = 200_000_000
 # Longer than five periods of a glove or tracker, from which on health calls it an error.
 SLOW_S = 0.1
 # A raw cell that all kinds of gloves have.
-DEAD: dict[str, Any] = {"cells": (9,), "how": "dead"}
+DEAD_CELL = 9
 
 
 def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
@@ -313,7 +313,8 @@ class MockStation:
                 if fault == "unplug" and now != before:
                     (glove.port.unplug if is_on else glove.port.plug)()
                 edits = glove.source.edits
-                cells = {"drift": edits.move_zero, "dead_taxel": partial(edits.pin, **DEAD)}
+                dead = partial(edits.pin, cells=(DEAD_CELL,), how="dead")
+                cells: dict[str, Edit] = {"drift": edits.move_zero, "dead_taxel": dead}
                 glove.extra_edits = tuple(edit for f, edit in cells.items() if f in now)
             self.station.faults = now
         return now
