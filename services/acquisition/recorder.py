@@ -142,7 +142,7 @@ class Recorder:
             given = "no consent" if prompt.operator else "no operator"
             raise InvalidInputError(
                 f"arm: got {given}, expected the pseudonym of an operator who agreed to be "
-                "recorded; name both, or start the station with --require-consent false"
+                "recorded; name both, or start the station with --no-require-consent"
             )
         return self._act("arm", None, partial(self._arm, prompt))
 

@@ -105,5 +105,5 @@ async def test_real_devices_are_left_alone(tmp_path):
         # Nobody is recorded there without having agreed.
         armed = {"task": "fold", "instruction": "fold it"}
         reply = await client.post("/v1/recorder/arm", json=armed)
-        assert (reply.status_code, "--require-consent" in reply.text) == (422, True)
+        assert (reply.status_code, "--no-require-consent" in reply.text) == (422, True)
         assert (await client.get("/v1/recorder")).json()["needs_consent"]
