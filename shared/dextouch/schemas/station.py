@@ -299,6 +299,8 @@ SimulatedFault = Literal["unplug", "drift", "dead_taxel", "slow_host"]
 class SetFault(FrozenModel):
     """Whether a fault is simulated from now on."""
 
+    model_config = example(on=True)
+
     on: bool
 
 
