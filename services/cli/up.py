@@ -167,6 +167,8 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
 
     if settings.mock or "station" in settings.model_fields_set:
         given["station"] = settings.station
+    if settings.mock_faults is not None:
+        given["mock_faults"] = settings.mock_faults
     if settings.mock_episode_id is not None:
         given |= {"mock_store": settings.store_url, "mock_episode_id": settings.mock_episode_id}
     station = AcquisitionSettings.model_validate(

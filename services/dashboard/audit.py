@@ -51,6 +51,7 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/sign_out": "sign out",
     "/v1/recorder/{action}": "recorder",
     "/v1/uploads/{recording_id}/retry": "send upload again",
+    "/v1/acquisition/faults/{fault}": "simulate fault",
     "/v1/comparisons": "start replay",
     "/v1/comparisons/stop": "stop replay",
     # Several a second; that they began is noted.

@@ -327,6 +327,7 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/enrolments", "POST", scope=ENROL),
     Forwarded("episode_store", "/enrolments/{station}/revoke", "POST", scope=ENROL),
     Forwarded("acquisition", "/uploads"),
+    Forwarded("acquisition", "/faults/{fault}", "POST"),
     Forwarded("alignment", "/alignments"),
     Forwarded("alignment", "/alignments", "POST"),
     Forwarded("alignment", "/alignments/{alignment_id}"),

@@ -61,6 +61,7 @@ TABLE = {
         "GET /v1/uploads": "station",
         "GET /v1/uploads/{recording_id}": "station",
         "POST /v1/uploads/{recording_id}/retry": "station",
+        "POST /v1/faults/{fault}": "station",
         "GET /v1/practice": "station",
         "POST /v1/practice/start": "station",
         "POST /v1/practice/stop": "station",

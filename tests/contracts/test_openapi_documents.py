@@ -17,7 +17,8 @@ OPERATIONS = {
         get_recorder arm_recorder start_recording stop_recording save_take discard_take
         rerecord_take begin_session get_station_health list_health_events get_health_history
         list_uploads get_upload retry_upload get_live_overview get_live_taxels get_live_poses
-        list_cameras get_camera_image get_practice start_practice stop_practice""",
+        list_cameras get_camera_image get_practice start_practice stop_practice
+        set_fault""",
     "alignment": """
         start_alignments list_alignments get_alignment cancel_alignment get_calibration
         start_practice stop_practice start_calibration_run get_calibration_run

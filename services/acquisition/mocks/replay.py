@@ -145,6 +145,8 @@ class MockDevice:
         self._taxel_edits: list[Edit] = [
             partial(self._edits.pin, cells=cells, how=how) for how, cells in pinned.items() if cells
         ]
+        # Of one who shows a fault on request.
+        self.extra_edits: tuple[Edit, ...] = ()
         self._next_sequence = faults.first_sequence
         # The device numbers all that it sends, in the order in which it sends it.
         self._numbering = threading.Lock()
@@ -269,7 +271,7 @@ class MockDevice:
     def _edit(self, units: list[bytes], t_true_ns: int, fate: Fate) -> tuple[list[bytes], Fate]:
         """What the device says instead, with what is wrong in itself."""
         faults = self.faults
-        edits = list(self._taxel_edits)
+        edits = [*self._taxel_edits, *self.extra_edits]
         for from_s, edit in (
             (faults.version_from_s, self._edits.other_version),
             (faults.wrong_side_from_s, self._edits.other_side),

@@ -3,6 +3,7 @@
 import {
   ageWords, capital, countWords, delayRows, isOfCamera, LEVELS, nextWords, placesWords, polygon, progressOf, runLevel, runTitle, secondsLeft, signsOf,
 } from "./calibration_words.js";
+import * as api from "./catalog/api.js";
 import { element, levelBadge, setText, showChildren } from "./dom.js";
 import { ask } from "./session.js";
 
@@ -21,19 +22,8 @@ const PRACTICE_WORDS = {
   on: "You practise with simulated devices; their calibration is kept apart from that of real ones. The board is chessboard:9x6:25mm.",
 };
 
-async function get(path) {
-  const answer = await ask(`${API}${path}`);
-  const data = await answer.json();
-  if (!answer.ok) throw new Error(data.detail ?? `refused (${answer.status})`);
-  return data;
-}
-
-async function post(path, body) {
-  const answer = await ask(`${API}${path}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body ?? {}) });
-  const data = await answer.json();
-  if (!answer.ok) throw new Error(data.detail ?? `refused (${answer.status})`);
-  return data;
-}
+const get = (path) => api.get(`${API}${path}`);
+const post = (path, body = {}) => api.post(`${API}${path}`, body);
 
 function regions(item) {
   if (item.views_by_region.length === 0) return "";
@@ -44,10 +34,8 @@ function regions(item) {
 function row(item) {
   const begin = item.run === null ? null : element("button", { type: "button" }, "Guided run");
   begin?.addEventListener("click", () => choose(item));
-  const badge = levelBadge(LEVELS[item.state]);
-  badge.textContent = item.state;
   return element("tr", { "data-name": item.name },
-    element("td", {}, badge),
+    element("td", {}, levelBadge(LEVELS[item.state], item.state)),
     element("td", { class: "name" }, item.title, element("span", { class: "why" }, item.name)),
     element("td", { class: "number" }, ageWords(item.age_days)),
     element("td", {}, item.sigma),

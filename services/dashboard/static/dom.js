@@ -11,8 +11,8 @@ export function element(tag, attributes = {}, ...children) {
 
 export const find = (id) => document.getElementById(id);
 
-export function levelBadge(level) {
-  return element("span", { class: "level", "data-level": level }, level);
+export function levelBadge(level, text = level) {
+  return element("span", { class: "level", "data-level": level }, text);
 }
 
 export function setText(node, text) {

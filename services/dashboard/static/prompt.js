@@ -95,6 +95,11 @@ export class PromptForm {
     this.keep();
   }
 
+  // Who is recorded is asked once a session.
+  forget() {
+    this.write({ ...this.read(), operator: null, consent: false });
+  }
+
   differs(prompt) {
     const fields = this.read();
     return Object.keys(fields).some((name) => fields[name] !== (prompt[name] ?? null));

@@ -165,7 +165,9 @@ from .station import RecorderStatus as RecorderStatus
 from .station import RobotFollowing as RobotFollowing
 from .station import SavedTakes as SavedTakes
 from .station import SaveTake as SaveTake
+from .station import SetFault as SetFault
 from .station import SharedLink as SharedLink
+from .station import SimulatedFault as SimulatedFault
 from .station import SpooledTake as SpooledTake
 from .station import StaleCode as StaleCode
 from .station import StationEnrolment as StationEnrolment
