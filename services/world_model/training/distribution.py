@@ -157,8 +157,9 @@ def joined_processes(device: str = "cpu", replicas: int = 1) -> Iterator[Process
                 f"training: got {count} processes for --replicas {replicas}, expected a multiple; "
                 "change --replicas, or the number of processes"
             )
-        copies = (replicas, count // replicas) if replicas > 1 else (count,)
-        mesh = init_device_mesh(device, copies)
+        sizes = (replicas, count // replicas) if replicas > 1 else (count,)
+        names = ("replicas", "shards")[-len(sizes) :]
+        mesh = init_device_mesh(device, sizes, mesh_dim_names=names)
         with warnings.catch_warnings():
             # Nothing is changed in place.
             warnings.filterwarnings("ignore", message="FSDP2-wrapped module .* a view tensor")
