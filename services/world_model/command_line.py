@@ -74,7 +74,7 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
         losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
         lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
-    with joined_processes() as processes:
+    with joined_processes(settings.device, settings.replicas) as processes:
         report = train(settings, on_progress if processes.is_first else None, processes)
     if report is not None:
         counts = f"{report.num_train_episodes} episodes, {report.num_heldout_episodes} held out"

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
@@ -307,11 +308,27 @@ class JointLayer(nn.Module):
         super().__init__()
         self.video = video
         self.tactile = tactile
+        # Whether training computes the layer again instead of keeping its activations.
+        self.recompute = False
 
     def forward(
         self, video: Stream, tactile: Stream | None, mask: Bool[Tensor, "tokens tokens"]
     ) -> tuple[Stream, Stream | None]:
         """Update both streams through the shared attention."""
+        if not self.recompute or not torch.is_grad_enabled():
+            return self._update(video, tactile, mask)
+
+        def update() -> tuple[Stream, Stream | None]:
+            # Keys and values of the text are computed again, too.
+            text = None if video.text is None else Text(video.text.words)
+            return self._update(replace(video, text=text), tactile, mask)
+
+        updated, touched = checkpoint(update, use_reentrant=False, preserve_rng_state=False)
+        return replace(updated, text=video.text), touched
+
+    def _update(
+        self, video: Stream, tactile: Stream | None, mask: Tensor
+    ) -> tuple[Stream, Stream | None]:
         query, key, value = self._queries_keys_values(video, tactile)
         attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return self._finish(video, tactile, attended)

@@ -201,6 +201,10 @@ class ModelInputs:
     def __len__(self) -> int:
         return len(self.first_image)
 
+    def __getitem__(self, rows: slice) -> "ModelInputs":
+        """Some of the requests."""
+        return replace(self, **{name: one[rows] for name, one in vars(self).items()})
+
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
         moved: dict[str, Any] = {

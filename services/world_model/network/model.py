@@ -30,6 +30,7 @@ from services.world_model.network.configuration import (
 from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import TextFeatures
+from services.world_model.network.low_rank import add_adapters, merge_adapters
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
@@ -149,6 +150,9 @@ class JointWorldModel(nn.Module):
             )
             for index in range(config.num_layers)
         )
+        if wan is not None and wan.lora_rank:
+            for layer in self.joint_layers():
+                add_adapters(layer.video, wan.lora_rank, wan.lora_scale)
 
     @property
     def text_features(self) -> TextFeatures | None:
@@ -232,7 +236,7 @@ class JointWorldModel(nn.Module):
         video = video.split(self.config.tokens_per_latent)[0]
         if tactile is not None:
             tactile = tactile.split(2 * self.tokenizer.num_tokens)[0]
-        return replace(context, clean=CleanTokens.through(self._joint_layers(), video, tactile))
+        return replace(context, clean=CleanTokens.through(self.joint_layers(), video, tactile))
 
     def denoise(
         self, context: Context, noisy: JointLatents, t: Float32[Tensor, " batch"]
@@ -244,13 +248,19 @@ class JointWorldModel(nn.Module):
             for layer in self.layers:
                 video, tactile = layer(video, tactile, mask)
         else:
-            video, tactile = context.clean.update(self._joint_layers(), video, tactile)
+            video, tactile = context.clean.update(self.joint_layers(), video, tactile)
         latents = self.video.finish(video, of_video)
         if self.tactile is None or tactile is None or of_tactile is None:
             return JointLatents(latents, self.with_clean_first(noisy, context.first).tactile)
         return JointLatents(latents, self.tactile.finish(tactile, of_tactile))
 
-    def _joint_layers(self) -> list[JointLayer]:
+    def merge_adapters(self) -> None:
+        """Merge adapters of the pretrained video expert into its weights, in place."""
+        merge_adapters(self)
+        self.config = self.config.adapted(rank=0)
+
+    def joint_layers(self) -> list[JointLayer]:
+        """The layers, typed."""
         return [layer for layer in self.layers if isinstance(layer, JointLayer)]
 
     def _begin(
