@@ -26,7 +26,12 @@ from services.networks.training_settings import (
     Tasks,
     WeightDecay,
 )
-from services.world_model.network.configuration import Precision, Sampler, WanFiles
+from services.world_model.network.configuration import (
+    SPATIAL_FACTOR,
+    Precision,
+    Sampler,
+    WanFiles,
+)
 from services.world_model.presets import PRESETS
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
@@ -243,6 +248,17 @@ class Placement(FrozenModel):
     )
     max_file_gb: float | None = Field(
         default=None, gt=0, description="largest checkpoint; default: 64 MiB, at full size memory"
+    )
+    decode_window: int | None = Field(
+        default=None,
+        ge=2,
+        description="at full size, latents that an image is decoded from; default: all, exactly",
+    )
+    decode_tile_px: int | None = Field(
+        default=None,
+        ge=64,
+        multiple_of=SPATIAL_FACTOR,
+        description="at full size, side of the tiles that images are decoded in; default: whole",
     )
 
 

@@ -25,7 +25,7 @@ from services.world_model import checkpoints, starts
 from services.world_model.network.configuration import GloveNetworkConfig, Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Sampling, stack_noise
-from services.world_model.network.video import to_uint8, to_unit
+from services.world_model.network.video import WanVideoCodec, to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
@@ -127,8 +127,8 @@ class ModelWorld(BatchWorld[ModelState]):
     ) -> list[SteppedRollout[ModelState]]:
         """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
 
-        Images of the last latent are always decoded, since the next chunk starts from the last of
-        them; the others only on request.
+        The last image is always decoded, since the next chunk starts from it; the others only on
+        request, which at full size may change the last one by rounding.
 
         Raises:
             ShapeError: a chunk of another length.
@@ -296,6 +296,13 @@ def _placed(file: Path, placement: Placement) -> checkpoints.Checkpoint:
     if placement.precision == "bfloat16":
         model.to(torch.bfloat16)
     on_device(model, placement.device)
+    if isinstance(model.codec, WanVideoCodec):
+        model.codec.window, model.codec.tile_px = placement.decode_window, placement.decode_tile_px
+    elif placement.decode_window or placement.decode_tile_px:
+        raise InvalidInputError(
+            f"world model {file.name}: got options of decoding (--placement.decode-window, "
+            "--placement.decode-tile-px), expected none: only the full size has them"
+        )
     if model.text_features is not None:
         model.text_features.use(placement.text.folder, placement.text.text_cache)
     return checkpoint

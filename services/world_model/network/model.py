@@ -94,7 +94,7 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future after the first step; images of all its steps, or of the last four only."""
+    """Future after the first step; images of all its steps, or of the last ones only."""
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
@@ -311,7 +311,7 @@ class JointWorldModel(nn.Module):
         """Sample a future for every request.
 
         There is one `noise` per request; like the inputs it may be on any device. Of the images,
-        all are decoded or only those of the last latent. `precision` is that of the experts' matrix
+        all are decoded or only the last ones. `precision` is that of the experts' matrix
         products (autocast); codecs always use float32.
         """
         inputs = inputs.to(self.device)
@@ -368,7 +368,7 @@ class JointWorldModel(nn.Module):
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step; of the images maybe the last four only.
+        """Images and pressures after the first step; of the images maybe the last ones only.
 
         Without touch all pressures are zero.
         """
