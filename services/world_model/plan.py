@@ -262,6 +262,7 @@ def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
         raster=torch.zeros(1, num_steps, 2, cells, cells),
         geometry=torch.zeros(1, num_steps, 2, GEOMETRY_SIZE * config.use_contact_geometry),
         commanded=torch.zeros(1),
+        acting=torch.ones(1),
         words=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
         instructions=("",),
     )

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,6 +30,7 @@ from services.world_model.network.conditioning import (
     ActionFeatures,
     Condition,
     after_first,
+    told,
     two_layers,
 )
 from services.world_model.network.configuration import (
@@ -45,6 +45,7 @@ from services.world_model.network.configuration import (
 )
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import TextFeatures
+from services.world_model.network.kept import LastUsed
 
 if TYPE_CHECKING:
     from diffusers import AutoencoderKLWan, WanTransformer3DModel
@@ -54,7 +55,7 @@ Images = Float32[Tensor, "batch time px px 3"]
 _Raster = Float32[Tensor, "batch time 2 cells cells"]
 _Shown = Float32[Tensor, "batch shown px px 3"]
 _Patches = Float32[Tensor, "batch latents rows cols values"]
-_Frames = Float[Tensor, "batch channels frames rows columns"]
+_Frames = Float[Tensor, "batch _channels _frames _rows _columns"]
 
 
 class VideoExpert(nn.Module):
@@ -278,27 +279,15 @@ class WanVideoCodec(nn.Module):
         return latents * std + mean
 
     def _decoded(self, latents: _Frames, num_images: int) -> _Frames:
-        """The last images in -1 … 1, whole or in tiles that are blended where they overlap."""
-        side, tile = latents.shape[-1], (self.tile_px or 0) // SPATIAL_FACTOR
-        if not 0 < tile < side:
+        """The last images in -1 … 1, whole or in diffusers' tiles, blended where they overlap."""
+        if self.tile_px is None or self.tile_px >= SPATIAL_FACTOR * latents.shape[-1]:
             return last_images(self.autoencoder, latents, num_images)
-        overlap = max(1, tile // 4)
-        starts = [*range(0, side - tile, tile - overlap), side - tile]
-        middles = torch.arange(SPATIAL_FACTOR * tile, device=latents.device) + 0.5
-        ramp = (torch.minimum(middles, middles.flip(0)) / (SPATIAL_FACTOR * overlap)).clamp(max=1.0)
-        size = SPATIAL_FACTOR * side
-        total = latents.new_zeros(len(latents), 3, num_images, size, size)
-        weight = latents.new_zeros(size, size)
-        for row, column in product(starts, starts):
-            part = latents[..., row : row + tile, column : column + tile]
-            rows, columns = (
-                slice(SPATIAL_FACTOR * first, SPATIAL_FACTOR * (first + tile))
-                for first in (row, column)
-            )
-            share = ramp[:, None] * ramp
-            total[..., rows, columns] += share * last_images(self.autoencoder, part, num_images)
-            weight[rows, columns] += share
-        return total / weight
+        side, stride = self.tile_px, self.tile_px - SPATIAL_FACTOR * (self.tile_px // 64)
+        self.autoencoder.enable_tiling(side, side, stride, stride)
+        # Of decoding alone.
+        self.autoencoder.use_tiling = False
+        pixels: Tensor = self.autoencoder.tiled_decode(latents).sample
+        return pixels[:, :, -num_images:]
 
 
 def _shown(pixels: _Frames) -> Images:
@@ -415,18 +404,33 @@ class WanVideoCondition(nn.Module):
         self.actions[-1] = zero_linear(width, width)
         self.commanded = nn.Parameter(torch.zeros(width))
         self.text_features = TextFeatures(wan)
+        self.kept_texts: LastUsed[Text] | None = None
 
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> WanConstants:
         """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
-        actions = after_first(self.actions(groups.to(self.commanded.dtype))).float()
+        actions = self.actions(groups.to(self.commanded.dtype)).float()
+        actions = after_first(told(actions, inputs))
         kind = inputs.commanded[:, None, None] * self.commanded.float()
-        return self.of(actions + kind, self.text_features.stack(inputs.instructions))
+        texts = inputs.instructions
+        if self.kept_texts is None:
+            return self.of(actions + kind, self.text_features.stack(texts))
+        # Of every precision of matrix products; one by one, since other batches have other rows.
+        precision = torch.is_autocast_enabled(actions.device.type)
+        rows = self.kept_texts.of(
+            [(text, precision) for text in texts],
+            lambda missing: [
+                self._embedded(self.text_features.stack([texts[index]])) for index in missing
+            ],
+        )
+        return WanConstants(actions + kind, Text(rows[0].words, rows=tuple(rows)))
 
     def of(self, actions: Tensor, text: Float[Tensor, "batch words features"]) -> WanConstants:
         """What embedded actions [batch, latents, width] and text features contribute."""
-        weight = self.embedder.time_proj.weight
-        return WanConstants(actions, Text(self.embedder.text_embedder(text.to(weight))))
+        return WanConstants(actions, self._embedded(text))
+
+    def _embedded(self, text: Float[Tensor, "batch words features"]) -> Text:
+        return Text(self.embedder.text_embedder(text.to(self.embedder.time_proj.weight)))
 
     def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
         """Conditions at these times; t is zero where tokens are clean."""
