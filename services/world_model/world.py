@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -250,7 +251,9 @@ class ModelWorld(BatchWorld[ModelState]):
         """
         fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         words, task = fields.get("instruction"), fields.get("task")
-        counts = {name: fields.get(name) for name in ("step", "num_still", "num_moving")}
+        counts: dict[str, Any] = {
+            name: fields.get(name) for name in ("step", "num_still", "num_moving")
+        }
         if (
             set(arrays) != set(_SNAPSHOT_ARRAYS)
             or not all(isinstance(one, int) and one >= 0 for one in counts.values())

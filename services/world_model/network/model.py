@@ -374,8 +374,8 @@ class JointWorldModel(nn.Module):
             with products_in(precision, self.device.type):
                 clean = self.clean_tokens(self.context(some, first), noisy)
             whole = Observed(first, clean)
-            each = torch.arange(len(rows)).split(1)
-            return [mapped(whole, lambda one, row=row: one[row]) for row in each]
+            each = torch.split(torch.arange(len(rows), device=self.device), 1)
+            return [mapped(whole, partial(torch.index_select, dim=0, index=row)) for row in each]
 
         keys = [(precision, key) for key in inputs.first_step_keys()]
         found = combined(self._observed.of(keys, compute), torch.cat)
@@ -421,8 +421,9 @@ class JointWorldModel(nn.Module):
                 )
             found = guess.video.float(), guess.tactile.float()
             if is_guided:
-                told, free = zip(*(one.chunk(2) for one in found), strict=True)
-                found = tuple(map(partial(torch.lerp, weight=sampling.guidance), free, told))
+                (told, free), (touch, free_touch) = (one.chunk(2) for one in found)
+                scale = sampling.guidance
+                found = torch.lerp(free, told, scale), torch.lerp(free_touch, touch, scale)
             if self.config.prediction == "clean":
                 return found
             return (

@@ -234,7 +234,7 @@ class WanVideoCodec(nn.Module):
         super().__init__()
         self.window: int | None = None
         self.tile_px: int | None = None
-        self.autoencoder = empty_autoencoder(wan).requires_grad_(requires_grad=False)
+        self.autoencoder: Any = empty_autoencoder(wan).requires_grad_(requires_grad=False)
 
     def fit(self, windows: UInt8[Tensor, "n time px px 3"]) -> None:
         """Do nothing: the autoencoder is pretrained."""
@@ -295,7 +295,9 @@ def _shown(pixels: _Frames) -> Images:
 
 
 def last_images(
-    autoencoder: "AutoencoderKLWan", latents: _Frames, num_images: int
+    autoencoder: Any,  # noqa: ANN401 - of diffusers
+    latents: _Frames,
+    num_images: int,
 ) -> Float[Tensor, "batch 3 shown height width"]:
     """The last images of a video in -1 … 1, by diffusers' decoder, to rounding.
 
@@ -306,14 +308,14 @@ def last_images(
     """
     from diffusers.models.autoencoders.autoencoder_kl_wan import unpatchify
 
-    decoder: Any = autoencoder.decoder
+    decoder = autoencoder.decoder
     latents = autoencoder.post_quant_conv(latents)
     # One place for each convolution that has a cache, as diffusers' own loop has.
     past: list[Any] = [None] * len(list(decoder.modules()))
     ending, images = _LastFrames(decoder), []
     # Frames of the video that follow the ones at hand.
     num_after = FRAMES_PER_LATENT * (latents.shape[2] - 1)
-    for index, latent in enumerate(latents.split(1, dim=2)):
+    for index, latent in enumerate(torch.split(latents, 1, dim=2)):
         place = [0]
         frames = decoder.mid_block(
             ending.convolved(decoder.conv_in, latent, 1), feat_cache=past, feat_idx=place
@@ -322,7 +324,9 @@ def last_images(
             frames = block(frames, feat_cache=past, feat_idx=place, first_chunk=index == 0)
         images += ending.images(frames, num_images - num_after)
         num_after -= FRAMES_PER_LATENT
-    pixels: Tensor = unpatchify(torch.cat(images, dim=2), patch_size=2)
+    pixels: Tensor = unpatchify(  # type: ignore[no-untyped-call]
+        torch.cat(images, dim=2), patch_size=2
+    )
     return pixels.clamp(-1.0, 1.0)
 
 
