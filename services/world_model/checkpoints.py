@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
+from typing import Final
 
 from pydantic import Field, model_validator
 
@@ -45,6 +46,8 @@ _TOKENIZER_KEY = "dextouch_tactile_tokenizer"
 _TEXT, _DYNAMICS, _RENDERER = "text_features.", "dynamics.", "renderer."
 # Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
+# Of the twin's episodes, in files of older releases.
+HORIZON_LATENTS: Final = 20
 
 
 class TrainingSet(FrozenModel):
@@ -75,7 +78,8 @@ class CheckpointMetadata(FrozenModel):
     `initialized_from` is the digest of the checkpoint that the weights were initialized from, whose
     training episodes count here, too, and `tokenizer_digest` that of the pretrained tokenizer's
     file. None is not written, so that older releases can read the file. `sets` are the episodes by
-    domain, those of ancestors included; empty in files of older releases.
+    domain, those of ancestors included; empty in files of older releases. `horizon_latents` is the
+    length of the longest training episode.
     """
 
     format_version: int = 1
@@ -93,6 +97,7 @@ class CheckpointMetadata(FrozenModel):
     initialized_from: str | None = Field(default=None, exclude_if=not_)
     sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
     tokenizer_digest: str | None = Field(default=None, exclude_if=not_)
+    horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1, exclude_if=HORIZON_LATENTS.__eq__)
     metrics: dict[str, float] = Field(default={})
 
 
@@ -167,7 +172,7 @@ class StateBounds(FrozenModel):
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
     distance: float = Field(default=1.0, gt=0, allow_inf_nan=False)
-    horizon_latents: int = Field(default=20, ge=1)
+    horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1)
     of_chunks: bool = False
 
     @property

@@ -19,6 +19,7 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
     read_tokenizer,
 )
+from services.world_model.network.model import Sampling
 from services.world_model.paper_settings import (
     DistillCommand,
     TrainSettings,
@@ -120,22 +121,22 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     import torch
 
     torch.set_num_threads(settings.num_threads)
-    return {settings.world_name: _open(settings.checkpoint, settings)}
+    return {settings.world_name: open_model(settings.checkpoint, settings)}
 
 
 def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
     """The world of the checkpoint with this digest beside the one that is served."""
     for path, found in list_checkpoints(settings.checkpoint.parent).items():
         if found == digest:
-            return open_world(path) if is_state_checkpoint(path) else _open(path, settings)
+            return open_world(path) if is_state_checkpoint(path) else open_model(path, settings)
     return None
 
 
-def _open(path: Path, settings: WorldModelSettings) -> World[Any]:
+def open_model(path: Path, settings: WorldModelSettings) -> World[Any]:
+    """The world of a checkpoint, as the settings say."""
     return open_world(
         path,
-        sampling_steps=settings.sampling_steps,
-        sampler=settings.sampler,
+        sampling=Sampling(settings.sampling_steps, settings.sampler, guidance=settings.guidance),
         objects=settings.objects,
         placement=settings.placement,
     )

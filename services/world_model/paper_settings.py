@@ -71,6 +71,12 @@ class WindowSettings(FrozenModel):
 
     short_fraction: Share = Field(default=0.25, description="share of short windows")
     context_noise: Share = Field(default=0.05, description="noise on the first latents")
+    text_dropout: Share = Field(
+        default=0.0, description="share of windows without instruction, for --guidance of serving"
+    )
+    action_dropout: Share = Field(
+        default=0.0, description="share of windows without actions, for --guidance of serving"
+    )
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 

@@ -26,6 +26,8 @@ from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
 
 _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
+# A chunk needs one of the two.
+_DECODING: Final = ("decode all images", "decode the last image")
 # Text encoder of the published model, UMT5-XXL.
 _TEXT_ENCODER: Final = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
@@ -135,7 +137,14 @@ def plan_table(config: NetworkConfig) -> str:
         row(f"  {one.name}", times[i], (p.work[i].memory_bytes for p in columns))
         for i, one in enumerate(first.work)
     ]
-    flops = sum(one.times * one.flops for one in first.work)
+    totals = [
+        row(
+            f"all, and {name}",
+            f"{sum(w.times * w.flops for w in first.work if w.name != other) / 1e9:,.2f} GF",
+            (plan.peak_bytes for plan in columns),
+        )
+        for name, other in (_DECODING, _DECODING[::-1])
+    ]
     return "\n".join(
         [
             f"one action chunk of {first.num_steps} steps, {first.num_video_tokens} video and "
@@ -144,7 +153,7 @@ def plan_table(config: NetworkConfig) -> str:
             *weights,
             "work, with memory beside the weights",
             *work,
-            row("all", f"{flops / 1e9:,.2f} GF", (plan.peak_bytes for plan in columns)),
+            *totals,
             row("shared by sampler steps", "", (plan.kept_bytes for plan in columns)),
             row("training, without activations", "", (plan.training_bytes for plan in columns)),
         ]
@@ -217,7 +226,8 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
         "encode the first image": (1, lambda: model.first_latents(inputs)),
         "what sampler steps share": (1, shared),
         "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
-        "decode all images": (1, lambda: model.decode(first, noisy)),
+        _DECODING[0]: (1, lambda: model.decode(first, noisy)),
+        _DECODING[1]: (1, lambda: model.decode(first, noisy, all_images=False)),
     }
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
     work = []
@@ -252,6 +262,7 @@ def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
         raster=torch.zeros(1, num_steps, 2, cells, cells),
         geometry=torch.zeros(1, num_steps, 2, GEOMETRY_SIZE * config.use_contact_geometry),
         commanded=torch.zeros(1),
+        acting=torch.ones(1),
         words=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
         instructions=("",),
     )

@@ -182,17 +182,28 @@ class KeysValues:
 class Text:
     """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
 
-    They do not depend on the flow time, so that the steps of a sampler can share one object.
+    They do not depend on the flow time, so that the steps of a sampler can share one object. The
+    keys and values of a batch may come from texts of single `rows`, which other batches share.
     """
 
     words: Float[Tensor, "batch words width"]
     kept: dict[int, KeysValues] = field(default_factory=dict)
+    rows: tuple["Text", ...] = ()
 
     def keys_values(self, layer: nn.Module, compute: Callable[[Tensor], KeysValues]) -> KeysValues:
         """Keys and values of the words in a layer, computed at most once."""
         number = id(layer)
         if number not in self.kept:
-            self.kept[number] = compute(self.words)
+            each = [row.keys_values(layer, compute) for row in self.rows]
+            if not each:
+                self.kept[number] = compute(self.words)
+            elif all(one is each[0] for one in each):
+                shape = (len(each), -1, -1, -1)
+                keys, values = each[0].keys.expand(shape), each[0].values.expand(shape)
+                self.kept[number] = KeysValues(keys, values)
+            else:
+                keys, values = (torch.cat([vars(o)[n] for o in each]) for n in ("keys", "values"))
+                self.kept[number] = KeysValues(keys, values)
         return self.kept[number]
 
 

@@ -197,7 +197,7 @@ class NetworkConfig(FrozenModel):
     sampling_time_shift: float = Field(
         default=3.0, ge=1.0, description="shift of flow-matching times in sampling"
     )
-    sampling_steps: int = Field(default=2, ge=1, le=64, description="network calls per chunk")
+    sampling_steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
     sampler: Sampler = Field(
         default="euler", description="solver of the flow: unipc needs fewer steps"
     )

@@ -61,12 +61,16 @@ class LossOptions:
     output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
     learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
+    `text_dropout` and `action_dropout` are the shares of windows whose instruction, and whose
+    actions, are not told, for guidance; the smaller share is without both.
     """
 
     context_noise: float = 0.0
     touch_loss: TouchLoss = "all"
     precision: Precision = "float32"
     own_noisy: bool = False
+    text_dropout: float = 0.0
+    action_dropout: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,9 @@ def examples_of(
     """
     device = model.device
     inputs = build_inputs(batch.requests, model.config).to(device)
+    if options.text_dropout or options.action_dropout:
+        drawn = processes.rand([len(inputs)], generator).to(device)
+        inputs = inputs.without(drawn < options.text_dropout, drawn < options.action_dropout)
     tactile_kpa = batch.tactile_kpa.to(device)
     encoded = [
         model.targets(images.to(device), felt)
@@ -281,7 +288,7 @@ def own_noisy(
     """Noisy latents and their time at a random step of the model's own sampler (Euler)."""
     num_steps = model.config.sampling_steps
     taken = int(torch.randint(num_steps, (), generator=generator))
-    sampling = Sampling(num_steps, "euler", keep_context=False)
-    noisy = model.sample(inputs, first, noise, sampling, stop_after=taken)
+    sampling = Sampling(num_steps, "euler", keep_context=False, stop_after=taken)
+    noisy = model.sample(inputs, first, noise, sampling)
     times = sampling_times(num_steps, model.config.sampling_time_shift)
     return noisy, times[taken].expand(len(inputs)).to(noisy.video.device)

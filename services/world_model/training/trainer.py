@@ -21,7 +21,7 @@ from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
-from services.world_model.network.configuration import WanFiles
+from services.world_model.network.configuration import WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer
@@ -274,8 +274,15 @@ class TrainingRun:
             batch = own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
-        noise, is_own = self.settings.windows.context_noise, self.settings.self_forcing
-        options = LossOptions(noise, settings.touch_loss, settings.precision, own_noisy=is_own)
+        windows = self.settings.windows
+        options = LossOptions(
+            windows.context_noise,
+            settings.touch_loss,
+            settings.precision,
+            own_noisy=self.settings.self_forcing,
+            text_dropout=windows.text_dropout,
+            action_dropout=windows.action_dropout,
+        )
         examples = examples_of(
             self.model,
             batch,
@@ -404,6 +411,10 @@ def train_on(
         train_episode_ids=tuple(sorted(names)),
         train_fingerprints=tuple(sorted(prints)),
         data_hash=_data_hash(trained, settings, ancestor),
+        horizon_latents=max(
+            num_latents(max(map(len, trained))) - 1,
+            0 if ancestor is None else ancestor.metadata.horizon_latents,
+        ),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
         sets=dataset.training_sets(
