@@ -114,7 +114,7 @@ class TrashRetention(PeriodicThread):
     """Permanently deletes what has been in the trash of a store in a folder for some days."""
 
     def __init__(self, store: EpisodeStore, keep_days: float | None) -> None:
-        super().__init__("trash_not_purged", TRASH_PERIOD_S)
+        super().__init__("trash_not_purged", TRASH_PERIOD_S, self.work)
         self._store, self._keep_days = store, keep_days
 
     def work(self) -> None:
