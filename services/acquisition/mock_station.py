@@ -30,7 +30,7 @@ from services.acquisition.mocks.cameras_and_robot import (
     RobotStateSource,
     video_camera,
 )
-from services.acquisition.mocks.faults import Edit, FaultScript, Ledger
+from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -299,19 +299,25 @@ class MockStation:
         """Begin or end a fault, of one glove or of the whole station; gives those that are on.
 
         Raises:
-            ConflictError: no glove is simulated.
+            ConflictError: no glove is simulated, or one of a kind that cannot have the fault.
         """
         gloves = [pair.device for pair in self.pairs if pair.device.name.startswith("glove")]
         if not gloves and fault != "slow_host":
             raise ConflictError(f"fault {fault}: no glove is simulated here, expected one")
+        needs: dict[str, Pinned] = {"drift": "saturated", "dead_taxel": "dead"}
+        if fault in needs and not gloves[0].source.edits.pins(needs[fault]):
+            raise ConflictError(
+                f"fault {fault}: the packets of {gloves[0].name} cannot show it, expected a mock "
+                f"whose PacketEdits are given what a {needs[fault]!r} cell shows"
+            )
         with self._setting:
             before = self.station.faults or ()
             known = get_args(SimulatedFault)
             now = tuple(f for f in known if (is_on if f == fault else f in before))
             self.station.slow_s = SLOW_S if "slow_host" in now else 0.0
             for glove in gloves[:1]:
-                if fault == "unplug" and now != before:
-                    (glove.port.unplug if is_on else glove.port.plug)()
+                if fault == "unplug":
+                    glove.set_plugged("fault", is_plugged=not is_on)
                 edits = glove.source.edits
                 dead = partial(edits.pin, cells=(DEAD_CELL,), how="dead")
                 cells: dict[str, Edit] = {"drift": edits.move_zero, "dead_taxel": dead}

@@ -376,7 +376,11 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         measured = measured_taxels(calibration, num_taxels)
         taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
     is_action = stream.name in STREAMS.values() and stream.shape == (ACTION_DIM,)
-    is_named = is_action and isinstance(reader, EpisodeReader) and not _is_of_human_hand(reader)
+    components = (
+        action_names(has_robot_joints=not _is_of_human_hand(reader))
+        if is_action and isinstance(reader, EpisodeReader)
+        else ()
+    )
     return PlayedStream(
         name=stream.name,
         kind=stream.kind,
@@ -395,7 +399,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
-        components=tuple(action_names()) if is_named else (),
+        components=tuple(components),
         layout=stream.layout,
     )
 

@@ -273,10 +273,14 @@ class PacketEdits(ABC):
         """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
         return self.marks_nan
 
+    def pins(self, how: Pinned) -> bool:
+        """Whether raw cells can be pinned so."""
+        return how in self._pinned
+
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Raw cells of a glove that show the same whatever presses them."""
         fields = self.fields(data)
-        if fields.numbers is None or how not in self._pinned:
+        if fields.numbers is None or not self.pins(how):
             raise _cannot("a taxel that is pinned")
         fields.numbers[list(cells)] = self._pinned[how]
         return self.packed(data, fields)
@@ -284,7 +288,7 @@ class PacketEdits(ABC):
     def move_zero(self, data: bytes) -> bytes:
         """A glove whose zero has moved, by 0.5 % of full scale."""
         fields = self.fields(data)
-        if fields.numbers is None or not self._pinned:
+        if fields.numbers is None or not self.pins("saturated"):
             raise _cannot("readings of a glove")
         full_scale = self._pinned["saturated"]
         fields.numbers[:] = np.minimum(fields.numbers + DRIFT_SHARE * full_scale, full_scale)

@@ -62,17 +62,22 @@ class HandTrajectory:
         )
 
 
-def action_names() -> list[str]:
+def action_names(*, has_robot_joints: bool = True) -> list[str]:
     """Names of the 67 components of an action or a state, in order.
 
-    A pose is a translation in metres and two columns of the rotation matrix.
+    A pose is a translation in metres and two columns of the rotation matrix. Joints without those
+    of the robot's hands, such as of a human hand, have numbers in place of names.
     """
     rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
     left, right, head = (
         [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
         for name in ("wrist_left", "wrist_right", "camera_head")
     )
-    joints = [f"{name}_rad" for side in ("left", "right") for name in RobotHand(side).joint_names]
+    joints = [
+        f"{name}_rad" if has_robot_joints else f"{side}_joint_{index}_rad"
+        for side in ("left", "right")
+        for index, name in enumerate(RobotHand(side).joint_names)
+    ]
     return [*left, *right, *joints, *head]
 
 

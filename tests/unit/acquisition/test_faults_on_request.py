@@ -1,12 +1,17 @@
 """Faults that a simulated station shows on request: what health says of them, and their end."""
 
 import time
+from types import SimpleNamespace
 
 import httpx
 import pytest
 
 from services.acquisition import app as station_app
-from services.acquisition.mocks import pattern
+from services.acquisition.clock import StationClock
+from services.acquisition.mock_station import build_mocks
+from services.acquisition.mocks import FaultScript, SocketPort, pattern
+from services.acquisition.mocks.faults import OurPacketEdits
+from services.acquisition.mocks.gloves import TactileGloveSource
 from services.acquisition.settings import AcquisitionSettings
 
 STREAMS = {"tactile_left", "tactile_right", "wrist_left", "head"}
@@ -51,7 +56,8 @@ def stream(health, name):
 
 
 async def test_a_glove_is_unplugged_and_plugged_in_again(station):
-    assert (await station.get("/v1/health")).json()["faults"] == []
+    health = await found(station, lambda _, one: stream(one, "tactile_right")["stale"] is None)
+    assert health["faults"] == []
     assert await switch(station, "unplug", on=True) == ["unplug"]
     assert await switch(station, "unplug", on=True) == ["unplug"]
     health = await found(station, lambda causes, _: ("gone", "unplugged") in causes)
@@ -92,6 +98,43 @@ async def test_what_is_not_there_cannot_fail(station):
     reply = await station.post("/v1/faults/unplug", json={"on": True})
     assert (reply.status_code, "no glove is simulated" in reply.text) == (409, True)
     assert (await station.post("/v1/faults/fire", json={"on": True})).status_code == 422
+
+
+async def test_a_glove_that_cannot_show_a_fault_goes_on(station, monkeypatch):
+    monkeypatch.setattr(TactileGloveSource, "edits", OurPacketEdits())
+    for fault in ("drift", "dead_taxel"):
+        reply = await station.post(f"/v1/faults/{fault}", json={"on": True})
+        assert (reply.status_code, "cannot show it" in reply.text) == (409, True)
+    assert (await station.get("/v1/health")).json()["faults"] == []
+
+
+class Port:
+    def __init__(self):
+        self.done = []
+
+    def plug(self):
+        self.done.append("plug")
+
+    def unplug(self):
+        self.done.append("unplug")
+
+
+def test_what_a_person_unplugs_no_script_plugs_in():
+    streams = [s for s in pattern.pattern_streams() if s.descriptor.name == "tactile_left"]
+    (pair,) = build_mocks(streams, faults=FaultScript(), seed=0, clock=StationClock())
+    device = pair.device
+    device.port = port = Port()
+    for by, is_plugged in (("fault", False), ("script", False), ("script", True), ("fault", True)):
+        device.set_plugged(by, is_plugged=is_plugged)
+    assert port.done == ["unplug", "plug"]
+
+
+def test_a_socket_is_unplugged_twice_at_once():
+    port = SocketPort("probe")
+    port.plug()
+    port._device_end = SimpleNamespace(close=port.unplug)
+    port.unplug()
+    assert not port.send(b"x")
 
 
 async def test_real_devices_are_left_alone(tmp_path):

@@ -202,6 +202,11 @@ async def test_what_was_not_measured_is_there_to_be_drawn(store, http):
         "r_pinky_dip_rad",
     ]
     assert (len(names), streams["tactile_left"]["components"]) == (67, [])
+    # Those of a person in the twin are of a human hand.
+    write_episode(store, "human", domain="human")
+    answer = (await http.get("/v1/playback/episode/human")).json()
+    (human,) = (one["components"] for one in answer["streams"] if one["name"] == "action")
+    assert [human[k] for k in (0, 18, 57)] == [names[0], "left_joint_0_rad", "right_joint_19_rad"]
 
 
 def store_attributes(store):
