@@ -145,7 +145,10 @@ class AccessControl:
 
     def find(self, authorization: str | None) -> Grant | None:
         """What the key in the header allows, if it is a valid one."""
-        presented = secret_digest(presented_key(authorization) or "")
+        return self.of_digest(secret_digest(presented_key(authorization) or ""))
+
+    def of_digest(self, presented: bytes) -> Grant | None:
+        """What the key with this `secret_digest` allows, if it is a valid one."""
         # Every key is compared, to avoid a timing side channel.
         known = (*self._keys, *self._enrolled)
         matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]
