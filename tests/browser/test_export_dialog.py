@@ -102,6 +102,8 @@ def test_a_lab_lead_exports_mondays_accepted_takes(page, connect, store, tmp_pat
     store.set_review("tuesday-aligned", review("accepted"))
     page.goto(connect())
     page.get_by_role("navigation", name="screens").get_by_role("link", name="Episodes").click()
+    # Before its scripts are there, the page does not listen to its fields.
+    expect(names(page)).to_have_count(5)
     page.get_by_label("From", exact=True).fill("2026-05-04")
     page.get_by_label("To", exact=True).fill("2026-05-04")
     page.get_by_label("Review").select_option("accepted")

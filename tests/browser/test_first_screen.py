@@ -152,3 +152,30 @@ def test_faults_are_tried_on_simulated_devices_alone(station, opened):
     expect(page.locator("#faults [aria-pressed=true]")).to_have_text(["Slow host"])
     station.faults = None
     expect(page.locator("#faults")).to_be_hidden()
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.keyboard.press("f")
+    page.wait_for_timeout(300)
+    assert not [url for url in asked if "faults" in url]
+
+
+def test_an_enlarged_panel_is_large_where_something_is_armed(station, opened):
+    page, station.state = opened, "armed"
+    expect(page.locator("#recorder_state")).to_have_text("armed")
+    poses = page.locator("#poses")
+    small = poses.bounding_box()["width"]
+    poses.hover()
+    page.get_by_role("button", name="Enlarge Hands in space").click()
+    large = poses.bounding_box()
+    assert large["width"] > 2 * small
+    assert page.locator("#pose_canvas").bounding_box()["height"] > 450
+    page.get_by_role("button", name="Enlarge Hands in space").click()
+    assert poses.bounding_box()["width"] == small
+    # Without cameras, whoever hid them, the others have their place.
+    page.locator("#cameras").hover()
+    page.get_by_role("button", name="Hide Cameras").click()
+    assert poses.bounding_box()["width"] > 1.5 * small
+    expect(page.locator(".panels_away")).to_have_text("Hidden panels: Cameras")
+    # What the page hides itself is not listed.
+    page.evaluate("document.getElementById('cameras').hidden = true")
+    expect(page.locator(".panels_away")).to_be_hidden()

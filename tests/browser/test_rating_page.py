@@ -105,6 +105,7 @@ def test_an_invited_rater_opens_a_link_and_keeps_keys_of_their_own(serve, page, 
     page.get_by_role("button", name="Criterion 1: 1").click()
     page.locator("body").press("c")
     expect(page.get_by_role("button", name="Cannot judge: 1")).to_be_visible()
+    expect(page.get_by_role("button", name="Criterion 1: C")).to_be_focused()
     page.reload()
     expect(page.locator(".criterion kbd").first).to_have_text("C")
     for pressed in ("c", "2", "Enter"):

@@ -8,7 +8,8 @@ const FORMS = {
   minute: form({ timeStyle: "short" }),
 };
 
-// `at` is ISO text or seconds since 1970; what is not known is "–".
+// `at` is ISO text or seconds since 1970; what is not known, or no time, is "–".
 export function date(at, name = "moment") {
-  return at === null || at === undefined || at === "" ? "–" : FORMS[name].format(new Date(typeof at === "number" ? 1000 * at : at));
+  const moment = new Date(typeof at === "number" ? 1000 * at : at ?? "");
+  return Number.isNaN(moment.getTime()) ? "–" : FORMS[name].format(moment);
 }

@@ -15,6 +15,11 @@ export function levelBadge(level, text = level) {
   return element("span", { class: "level", "data-level": level }, text);
 }
 
+// Words beneath the value of a cell, if there are some.
+export function why(text) {
+  return text ? element("span", { class: "why" }, text) : null;
+}
+
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }

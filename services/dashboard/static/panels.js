@@ -1,6 +1,7 @@
 // Panels of a page can be hidden and enlarged; what was chosen is kept in this browser for each person, station and screen.
 
 import { element } from "./dom.js";
+import { keep, kept } from "./kept.js";
 
 const main = document.querySelector("main");
 const { person, station, screen } = main.dataset;
@@ -10,23 +11,24 @@ const found = [...main.querySelectorAll(".panel[aria-labelledby]:not(.recorder)"
 const panels = new Map(found.length > 1 ? found : []);
 const nameOf = (panel) => panel.querySelector("h2").textContent || panel.id;
 const away = element("p", { class: "panels_away quiet", hidden: "" });
-let kept = { hidden: [], enlarged: null };
+let chosen = { hidden: [], enlarged: null };
 
 function show() {
   for (const [id, panel] of panels) {
-    panel.classList.toggle("put_away", kept.hidden.includes(id));
-    panel.classList.toggle("enlarged", id === kept.enlarged);
-    panel.querySelector(".panel_tools [data-tool=enlarge]").setAttribute("aria-pressed", String(id === kept.enlarged));
+    panel.classList.toggle("put_away", chosen.hidden.includes(id));
+    panel.classList.toggle("enlarged", id === chosen.enlarged);
+    panel.querySelector(".panel_tools [data-tool=enlarge]").setAttribute("aria-pressed", String(id === chosen.enlarged));
   }
-  const hidden = kept.hidden.filter((id) => panels.has(id));
+  // What the page itself hides cannot be brought back.
+  const hidden = chosen.hidden.filter((id) => panels.has(id) && !panels.get(id).hidden);
   away.hidden = !hidden.length;
-  away.replaceChildren("Hidden panels: ", ...hidden.map((id) => button(nameOf(panels.get(id)), `Show ${nameOf(panels.get(id))}`, () => keep({ hidden: kept.hidden.filter((one) => one !== id) }))));
+  away.replaceChildren("Hidden panels: ", ...hidden.map((id) => button(nameOf(panels.get(id)), `Show ${nameOf(panels.get(id))}`, () => choose({ hidden: chosen.hidden.filter((one) => one !== id) }))));
 }
 
-function keep(change) {
-  kept = { ...kept, ...change };
-  localStorage.setItem(KEY, JSON.stringify(kept));
+function choose(change) {
+  chosen = { ...chosen, ...change };
   show();
+  keep(KEY, JSON.stringify(chosen));
 }
 
 function button(text, label, act) {
@@ -36,15 +38,16 @@ function button(text, label, act) {
 }
 
 for (const [id, panel] of panels) {
-  const enlarge = button("⤢", `Enlarge ${nameOf(panel)}`, () => keep({ enlarged: kept.enlarged === id ? null : id }));
+  const enlarge = button("⤢", `Enlarge ${nameOf(panel)}`, () => choose({ enlarged: chosen.enlarged === id ? null : id }));
   enlarge.dataset.tool = "enlarge";
-  const hide = button("×", `Hide ${nameOf(panel)}`, () => keep({ hidden: [...kept.hidden, id], enlarged: kept.enlarged === id ? null : kept.enlarged }));
+  const hide = button("×", `Hide ${nameOf(panel)}`, () => choose({ hidden: [...chosen.hidden, id], enlarged: chosen.enlarged === id ? null : chosen.enlarged }));
   panel.append(element("div", { class: "panel_tools" }, enlarge, hide));
+  new MutationObserver(show).observe(panel, { attributeFilter: ["hidden"] });
 }
 main.insertBefore(away, main.querySelector(":scope > .deck"));
 try {
-  const { hidden, enlarged } = JSON.parse(localStorage.getItem(KEY)) ?? kept;
-  if (Array.isArray(hidden)) kept = { hidden, enlarged };
+  const { hidden, enlarged } = JSON.parse(kept(KEY)) ?? chosen;
+  if (Array.isArray(hidden)) chosen = { hidden, enlarged };
 } catch {
   // What cannot be read is as nothing kept.
 }

@@ -1,11 +1,13 @@
 // Recorder panel: buttons, one-key shortcuts and a pedal → POST /v1/recorder/ACTION; what is allowed follows the state.
 
 import { post } from "./catalog/api.js";
+import { date } from "./dates.js";
 import { element, setText, showChildren } from "./dom.js";
 import { stopwatch } from "./format.js";
+import { keep, kept } from "./kept.js";
 import { Pedal } from "./pedal.js";
 import { PromptForm } from "./prompt.js";
-import { clockTime, keyOf, lastTakeWords, nextStep, numSaved, verdict } from "./recorder_logic.js";
+import { keyOf, lastTakeWords, nextStep, numSaved, verdict } from "./recorder_logic.js";
 import { ResetTimer } from "./reset_timer.js";
 import { pagePath } from "./session.js";
 import { Sounds } from "./sounds.js";
@@ -39,7 +41,7 @@ export class RecorderPanel {
     // Letters go to a field, and press a button.
     const others = [...root.querySelectorAll("[data-key]:not([data-action], [name=outcome])")];
     this.hotkeys = new Map([
-      ...others.map((one) => [one.dataset.key, () => (one.type === "button" ? one.click() : one.focus())]),
+      ...others.map((one) => [one.dataset.key, () => (one.type === "button" ? one.closest("[hidden]") || one.click() : one.focus())]),
       ...this.buttons.map((button) => [button.dataset.key, () => this.act(button.dataset.action)]),
       ...this.outcomes.map((outcome) => [outcome.dataset.key, () => this.choose(outcome)]),
       ["k", () => this.reset.end()],
@@ -56,8 +58,8 @@ export class RecorderPanel {
     for (const outcome of this.outcomes) outcome.addEventListener("change", () => this.judge());
     this.find("skip_reset").addEventListener("click", () => this.reset.end());
     this.find("show_keys").addEventListener("click", () => this.help());
-    this.find("arm_again").checked = localStorage.getItem("arm_again") === "yes";
-    this.find("arm_again").addEventListener("change", (event) => localStorage.setItem("arm_again", event.target.checked ? "yes" : "no"));
+    this.find("arm_again").checked = kept("arm_again") === "yes";
+    this.find("arm_again").addEventListener("change", (event) => keep("arm_again", event.target.checked ? "yes" : "no"));
     document.addEventListener("keydown", (event) => this.onKey(event));
     const form = this.find("prompt");
     form.addEventListener("submit", (event) => {
@@ -303,7 +305,7 @@ export class RecorderPanel {
     box.dataset.level = goal > 0 && saved >= goal ? "OK" : "";
     setText(this.find("num_saved"), goal > 0 ? `${saved} / ${goal}` : String(saved));
     const reached = box.dataset.level === "OK" ? "goal reached" : "saved";
-    setText(this.find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"}${consent ? ", consent given" : ""} · since ${clockTime(this.recorder?.session?.started_at)}`);
+    setText(this.find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"}${consent ? ", consent given" : ""} · since ${date(this.recorder?.session?.started_at, "minute")}`);
   }
 
   tick() {

@@ -35,7 +35,3 @@ const STAGES = {
 export function lastTakeWords(take) {
   return take ? [STAGES[take.stage] ?? take.stage, take.reason].filter(Boolean).join(" · ") : "";
 }
-
-export function clockTime(iso) {
-  return iso ? new Date(iso).toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" }) : "–";
-}

@@ -1,10 +1,12 @@
 // The theme of every page, kept in this browser: auto (as the system says), light or dark.
 
+import { keep, kept } from "./kept.js";
+
 const ORDER = ["auto", "light", "dark"];
 const { dataset } = document.documentElement;
 const button = document.getElementById("theme");
 const redraws = [];
-let theme = localStorage.getItem("theme");
+let theme = kept("theme");
 
 function apply(wanted) {
   theme = ORDER.includes(wanted) ? wanted : "auto";
@@ -21,7 +23,7 @@ export function onTheme(redraw) {
 
 button.addEventListener("click", () => {
   apply(ORDER[(ORDER.indexOf(theme) + 1) % ORDER.length]);
-  localStorage.setItem("theme", theme);
+  keep("theme", theme);
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => apply(theme));
 apply(theme);

@@ -61,7 +61,7 @@ test("dates have one form, and values their unit", () => {
   assert.equal(date("2026-11-30T14:05:09"), "30 Nov 2026, 14:05:09");
   assert.deepEqual(["day", "time", "minute"].map((name) => date("2026-01-02T03:04:05", name)), ["2 Jan 2026", "03:04:05", "03:04"]);
   assert.equal(date(Date.parse("2026-11-30T14:05:09") / 1000), "30 Nov 2026, 14:05:09");
-  assert.deepEqual([null, undefined, ""].map((at) => date(at)), ["–", "–", "–"]);
+  assert.deepEqual([null, undefined, "", "soon", NaN].map((at) => date(at)), Array(5).fill("–"));
   assert.deepEqual([0, 999.6, 999_600_000, 123_456_789, 1e19, null].map(bytes), ["0 B", "1 kB", "1.0 GB", "123 MB", "10000 PB", "–"]);
   assert.deepEqual(componentWords("l_index_finger_mcp_abd_rad"), { text: "left index finger mcp abd", unit: "rad" });
   assert.deepEqual(componentWords("camera_head.x_m"), { text: "camera head x", unit: "m" });

@@ -1,6 +1,7 @@
 """Pure modules of the player in Node, among them its decoder on bodies that Python packed."""
 
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -81,3 +82,18 @@ def test_player_modules(tmp_path):
     )
     assert run.returncode == 0, run.stdout[-6000:] + run.stderr[-2000:]
     assert run.stdout.count("that Python packed") >= 10
+
+
+def exports(module, name):
+    return re.search(rf"export [\w* ]*\b{name}\b|export \{{[^}}]*\b{name}\b", module.read_text())
+
+
+def test_what_a_module_imports_another_one_exports():
+    missing = [
+        f"{path.name}: {name} of {source}"
+        for path in STATIC.rglob("*.js")
+        for names, source in re.findall(r'import \{([^}]*)\} from "(\.[^"]*)"', path.read_text())
+        for name in re.findall(r"(\w+)(?: as \w+)?\s*(?:,|$)", names.strip())
+        if not exports(path.parent / source, name)
+    ]
+    assert missing == []

@@ -66,8 +66,7 @@ export function qualityCell(item) {
 }
 
 export function stageCell(stage) {
-  const badge = stage.label ? levelBadge(stage.level) : null;
-  if (badge) badge.textContent = stage.label;
+  const badge = stage.label ? levelBadge(stage.level, stage.label) : null;
   const steps = stage.done === null ? null : element("span", { class: "steps", title: STEPS.map((step, index) => `${step}${index < stage.done ? " ✓" : ""}`).join(", ") },
     ...STEPS.map((_, index) => element("span", { class: index < stage.done ? "done" : "open" })));
   const share = stage.share === undefined ? null : element("progress", { value: stage.share, max: 1, "aria-label": stage.label });

@@ -1,6 +1,7 @@
 // The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
 
 import { element, find, repeat, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { pagePath } from "../session.js";
 import { get, getIfServed, listChoices, post } from "./api.js";
 import * as cells from "./cells.js";
@@ -152,7 +153,7 @@ listen(grid, { form, actions: KEYS, buttons: [["accept", "a"], ["reject", "r"], 
 form.addEventListener("submit", (event) => event.preventDefault());
 form.addEventListener("input", (event) => {
   if (event.target.name === "reviewer") {
-    localStorage.setItem("reviewer", event.target.value);
+    keep("reviewer", event.target.value);
     return;
   }
   const { task, origin } = form.elements;
@@ -164,5 +165,5 @@ form.addEventListener("input", (event) => {
 const given = new URLSearchParams(location.search);
 await listChoices(form, { task: given.get("task") ?? "" });
 form.elements.origin.value = given.get("origin") === "any" ? "" : given.get("origin") ?? "recorded";
-form.elements.reviewer.value = localStorage.getItem("reviewer") ?? "";
+form.elements.reviewer.value = kept("reviewer") ?? "";
 await repeat(async () => { if (!dialog.open) await refresh(); }, REFRESH_MS);

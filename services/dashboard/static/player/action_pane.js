@@ -23,9 +23,7 @@ export class ActionPane {
     this.canvas = root.querySelector("canvas");
     this.readout = root.querySelector(".readout");
     this.time = root.querySelector(".own_time");
-    // Actions of a human hand have no names of joints.
-    const { components } = tracks.measured.stream;
-    this.words = Array.from({ length: ACTION_SIZE }, (_, index) => (components[index] ? componentWords(components[index]) : { text: `value ${index}`, unit: "" }));
+    this.words = tracks.measured.stream.components.map(componentWords);
     this.values = {};
     this.hovered = null;
     this.canvas.addEventListener("pointermove", (event) => this.hover(this.indexAt(event)));

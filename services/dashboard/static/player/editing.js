@@ -3,6 +3,7 @@
 
 import { post } from "../catalog/api.js";
 import { element, find, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { pagePath } from "../session.js";
 import { relabelCommand, spanText, stepsOf, trimCommand } from "./edit_spans.js";
 import { fetchFacts } from "./item.js";
@@ -18,6 +19,7 @@ export class Editing {
     this.item = player.item;
     this.selection = null;
     this.notes = [];
+    this.asked = 0;
     this.path = `${STORE}/notes/${this.item.path}`;
     const { kind, num_steps } = this.item.about;
     find("open_trim").hidden = kind !== "episode" || !num_steps;
@@ -110,13 +112,13 @@ export class Editing {
     const span = this.selection ?? [at, at];
     const { text, author } = this.fields;
     this.open("note", { title: "Note", words: spanText(span), verb: "Add" }, async () => {
-      localStorage.setItem("reviewer", author.value);
+      keep("reviewer", author.value);
       const [start_ns, stop_ns] = span.map((t_ns) => stampOf(t_ns, this.item.zero));
       await post(this.path, { start_ns, stop_ns, text: text.value, author: author.value.trim() || null });
       await this.load();
-      this.dialog.close();
+      return () => this.dialog.close();
     });
-    author.value = localStorage.getItem("reviewer") ?? "";
+    author.value = kept("reviewer") ?? "";
     text.focus();
   }
 
@@ -149,21 +151,21 @@ export class Editing {
   openEdit(kind, about, { command, send }) {
     const { outcome, keep } = this.fields;
     const how = (dry_run) => ({ outcome: outcome.value || null, keep: keep.checked, dry_run });
-    const apply = this.open(kind, { ...about, verb: about.title }, async () => this.showResult(await send(how(false))));
-    let asked = 0;
+    const apply = this.open(kind, { ...about, verb: about.title }, async () => {
+      const result = await send(how(false));
+      return () => this.showResult(result);
+    });
     this.form.onchange = async () => {
-      const number = (asked += 1);
+      const number = (this.asked += 1);
       apply.disabled = true;
       setText(find("edit_command"), command({ outcome: outcome.value, keep: keep.checked }));
-      let lines;
-      try {
-        const result = await send(how(true));
-        lines = [`Becomes ${result.id}; the source is then ${result.source_is}.`, ...result.messages];
-        if (number === asked) apply.disabled = false;
-      } catch (error) {
-        lines = [error.message];
-      }
-      if (number === asked) find("edit_preview").replaceChildren(...lines.map((line) => element("p", {}, line)));
+      const result = await send(how(true)).catch((error) => error);
+      // Of another dialog, or of fields that changed since.
+      if (number !== this.asked) return;
+      const isRefused = result instanceof Error;
+      apply.disabled = isRefused;
+      const lines = isRefused ? [result.message] : [`Becomes ${result.id}; the source is then ${result.source_is}.`, ...result.messages];
+      find("edit_preview").replaceChildren(...lines.map((line) => element("p", {}, line)));
     };
     this.form.onchange();
   }
@@ -176,7 +178,7 @@ export class Editing {
     setText(find("edit_undo"), `To undo this, delete ${id}${source_is === "in the trash" ? ` and restore ${source_id} from the trash` : ""}.`);
   }
 
-  // Show the parts of the form that are of this kind; gives the button that applies it.
+  // Show the parts of the form that are of this kind; gives the button that applies it. `act` gives what shows its result.
   open(kind, { title, words, verb, fill = () => {} }, act) {
     this.player.clock.pause();
     this.form.reset();
@@ -189,18 +191,24 @@ export class Editing {
     setText(find("edit_words"), words);
     setText(apply, verb);
     apply.disabled = false;
+    find("edit_preview").replaceChildren();
+    this.asked += 1;
     this.form.onchange = null;
-    this.form.onsubmit = async (event) => {
+    const submit = async (event) => {
       event.preventDefault();
       apply.disabled = true;
-      try {
-        await act();
-      } catch (error) {
+      this.asked += 1;
+      const fail = (error) => () => {
         find("edit_failure").hidden = false;
         setText(find("edit_failure"), error.message);
-      }
+      };
+      const showEnd = await act().catch(fail);
+      // The dialogs share one form: this one may show another by now.
+      if (this.form.onsubmit !== submit) return;
+      showEnd();
       apply.disabled = false;
     };
+    this.form.onsubmit = submit;
     this.dialog.showModal();
     return apply;
   }

@@ -13,10 +13,7 @@ const OPEN_FIGURES = 6;
 const OUTCOMES = { true: ["OK", "success"], false: ["ERROR", "failure"], null: ["STALE", "not judged"] };
 
 export function outcomeBadge(success) {
-  const [level, text] = OUTCOMES[String(success)];
-  const badge = levelBadge(level);
-  badge.textContent = text;
-  return badge;
+  return levelBadge(...OUTCOMES[String(success)]);
 }
 
 function rows(pairs) {

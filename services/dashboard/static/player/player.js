@@ -26,6 +26,15 @@ const URL_MS = 400;
 const RETRY_MS = 1000;
 const ACTIONS = { measured: "action", commanded: "action_commanded" };
 
+// A box that is checked while its value is in a set, or is not (`isIn`).
+function bind(box, set, isIn, onChange) {
+  box.checked = set.has(box.value) === isIn;
+  box.addEventListener("change", () => {
+    set[box.checked === isIn ? "add" : "delete"](box.value);
+    onChange();
+  });
+}
+
 export class Player {
   constructor(item, heatmap, state) {
     this.item = item;
@@ -90,12 +99,7 @@ export class Player {
 
   choice(name, set, onChange) {
     const box = element("input", { type: "checkbox", value: name });
-    box.checked = set.has(name);
-    box.addEventListener("change", () => {
-      if (box.checked) set.add(name);
-      else set.delete(name);
-      onChange();
-    });
+    bind(box, set, true, onChange);
     return element("label", { class: "check" }, box, name);
   }
 
@@ -189,15 +193,7 @@ export class Player {
       this.plots.setRaw(null);
       this.noteUrl();
     });
-    for (const box of find("layers").querySelectorAll("input")) {
-      box.checked = !this.hidden.has(box.value);
-      box.addEventListener("change", () => {
-        if (box.checked) this.hidden.delete(box.value);
-        else this.hidden.add(box.value);
-        this.noteUrl();
-        this.request();
-      });
-    }
+    for (const box of find("layers").querySelectorAll("input")) bind(box, this.hidden, false, () => { this.noteUrl(); this.request(); });
     const stream = find("signal_stream");
     stream.append(...[...this.item.streams.keys()].map((name) => element("option", { value: name }, name)));
     stream.addEventListener("change", () => this.listValues(stream.value));
@@ -246,7 +242,7 @@ export class Player {
     const act = event.key in jumps
       ? () => (event.shiftKey ? this.seek(this.clock.t_ns + jumps[event.key] * STEP_NS) : this.step(jumps[event.key]))
       : Object.hasOwn(acts, event.key) ? acts[event.key] : null;
-    if (!act || (event.key === " " && event.target.closest("input, summary"))) return;
+    if (!act || (event.key === " " && event.target.closest("button, input, summary"))) return;
     event.preventDefault();
     act();
   }

@@ -2,6 +2,7 @@
 // keys, zoomed by wheel and buttons. `range` is the visible part, in nanoseconds of the player.
 
 import { element, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { clockText, secondsText, ticks, tickText } from "./times.js";
 
 const SHORTEST_RANGE_NS = 1e7;
@@ -45,10 +46,12 @@ export class Timeline {
     const streams = [...item.streams.values()];
     this.lanes = [together(streams), ...streams].map((stream) => this.lane(stream));
     this.fold = element("button", { type: "button", class: "plain lane_name", title: "One line for all streams, or one for each" });
-    root.append(element("div", { class: "lane ruler_row" }, this.fold, this.ruler, element("span", { class: "lane_note" })),
+    // Beside the slider: a slider cannot have controls in it.
+    root.before(this.fold);
+    root.append(element("div", { class: "lane ruler_row" }, element("span"), this.ruler, element("span", { class: "lane_note" })),
       element("div", { class: "lanes" }, ...this.lanes.map(({ row }) => row)), this.over);
     this.listen();
-    this.setFolded((localStorage.getItem("timeline") ?? (SMALL.matches ? "folded" : "open")) === "folded");
+    this.setFolded((kept("timeline") ?? (SMALL.matches ? "folded" : "open")) === "folded");
     this.setRange(range ?? this.bounds);
   }
 
@@ -74,8 +77,8 @@ export class Timeline {
   listen() {
     this.fold.addEventListener("click", () => {
       const isFolded = !this.root.classList.contains("folded");
-      localStorage.setItem("timeline", isFolded ? "folded" : "open");
       this.setFolded(isFolded);
+      keep("timeline", isFolded ? "folded" : "open");
     });
     const at = (event) => {
       const box = this.over.getBoundingClientRect();

@@ -2,8 +2,7 @@
 
 import { getIfServed, post } from "../catalog/api.js";
 import { date } from "../dates.js";
-import { element, repeat, say, setText } from "../dom.js";
-import { badge } from "../study_parts.js";
+import { element, levelBadge, repeat, say, setText } from "../dom.js";
 import { newestOf, since } from "./figures.js";
 import { twoStep } from "./two_step.js";
 
@@ -129,7 +128,7 @@ export class StationKeys {
     if (!this.rows.has(key)) {
       const isValid = ["waiting", "enrolled"].includes(one.state);
       this.rows.set(key, element("tr", { "data-station": one.station },
-        element("td", {}, badge({ level: LEVELS[one.state], word: one.state })),
+        element("td", {}, levelBadge(LEVELS[one.state], one.state)),
         element("td", { class: "name" }, one.station),
         element("td", {}, date(since(one))),
         element("td", { class: "address" }, one.enrolled_from || "–"),

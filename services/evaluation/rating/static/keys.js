@@ -10,12 +10,13 @@ const KEPT = "dextouch.rating.keys";
 let keys = { ...USUAL };
 let learning = null;
 let numCriteria = 0;
-try {
+const attempt = (act) => { try { act(); } catch { /* A browser that keeps nothing, or no JSON: these keys last as long as the page. */ } };
+attempt(() => {
   for (const [action, key] of Object.entries(JSON.parse(localStorage.getItem(KEPT)))) if (action in USUAL && typeof key === "string") keys[action] = key;
-} catch { /* Nothing is kept, or no JSON: the usual keys. */ }
+});
 
 // Show the keys in the hints and in the list, with those of the criteria that there are.
-export function showKeys(criteria = numCriteria) {
+export function showKeys(criteria = numCriteria, focused = null) {
   numCriteria = criteria;
   const nameOf = (action) => NAMES[keys[action]] ?? (keys[action].length === 1 ? keys[action].toUpperCase() : keys[action]);
   for (const hint of document.querySelectorAll("kbd[data-action]")) hint.textContent = nameOf(hint.dataset.action);
@@ -23,9 +24,10 @@ export function showKeys(criteria = numCriteria) {
   at("key_list").replaceChildren(...shown.map((action) => {
     const button = Object.assign(document.createElement("button"), { type: "button", textContent: `${ACTIONS[action]}: ${action === learning ? "press a key" : nameOf(action)}` });
     button.setAttribute("aria-pressed", `${action === learning}`);
-    button.addEventListener("click", () => { learning = action; showKeys(); at("key_list").children[shown.indexOf(action)].focus(); });
+    button.addEventListener("click", () => { learning = action; showKeys(numCriteria, action); });
     return button;
   }));
+  if (focused) at("key_list").children[shown.indexOf(focused)].focus();
 }
 
 // The action of a pressed key. A key that is being assigned goes to its action, which gives its own to the one that had it.
@@ -37,15 +39,16 @@ export function actionOf(event) {
   if (pressed !== "Escape") {
     if (held) keys[held] = keys[learning];
     keys[learning] = pressed;
-    localStorage.setItem(KEPT, JSON.stringify(keys));
+    attempt(() => localStorage.setItem(KEPT, JSON.stringify(keys)));
   }
+  const learnt = learning;
   learning = null;
-  showKeys();
+  showKeys(numCriteria, learnt);
   return "learned";
 }
 
 at("usual").addEventListener("click", () => {
   [keys, learning] = [{ ...USUAL }, null];
-  localStorage.removeItem(KEPT);
   showKeys();
+  attempt(() => localStorage.removeItem(KEPT));
 });

@@ -48,9 +48,9 @@ async function show() {
   const biases = Object.entries(tasks).flatMap(([task, { raters }]) => raters.map((one) => ({ ...one, task: task.replaceAll("_", " ") })));
   fill("raters", [["rater", "rollouts", "scores more (+) or less (−) than others", "link", "action"], ...Object.keys(counts).sort().map((name) => {
     const link = links.find(({ rater }) => rater === name);
-    const told = biases.filter(({ rater }) => rater === name).map((one) => small(`${one.task}: ${one.bias > 0 ? "+" : ""}${number(one.bias)} (${range(one.bias_interval)})`));
+    const differences = biases.filter(({ rater }) => rater === name).map((one) => small(`${one.task}: ${one.bias > 0 ? "+" : ""}${number(one.bias)} (${range(one.bias_interval)})`));
     const state = link ? `${link.state.replace("_link", "")}, until ${link.ends_at.slice(0, 10)}` : "none, has a key";
-    return [name, `${counts[name]}`, told, state, link?.state === "valid" ? revoke(name) : ""];
+    return [name, `${counts[name]}`, differences, state, link?.state === "valid" ? revoke(name) : ""];
   })]);
   at("progress").textContent = `as of ${new Date().toTimeString().slice(0, 5)}`;
   [at("lead").hidden, at("enter").hidden] = [false, true];
