@@ -13,6 +13,7 @@ import { ask } from "./session.js";
 import { StepPlayer } from "./step_player.js";
 
 const OUTCOMES = { true: "success", false: "failure", null: "outcome unknown" };
+const RETRY_MS = 2000;
 const LEVELS = { running: "OK", finished: "OK", stopped: "STALE", failed: "ERROR" };
 
 // Values of a list with their words; what was chosen stays chosen.
@@ -40,10 +41,7 @@ export class ComparisonPanel {
       if (await this.start({ task: find("drive_task").value, seed: Number(find("drive_seed").value) })) find("drive_pad").focus();
     });
     find("replay_stop").addEventListener("click", () => post("/v1/comparisons/stop").catch((error) => this.say(error.message, "ERROR")));
-    for (const one of [window, find("replay_episode")]) one.addEventListener("focus", () => {
-      this.offered = null;
-      if (this.listed) this.offer(this.listed);
-    });
+    for (const one of [window, find("replay_episode")]) one.addEventListener("focus", () => this.offerAgain());
     find("comparison_step").addEventListener("input", (event) => this.goTo(Number(event.target.value)));
     find("comparison_pause").addEventListener("click", () => this.pause(!this.player.paused));
     find("go_to_moment").addEventListener("click", () => this.goTo(this.charts.left));
@@ -74,6 +72,7 @@ export class ComparisonPanel {
     const key = JSON.stringify([real, imagined, listed.has_episodes]);
     if (key === this.offered) return;
     this.offered = key;
+    clearTimeout(this.retry);
     const both = real.filter((task) => imagined.includes(task));
     fill(find("drive_task"), both.map((task) => [task, task]));
     find("drive").hidden = both.length === 0;
@@ -85,12 +84,17 @@ export class ComparisonPanel {
       problem = `Episodes cannot be listed: ${error.message}`;
     }
     if (this.offered !== key) return;
-    // Asked again with the next listing; the episodes of before stay.
-    if (problem) this.offered = null;
+    // The episodes of before stay.
+    if (problem) this.retry = setTimeout(() => this.offerAgain(), RETRY_MS);
     else this.fillEpisodes(found, real, imagined);
     const none = find("replay_episode").value ? "" : !listed.has_episodes ? "Replays need an episode store: this dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL."
       : "No robot episode of a task that the world model knows yet: dextouch demo records one, dextouch twin record as many as you want.";
     setText(find("offer_note"), problem || (imagined.length ? none : "Replays need a world model: dextouch up serves one."));
+  }
+
+  offerAgain() {
+    this.offered = null;
+    if (this.listed) this.offer(this.listed);
   }
 
   fillEpisodes(found, real, imagined) {
