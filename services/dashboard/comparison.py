@@ -193,11 +193,13 @@ class Comparisons:
             await self._end()
 
     async def _end(self) -> None:
-        task = self._run.task
-        if task is not None and not task.done():
-            task.cancel()
+        run = self._run
+        if run.task is not None:
+            # One that is over ends its rollouts, for which it is only waited.
+            if run.view.state == "running":
+                run.task.cancel()
             with suppress(asyncio.CancelledError):
-                await task
+                await run.task
 
     async def _world(self, side: str) -> WorldSide:
         service, wanted = SERVICES[side]

@@ -241,7 +241,8 @@ def test_hands_are_moved_by_the_keyboard_while_their_field_has_the_focus(page, s
     fields, arrays = unpack(newest, max_bytes=10**7)
     reached = arrays["action_reached"]
     last_step = fields["observation"]["first_step"] + len(reached) - 1
-    assert reached[-1][0] == pytest.approx(last_step / 15 * 0.25)
+    # Hands go no further than half a metre.
+    assert reached[-1][0] == pytest.approx(min(last_step / 15 * 0.25, 0.5))
     page.get_by_role("button", name="Stop").click()
     expect(page.locator("#comparison_state")).to_contain_text("stopped")
     expect(pad).to_be_hidden()
