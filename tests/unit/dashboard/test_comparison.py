@@ -131,6 +131,26 @@ async def test_of_two_that_begin_at_once_one_is_ended(compare):
     assert view.id == runs[-1].view.id
 
 
+async def test_one_that_is_over_ends_its_rollouts_though_stopped_meanwhile(compare, monkeypatch):
+    ending, allowed, ended = asyncio.Event(), asyncio.Event(), []
+
+    async def end(side):
+        ending.set()
+        await allowed.wait()
+        ended.append(side.name)
+
+    async def drive(comparisons, _):
+        await ending.wait()
+        stopping = asyncio.create_task(comparisons.stop())
+        await asyncio.sleep(0)
+        allowed.set()
+        await stopping
+
+    monkeypatch.setattr(comparison.WorldSide, "end", end)
+    await compare(NotedWorld("twin", judge=True), NotedWorld("dream", judge=False), drive=drive)
+    assert ended == ["twin", "dream"]
+
+
 class SharingWorld(NotedWorld):
     """Reports how much of its bound every chunk uses."""
 
