@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
@@ -520,8 +521,11 @@ def _run_or_resume(
         nonlocal kept_s
         is_last = now.budget.share() >= 1.0 and is_cut_short(settings, now.budget)
         if is_last or now.budget.wall_s - kept_s >= settings.state_every_s:
+            began_s = time.monotonic()
             files.write(now.state(identity))
-            kept_s = now.budget.wall_s
+            spent = torch.tensor(time.monotonic() - began_s, dtype=torch.float64)
+            # The same in all processes, which must decide alike.
+            kept_s = now.budget.wall_s + run.processes.mean(spent).item()
 
     return run.run(on_progress, keep)
 
