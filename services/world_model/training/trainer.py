@@ -427,6 +427,7 @@ def train_on(
             ancestor=None if ancestor is None else ancestor.digest,
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
+        **_dropout(settings, ancestor),
     )
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
     del averaged
@@ -485,6 +486,14 @@ def _data_hash(
     )
 
 
+def _dropout(settings: TrainSettings, ancestor: checkpoints.Checkpoint | None) -> dict[str, float]:
+    """Shares of windows without instruction and actions; the initial checkpoint's without own."""
+    own = settings.windows.model_dump(include={"text_dropout", "action_dropout"})
+    if any(own.values()) or ancestor is None:
+        return own
+    return {name: getattr(ancestor.metadata, name) for name in own}
+
+
 def _tokenizer_digest(
     ancestor: checkpoints.Checkpoint | None, tokenizer: checkpoints.StoredTokenizer | None
 ) -> str | None:
@@ -513,6 +522,12 @@ def _run_or_resume(
     if settings.resume and files.exists():
         like = {**training_state.moments_like(run.learned), **run.state(identity).tensors}
         run.restore(files.read(identity, like))
+        if run.budget.share() >= 1.0 and is_cut_short(settings, run.budget):
+            raise ConflictError(
+                f"training: cut short at step {run.budget.step} of {settings.step_limit} after "
+                f"{run.budget.wall_s:.0f} s ({run.budget.cpu_s:.0f} CPU s), and limits count in "
+                "all; resume with a larger --wall-budget-s or --cpu-budget-s"
+            )
     elif ancestor is None:
         run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
     kept_s = run.budget.wall_s
