@@ -24,7 +24,7 @@ from services.networks.weight_files import on_device
 from services.world_model import checkpoints
 from services.world_model.network.configuration import WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import JointWorldModel
+from services.world_model.network.model import JointWorldModel, from_first
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.network.video import to_unit
 from services.world_model.paper_settings import TrainSettings, command_line
@@ -144,14 +144,10 @@ class TrainingRun:
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
         # The pretrained expert takes its latents as they are.
         if config.wan is None:
-            videos = model.codec.encode(to_unit(batch.images))
-            if config.video_target == "residual":
-                videos = videos - videos[:, :1]
+            videos = from_first(model.codec.encode(to_unit(batch.images)), config.video_target)
             model.video_residual_std.copy_(videos[:, 1:].std().clamp_min(1e-3))
         if config.use_touch:
-            touch = model.tokenizer.encode(batch.tactile_kpa)
-            if config.tactile_target == "residual":
-                touch = touch - touch[:, :1]
+            touch = from_first(model.tokenizer.encode(batch.tactile_kpa), config.tactile_target)
             model.tactile_residual_std.copy_(touch[:, 1:].std().clamp_min(1e-3))
         for part in fitted:
             part.to(model.device)
