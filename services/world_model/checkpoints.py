@@ -118,6 +118,13 @@ class Checkpoint:
     digest: str
 
 
+def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> dict[str, float]:
+    """Shares of windows for the metadata: a training's, or its ancestor's if it has none."""
+    if ancestor is not None and not (text or action):
+        text, action = ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
+    return {"text_dropout": text, "action_dropout": action}
+
+
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
     """Write the file atomically and return its digest.
 

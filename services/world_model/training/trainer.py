@@ -423,7 +423,9 @@ def train_on(
             ancestor=None if ancestor is None else ancestor.digest,
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
-        **_dropout(settings, ancestor),
+        **checkpoints.dropout_shares(
+            settings.windows.text_dropout, settings.windows.action_dropout, ancestor
+        ),
     )
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
     del averaged
@@ -480,14 +482,6 @@ def _data_hash(
         image_px=settings.network.image_px,
         ancestor=None if ancestor is None else ancestor.metadata.data_hash,
     )
-
-
-def _dropout(settings: TrainSettings, ancestor: checkpoints.Checkpoint | None) -> dict[str, float]:
-    """Shares of windows without instruction and actions; the initial checkpoint's without own."""
-    own = settings.windows.model_dump(include={"text_dropout", "action_dropout"})
-    if any(own.values()) or ancestor is None:
-        return own
-    return {name: getattr(ancestor.metadata, name) for name in own}
 
 
 def _tokenizer_digest(

@@ -4,15 +4,13 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
-from services.world_model.checkpoints import Checkpoint, write_checkpoint
+from services.world_model.checkpoints import Checkpoint, dropout_shares, write_checkpoint
 from services.world_model.command_line import open_by_digest
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import Sampling
-from services.world_model.paper_settings import WindowSettings
 from services.world_model.settings import Placement, WorldModelSettings
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.objective import LossOptions, losses
-from services.world_model.training.trainer import _dropout
 from services.world_model.world import open_world
 from tests.unit.world_model.test_clean_tokens import noise_of
 from tests.unit.world_model.test_options import batch, model_with
@@ -128,10 +126,9 @@ def test_both_shares_of_dropped_windows_are_needed(tiny_model, metadata, tmp_pat
         open_world(path, sampling=Sampling(guidance=2.0))
 
 
-def test_shares_of_dropped_windows_are_inherited(tiny_model, metadata, train_settings):
+def test_shares_of_dropped_windows_are_inherited(tiny_model, metadata):
     given = metadata.model_copy(update={"text_dropout": 0.2, "action_dropout": 0.1})
     ancestor = Checkpoint(tiny_model, given, "0")
-    assert _dropout(train_settings, ancestor) == {"text_dropout": 0.2, "action_dropout": 0.1}
-    assert not any(_dropout(train_settings, None).values())
-    own = train_settings.model_copy(update={"windows": WindowSettings(action_dropout=0.5)})
-    assert _dropout(own, ancestor) == {"text_dropout": 0.0, "action_dropout": 0.5}
+    assert tuple(dropout_shares(0.0, 0.0, ancestor).values()) == (0.2, 0.1)
+    assert not any(dropout_shares(0.0, 0.0, None).values())
+    assert dropout_shares(0.0, 0.5, ancestor) == {"text_dropout": 0.0, "action_dropout": 0.5}
