@@ -118,11 +118,11 @@ class Checkpoint:
     digest: str
 
 
-def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> dict[str, float]:
+def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> tuple[float, float]:
     """Shares of windows for the metadata: a training's, or its ancestor's if it has none."""
     if ancestor is not None and not (text or action):
-        text, action = ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
-    return {"text_dropout": text, "action_dropout": action}
+        return ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
+    return text, action
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:

@@ -332,7 +332,9 @@ def _step_bytes(
     if is_sharded:
         num_parts = 1
         for weight in learned_weights(model).values():
-            weight.register_post_accumulate_grad_hook(_drop_gradient)
+            weight.register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
+                _drop_gradient
+            )
     t = torch.ones(num_windows)
     with PeakMemory((*model.parameters(), *model.buffers())) as memory:
         for _ in range(num_parts):

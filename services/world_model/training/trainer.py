@@ -397,6 +397,8 @@ def train_on(
     del run
     if averaged is None:
         return None
+    windows = settings.windows
+    dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
     metadata = checkpoints.CheckpointMetadata(
         name=settings.name,
         network=averaged.config,
@@ -423,9 +425,8 @@ def train_on(
             ancestor=None if ancestor is None else ancestor.digest,
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
-        **checkpoints.dropout_shares(
-            settings.windows.text_dropout, settings.windows.action_dropout, ancestor
-        ),
+        text_dropout=dropped[0],
+        action_dropout=dropped[1],
     )
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
     del averaged
