@@ -344,11 +344,11 @@ def test_short_writes_go_on_where_they_ended(path, monkeypatch, portion):
     assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
 
 
-def test_more_parts_than_one_call_takes_are_written(path):
+def test_more_parts_than_one_call_takes_are_written(tmp_path):
     parts = [bytes([number % 251]) * (1 + number % 3) for number in range(2500)]
-    with path.open("wb") as file:
+    with (tmp_path / "parts").open("wb") as file:
         write_parts(file.fileno(), *parts)
-    assert path.read_bytes() == b"".join(parts)
+    assert (tmp_path / "parts").read_bytes() == b"".join(parts)
 
 
 def test_an_encoded_batch_is_written_later_and_must_follow(path):
