@@ -63,7 +63,7 @@ class EpisodeStoreSettings(ServiceSettings):
     keep_trash_days: float | None = Field(
         default=None,
         ge=0,
-        description="days until what was put into the trash is permanently deleted; null: never",
+        description="days until what is in the trash is permanently deleted; otherwise it stays",
     )
     commit_in_process: bool = Field(
         default=True, description="commit finished recordings in a child process"

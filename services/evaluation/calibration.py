@@ -324,8 +324,17 @@ def _figures(
 def final_endings(
     episodes: Sequence[EndingEpisode], task: str, kind: str
 ) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
-    mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
+    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes.
+
+    True endings are seen without poses of objects, so that those without images are left out.
+    """
+    mine = [
+        e
+        for e in episodes
+        if e.task == task
+        and e.imagined == (kind == IMAGINED)
+        and (e.imagined or e.final.images is not None)
+    ]
     success = np.array([e.success for e in mine], dtype=bool)
     return [_as_seen(e.final) for e in mine], success
 
