@@ -529,8 +529,13 @@ def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePi
 def episode_pair(
     title: str, true: EpisodeReader, imagined: EpisodeReader, num_moments: int | None = None
 ) -> PredictionPicture:
-    """A true and an imagined episode, at all steps that both have or evenly spaced ones."""
+    """A true and an imagined episode, at evenly spaced steps that both have.
+
+    Without their number at all steps of the first five seconds, of which moving pictures are.
+    """
     num_steps = min(true.num_steps, imagined.num_steps)
+    if num_moments is None:
+        num_steps = min(num_steps, math.ceil(MOVING_S * imagined.attributes.model_rate_hz) + 1)
     shown = np.linspace(0, num_steps - 1, num_moments or num_steps).round().astype(np.int64)
     left, right = (one.window(0, num_steps, cameras=(HEAD_CAMERA,)) for one in (true, imagined))
     return PredictionPicture(
