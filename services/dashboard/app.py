@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, Gauge
 
-from dextouch.serving import AccessControl, create_service_app, serve
+from dextouch.serving import create_service_app, serve
 from services.dashboard import routes
 from services.dashboard.audit import AuditLog, AuditTrail
 from services.dashboard.comparison import Comparisons
@@ -40,7 +40,6 @@ def create_app(
     system = System(stations, upstreams)
     audit_log = AuditLog(settings.audit_folder, max_bytes=settings.audit_max_bytes)
     sessions = Sessions(
-        AccessControl(settings.api_keys),
         needs_key=bool(settings.api_keys),
         lifetime_s=3600 * settings.session_hours,
     )

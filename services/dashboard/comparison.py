@@ -100,6 +100,8 @@ class Comparisons:
     def __init__(self, feeds: Feeds, *, period_s: float) -> None:
         self._feeds = feeds
         self._run = _Run(ComparisonView())
+        # Held while a run ends, and until the next one is in its place.
+        self._ending = asyncio.Lock()
         self.topics = {"comparison": Topic.of_json("comparison", period_s, self.newest)}
 
     async def newest(self) -> ComparisonView:
@@ -122,7 +124,8 @@ class Comparisons:
             changes: dict[str, Any] = {name: getattr(about, name) for name in known}
             view = view.model_copy(update=changes | {"seed": about.seed or 0})
             if about.seed is None:
-                real = RecordedSide(self._feeds.upstream("episode_store"), about)
+                store = self._feeds.upstream("episode_store")
+                real = RecordedSide(store, about, len(actions) + 1)
         sides: dict[str, Side] = {"real": real or await self._world("real"), "imagined": imagined}
         _check_worlds(_worlds(sides), view.task)
         world = imagined.world
@@ -134,7 +137,6 @@ class Comparisons:
                 f"episode {asked.episode_id!r}: got {len(actions)} actions, expected at least "
                 f"{chunk}"
             )
-        await self.stop()
         changes = {
             "id": secrets.token_hex(8),
             "state": "running",
@@ -142,8 +144,11 @@ class Comparisons:
             "rate_hz": world.model_rate_hz,
             "num_steps": allowed,
         }
-        self._run = run = _Run(view.model_copy(update=changes), sides)
-        run.task = asyncio.create_task(self._supervise(run, actions))
+        run = _Run(view.model_copy(update=changes), sides)
+        async with self._ending:
+            await self._end()
+            self._run = run
+            run.task = asyncio.create_task(self._supervise(run, actions))
         return run.view
 
     async def move(self, comparison_id: str, moves: Moves) -> ComparisonView:
@@ -184,11 +189,17 @@ class Comparisons:
 
     async def stop(self) -> None:
         """End the running comparison, if any; its rollouts are ended too."""
-        task = self._run.task
-        if task is not None and not task.done():
-            task.cancel()
+        async with self._ending:
+            await self._end()
+
+    async def _end(self) -> None:
+        run = self._run
+        if run.task is not None:
+            # One that is over ends its rollouts, for which it is only waited.
+            if run.view.state == "running":
+                run.task.cancel()
             with suppress(asyncio.CancelledError):
-                await task
+                await run.task
 
     async def _world(self, side: str) -> WorldSide:
         service, wanted = SERVICES[side]
@@ -240,8 +251,8 @@ class Comparisons:
             world="", task=view.task, seed=view.seed, instruction=view.instruction
         )
         first = await real.start(request, None)
-        begun = await imagined.start(request, first)
-        await self._add(run, first[0], begun[0], None)
+        imagined_first = await imagined.start(request, first)
+        await self._add(run, first[0], imagined_first[0], None)
         size = _chunk_steps(run.sides)
         chunks = (
             _driven(run, HandDriver(*first, rate_hz=view.rate_hz), size)

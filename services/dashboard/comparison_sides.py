@@ -19,7 +19,8 @@ from services.dashboard.rollout_feeds import MAX_RESPONSE_BYTES
 from services.dashboard.upstream import Upstream
 
 WORLD_TIMEOUT_S: Final = 120.0
-Begun = tuple[schemas.Observation, schemas.RolloutOrigin]
+# Observation of step 0, with the anchor and the matrix of the head camera.
+FirstStep = tuple[schemas.Observation, schemas.RolloutOrigin]
 
 
 @dataclass
@@ -35,7 +36,7 @@ class WorldSide:
         """Name of the world."""
         return self.world.name
 
-    async def start(self, request: schemas.StartRequest, first: Begun | None) -> Begun:
+    async def start(self, request: schemas.StartRequest, first: FirstStep | None) -> FirstStep:
         """The first observation, with anchor and camera matrix; `first` is the other side's."""
         request = request.model_copy(update={"world": self.world.name})
         seen, origin = (None, None) if first is None else first
@@ -74,10 +75,11 @@ class RecordedSide:
 
     store: Upstream
     attributes: schemas.EpisodeAttributes
+    num_steps: int
     name: str = "recording"
     next_step: int = 0
 
-    async def start(self, request: schemas.StartRequest, first: Begun | None) -> Begun:
+    async def start(self, request: schemas.StartRequest, first: FirstStep | None) -> FirstStep:
         """See `WorldSide`."""
         del request, first
         seen, window = await self._read(1)
@@ -114,7 +116,8 @@ class RecordedSide:
             tactile_kpa=window.tactile_kpa,
             action_reached=window.actions,
             reached_is_measured=True,
-            success=self.attributes.success,
+            # Of the whole take, which says nothing about a part of it.
+            success=self.attributes.success if self.next_step == self.num_steps else None,
         )
         return seen, window
 

@@ -19,7 +19,7 @@ from dextouch.hands.actions import (
     pose_from_9d,
     pose_to_9d,
 )
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import SIDES, RobotHand
 
 # Chosen: as fast as demonstrators move hands; a task then takes its usual five seconds.
 SPEED_M_S: Final = 0.25
@@ -67,6 +67,7 @@ class HandDriver:
         self._period_s = 1.0 / rate_hz
         T_left, T_right, T_camera = origin.anchor.as_tuple()
         self._anchors = {"left": T_left, "right": T_right}
+        self._fingers = {side: _fingers(RobotHand(side)) for side in SIDES}
         # Axes of the person who looks at the picture; z of the world is up.
         up = np.array([0.0, 0.0, 1.0])
         forward = np.cross(up, T_camera[:3, 0])
@@ -94,15 +95,20 @@ class HandDriver:
         R = rotation_from_vector(tilt * self._axes[:, 0]) @ T_world_wrist[:3, :3] @ about_fingers
         T_world_wrist[:3, :3] = R
         self._row[wrist] = pose_to_9d(invert(anchor) @ T_world_wrist)
-        hand = RobotHand(side)
-        wanted = self._row[joints].copy()
-        flexes = np.array(["abd" not in name for name in hand.joint_names])
-        closed = CLOSED * hand.upper_rad if move.close > 0 else np.zeros(len(wanted))
-        wanted[flexes] = np.clip(closed, hand.lower_rad, hand.upper_rad)[flexes]
+        bends, opened_rad, closed_rad = self._fingers[side]
+        wanted_rad = closed_rad if move.close > 0 else opened_rad
         step_rad = abs(move.close) * JOINT_RAD_S * self._period_s
-        self._row[joints] += np.clip(wanted - self._row[joints], -step_rad, step_rad)
+        steps_rad = np.clip(wanted_rad - self._row[joints], -step_rad, step_rad)
+        self._row[joints] += np.where(bends, steps_rad, 0.0)
 
     def _limited(self, shares: Sequence[float], speed: float) -> Float64[np.ndarray, " n"]:
         """The step along several axes, together no faster than `speed`."""
         direction = np.array(shares, np.float64)
         return direction / max(1.0, float(np.linalg.norm(direction))) * speed * self._period_s
+
+
+def _fingers(hand: RobotHand) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which joints bend, and their angles in an open and in a closed hand (rad)."""
+    bends = np.array(["abd" not in name for name in hand.joint_names])
+    opened_rad = np.clip(0.0, hand.lower_rad, hand.upper_rad)
+    return bends, opened_rad, np.clip(CLOSED * hand.upper_rad, hand.lower_rad, hand.upper_rad)

@@ -199,7 +199,8 @@ SCREENS: Final = (
 class Sessions:
     """Access of browsers: open on loopback without keys, otherwise by signing in."""
 
-    access: AccessControl
+    # Of the application, which is made later.
+    access: AccessControl = field(init=False)
     _: KW_ONLY
     needs_key: bool
     lifetime_s: float

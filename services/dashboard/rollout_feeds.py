@@ -54,13 +54,15 @@ class ListedRollout(schemas.WatchedRollout):
 class RolloutsView(FrozenModel):
     """Open rollouts of all services; `problems` are the reasons of services that list none.
 
-    `over` are the ten that ended last, by when their last chunk was.
+    `over` are the ten that ended last, by when their last chunk was. `has_episodes` if a store is
+    configured, whose episodes can be replayed.
     """
 
     worlds: tuple[WorldView, ...] = ()
     rollouts: tuple[ListedRollout, ...] = ()
     over: tuple[ListedRollout, ...] = ()
     num_open: int = 0
+    has_episodes: bool = False
     problems: tuple[str, ...] = ()
 
 
@@ -107,6 +109,7 @@ class RolloutFeeds:
                 sorted((one for view in found for one in view.over), key=_idle_s)[:NUM_OVER]
             ),
             num_open=sum(view.num_open for view in found),
+            has_episodes=self._feeds.has("episode_store"),
             problems=tuple(text for view in found for text in view.problems),
         )
 

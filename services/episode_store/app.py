@@ -3,6 +3,7 @@
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Final
 
 import structlog
@@ -110,18 +111,10 @@ class PendingUploads(PeriodicThread):
                 logger.info("unfinished_writes_removed", count=removed)
 
 
-class TrashRetention(PeriodicThread):
-    """Permanently deletes what has been in the trash of a store in a folder for some days."""
-
-    def __init__(self, store: EpisodeStore, keep_days: float | None) -> None:
-        super().__init__("trash_not_purged", TRASH_PERIOD_S, self.work)
-        self._store, self._keep_days = store, keep_days
-
-    def work(self) -> None:
-        """Purge once."""
-        if self._keep_days is None or not self._store.folders:
-            return
-        for entry in self._store.purge(older_than_s=86_400.0 * self._keep_days):
+def purge_old_trash(store: EpisodeStore, keep_days: float | None) -> None:
+    """Permanently delete what has been in the trash of a store in a folder for some days."""
+    if keep_days is not None and store.folders:
+        for entry in store.purge(older_than_s=86_400.0 * keep_days):
             logger.info("trash_purged", kind=entry.kind, id=entry.item_id)
 
 
@@ -168,7 +161,11 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         # Reading a large store takes minutes, and can be interrupted anywhere.
         PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0),
         DeletionWatch(deletions, ingest.drop_deleted, limits.end),
-        TrashRetention(store, settings.keep_trash_days),
+        PeriodicThread(
+            "trash_not_purged",
+            TRASH_PERIOD_S,
+            partial(purge_old_trash, store, settings.keep_trash_days),
+        ),
     )
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 

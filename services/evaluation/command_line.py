@@ -133,17 +133,15 @@ def run_evaluation(arguments: list[str]) -> int:
     with ExitStack() as connections:
         real = opened(settings.real, connections)
         imagined = {n: opened(world, connections) for n, world in settings.imagined.items()}
-        given: dict[str, Any] = {
-            "real": real,
-            "imagined": imagined,
-            "policies": policies,
-            "plan": plan,
-        }
-        report = evaluate(**given, probe=probe, keep=log.keep)
+        report = evaluate(
+            real=real, imagined=imagined, policies=policies, plan=plan, probe=probe, keep=log.keep
+        )
         figures = report.to_report()
         write_result(settings.json_path, figures, allow_nan=False)
         if settings.html is not None:
-            moving = film(report, **given, probe=probe)
+            moving = film(
+                report, real=real, imagined=imagined, policies=policies, plan=plan, probe=probe
+            )
             write_report(figures, ReportPictures(moving=moving), settings.html)
     print_scores(figures)
     print_failures(figures, log.path)

@@ -25,7 +25,7 @@ def film(
     plan: EvaluationPlan,
     probe: SuccessClassifier,
 ) -> tuple[PredictionPicture, ...]:
-    """Play the telling pair of every task again, with the images of all steps.
+    """Play the example pair of every task again, with the images of all steps.
 
     The evaluation renders only what policies and the success classifier use. The arguments are
     those of `evaluate`, and `report` what it returned; a pair that fails now is left out, and a
@@ -39,7 +39,7 @@ def film(
         return ()
     runner = RolloutRunner(worlds, probe, plan.num_steps, shows_all=True)
     found = []
-    for task, pair in telling_pairs(report, world).items():
+    for task, pair in example_pairs(report, world).items():
         name, instruction = pair[0].policy, plan.instructions[task]
         start = matched_start(real, task, pair[0].seed, instruction)
         played = [runner.run(start, policies[name], name, one)[1] for one in (REAL, world)]
@@ -51,7 +51,7 @@ def film(
     return tuple(found)
 
 
-def telling_pairs(report: ClosedLoopReport, world: str) -> dict[str, Pair]:
+def example_pairs(report: ClosedLoopReport, world: str) -> dict[str, Pair]:
     """By task the first start and policy whose outcomes differ, or else succeed in both worlds."""
     known = {(s.world, s.task, s.policy, s.seed): s for s in report.scores if s.repeat == 0}
     found: dict[str, Pair] = {}
@@ -60,12 +60,12 @@ def telling_pairs(report: ClosedLoopReport, world: str) -> dict[str, Pair]:
         if where != REAL or imagined is None:
             continue
         pair = (score, imagined)
-        if task not in found or _told(pair) > _told(found[task]):
+        if task not in found or _rank(pair) > _rank(found[task]):
             found[task] = pair
     return found
 
 
-def _told(pair: Pair) -> tuple[bool, bool]:
+def _rank(pair: Pair) -> tuple[bool, bool]:
     return pair[0].success != pair[1].success, pair[0].success
 
 

@@ -138,10 +138,9 @@ def judge(
         seeds=list(plan.seeds),
         trained_on={"the policy": models.policy.metadata.training_starts},
     )
+    real, probe = WorldAddress(twin, "twin"), models.probe
     worlds = {name: WorldAddress(imagined, name) for name in (MODEL, BASELINE)}
-    given: dict[str, Any] = {"real": WorldAddress(twin, "twin"), "imagined": worlds, "plan": tasks}
-    given |= {"policies": policies, "probe": models.probe}
-    report = evaluate(**given)
+    report = evaluate(real=real, imagined=worlds, policies=policies, plan=tasks, probe=probe)
     if report.failures:
         first = report.failures[0]
         raise DexTouchError(
@@ -152,7 +151,9 @@ def judge(
     found["mistakes"] = mistake_rows(report.scores, plan)
     for task, comments in found["comments"].items():
         comments.append(mistake_comment(task, found["mistakes"]))
-    return found, film(report, **given)
+    return found, film(
+        report, real=real, imagined=worlds, policies=policies, plan=tasks, probe=probe
+    )
 
 
 def mistake_rows(scores: Iterable[RolloutScore], plan: DemoPlan) -> list[dict[str, Any]]:

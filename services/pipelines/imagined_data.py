@@ -20,6 +20,7 @@ from dextouch.worlds import World, WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
 from services.evaluation.reporting import (
+    MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
@@ -163,13 +164,14 @@ def generate_main(arguments: Sequence[str]) -> int:
         f"{len(made)} episodes imagined and verified, {num_bytes / 1e6:.1f} MB in {options.store}"
     )
     if options.strips is not None:
-        pictures = [
-            _pictures(source, target.open(one)) for one in sorted(made)[: options.num_strips]
-        ]
+        shown = [target.open(one) for one in sorted(made)[: options.num_strips]]
+        pictures = ReportPictures(
+            predictions=tuple(_picture(source, one, _NUM_MOMENTS) for one in shown),
+            moving=tuple(_picture(source, one, None) for one in shown[:MAX_MOVING]),
+        )
         about = {"world model": options.checkpoint.name, "episodes": len(made)}
         page = {"title": "Recorded and imagined episodes", "about": about}
-        strips, moving = (tuple(one) for one in zip(*pictures, strict=True))
-        write_report(page, ReportPictures(predictions=strips, moving=moving), options.strips)
+        write_report(page, pictures, options.strips)
         print(f"recorded and imagined images: {options.strips}")
     write_result(options.json, {"episodes": sorted(made), "num_bytes": num_bytes})
     return 0
@@ -225,8 +227,10 @@ def refuse_trained_episodes(
         )
 
 
-def _pictures(source: EpisodeStore, imagined: EpisodeReader) -> list[PredictionPicture]:
-    """A few moments of an episode beside its true one, and all of its steps."""
+def _picture(
+    source: EpisodeStore, imagined: EpisodeReader, num_moments: int | None
+) -> PredictionPicture:
+    """An episode beside its true one, as `episode_pair`."""
     (true_id,) = {one.id for one in imagined.attributes.lineage if one.kind == "episode"}
-    title, truth = f"{imagined.attributes.task}: {true_id}", source.open(true_id)
-    return [episode_pair(title, truth, imagined, num) for num in (_NUM_MOMENTS, None)]
+    title = f"{imagined.attributes.task}: {true_id}"
+    return episode_pair(title, source.open(true_id), imagined, num_moments)

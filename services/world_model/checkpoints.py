@@ -79,7 +79,8 @@ class CheckpointMetadata(FrozenModel):
     training episodes count here, too, and `tokenizer_digest` that of the pretrained tokenizer's
     file. None is not written, so that older releases can read the file. `sets` are the episodes by
     domain, those of ancestors included; empty in files of older releases. `horizon_latents` is the
-    length of the longest training episode.
+    length of the longest training episode. `text_dropout` and `action_dropout` are the shares of
+    windows without instruction and without actions, of this training or of an ancestor's.
     """
 
     format_version: int = 1
@@ -98,7 +99,14 @@ class CheckpointMetadata(FrozenModel):
     sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
     tokenizer_digest: str | None = Field(default=None, exclude_if=not_)
     horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1, exclude_if=HORIZON_LATENTS.__eq__)
+    text_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
+    action_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
+
+    @property
+    def is_guidable(self) -> bool:
+        """Whether the model was trained on windows with neither instruction nor actions, too."""
+        return min(self.text_dropout, self.action_dropout) > 0.0
 
 
 @dataclass(frozen=True)
@@ -108,6 +116,13 @@ class Checkpoint:
     model: JointWorldModel
     metadata: CheckpointMetadata
     digest: str
+
+
+def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> tuple[float, float]:
+    """Shares of windows for the metadata: a training's, or its ancestor's if it has none."""
+    if ancestor is not None and not (text or action):
+        return ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
+    return text, action
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:

@@ -114,10 +114,12 @@ class RunSettings(DataSettings):
         default=None, ge=1, description="training steps; a usual number unless time is limited"
     )
     wall_budget_s: float | None = Field(
-        default=None, gt=0, description="seconds after which training ends"
+        default=None,
+        gt=0,
+        description="seconds after which training ends, in all: also before --resume",
     )
     cpu_budget_s: float | None = Field(
-        default=None, gt=0, description="CPU seconds of a process after which training ends"
+        default=None, gt=0, description="CPU seconds of a process after which it ends, in all"
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
     device: Device = "cpu"
@@ -200,6 +202,7 @@ def command_line(settings: TrainSettings) -> str:
     """Command that repeats a run, as its checkpoint records it."""
     places = ("episodes", "human", "heldout", "init", "tokenizer")
     local = {"output", "json_path", "resume", "state_every_s", "device", "wan", "plan"}
+    local |= {"plan_processes"}
     command = f"dextouch train world-model --preset={settings.preset}"
     return recorded_command(settings, command, places, {*local, "preset"})
 
@@ -295,7 +298,11 @@ class TrainCommand(CommandSettings, TrainSettings):
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
     plan: CliImplicitFlag[bool] = Field(
-        default=False, description="print memory and FLOPs of the network, and do not train"
+        default=False,
+        description="print memory and FLOPs of a chunk and of this training, and what fits a card",
+    )
+    plan_processes: int = Field(
+        default=8, ge=1, description="processes that --plan shards the training over, too"
     )
 
     @classmethod

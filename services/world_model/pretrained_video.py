@@ -5,16 +5,20 @@ are checked from the files' headers before any weight is read. Nothing is ever d
 """
 
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import torch
 from safetensors import SafetensorError, safe_open
-from torch import nn
+from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks.weight_files import (
     allocate,
+    available_memory,
     check_memory,
     fill,
     memory_of,
@@ -182,7 +186,8 @@ def load_weights(
                 f"{where}: {name} has shape {shape}, expected {tuple(expected[name].shape)}; the "
                 "folder holds a model of another size"
             )
-    check_memory(memory_of(expected), where=where, max_bytes=max_bytes)
+    limit = _available(expected) if max_bytes is None else max_bytes
+    check_memory(memory_of(expected), where=where, max_bytes=limit)
     allocate(network)
     expected = network.state_dict()
     for file in files:
@@ -191,6 +196,16 @@ def load_weights(
                 tensor = opened.get_tensor(name)
                 refuse_non_finite({name: tensor}, where)
                 fill(expected[name], tensor)
+
+
+def _available(weights: Mapping[str, Tensor]) -> int | None:
+    """Memory for this process's weights: that of its GPU, or its part of the machine's."""
+    meshes = [one.device_mesh for one in weights.values() if isinstance(one, DTensor)]
+    if meshes and meshes[0].device_type == "cuda":
+        return torch.cuda.mem_get_info()[0]
+    free = available_memory()
+    # torchrun's number of processes on this machine, each with weights of its own.
+    return None if free is None else free // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 def _file_names(folder: Path, where: str) -> Sequence[str]:

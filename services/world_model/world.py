@@ -320,18 +320,29 @@ def open_world(
             reader = starts.SceneReader(
                 checkpoints.read_state_checkpoint(objects or default_checkpoint())
             )
-        if sampling.guidance != 1.0 and "-dropout=" not in checkpoint.metadata.command:
-            raise InvalidInputError(
-                f"world model {file.name}: got a guidance of {sampling.guidance:g}, expected 1: it "
-                "was trained with every instruction and action; train with --windows.text-dropout "
-                "and --windows.action-dropout"
-            )
+        if sampling.guidance != 1.0:
+            _check_guidance(checkpoint, sampling.guidance, file)
         return ModelWorld(checkpoint, sampling=sampling, reader=reader)
     if sampling != Sampling():
         raise InvalidInputError(
             f"state model {file.name}: got {sampling}, expected none: it predicts without sampling"
         )
     return StateWorld(checkpoints.read_state_checkpoint(file))
+
+
+def _check_guidance(checkpoint: checkpoints.Checkpoint, guidance: float, file: Path) -> None:
+    """Raise unless the model can predict without instruction and actions."""
+    metadata, texts = checkpoint.metadata, checkpoint.model.text_features
+    if not metadata.is_guidable:
+        raise InvalidInputError(
+            f"world model {file.name}: got a guidance of {guidance:g}, expected 1: it was trained "
+            f"without instruction in {metadata.text_dropout:.0%} of windows and without actions in "
+            f"{metadata.action_dropout:.0%}; train with both --windows.text-dropout and "
+            "--windows.action-dropout"
+        )
+    if texts is not None:
+        # Predictions without instruction need its features.
+        texts.of("")
 
 
 def _check_reader(

@@ -127,7 +127,7 @@ def test_rollouts_may_show_less(episode):
 
 def test_verdicts():
     served = benchmark.Variant(2).name
-    assert served == "1 Euler step, float32"
+    assert served == "2 Euler steps, float32"
     errors = {
         benchmark.COPY_FIRST: RolloutError(30.0, 4.0, 0.0),
         served: RolloutError(15.0, 5.0, 0.9),

@@ -1,5 +1,6 @@
 """An operator replays an episode in a real and an imagined world, and sees how far they part."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -210,7 +211,7 @@ def test_a_policy_author_sees_where_imagination_left_the_truth(
     expect(page.locator("#compared")).to_have_attribute("data-step", "33")
     figure = page.locator("figure", has=page.locator("#imagined_image"))
     expect(figure).to_have_attribute("data-outside", "true")
-    before, after = (strip_colour(page, step) for step in (20, 60))
+    before, after = (strip_colour(page, step) for step in (22, 62))
     assert before != after
     page.get_by_label("step of the comparison").fill("32")
     expect(figure).to_have_attribute("data-outside", "false")
@@ -228,17 +229,98 @@ def test_hands_are_moved_by_the_keyboard_while_their_field_has_the_focus(page, s
     page.get_by_role("button", name="Move hands").click()
     pad = page.locator("#drive_pad")
     expect(pad).to_be_focused()
+    # The toy's hand is the left one.
+    page.locator("#drive_sides").select_option("left")
+    pad.focus()
     page.keyboard.down("d")
     expect(page.locator("#comparison_step")).to_have_attribute("max", re.compile("^[1-9][0-9]$"))
     page.keyboard.up("d")
     # The newest response of the twin has the hand to the right of where it began.
     (rollout,) = httpx.get(f"{twin}/v1/watch").json()["rollouts"]
     newest = httpx.get(f"{twin}/v1/watch/{rollout['watch_id']}").content
-    reached = unpack(newest, max_bytes=10**7)[1]["action_reached"][-1]
-    assert reached[9] == pytest.approx(rollout["last_step"] / 15 * 0.25)
+    fields, arrays = unpack(newest, max_bytes=10**7)
+    reached = arrays["action_reached"]
+    last_step = fields["observation"]["first_step"] + len(reached) - 1
+    # Hands go no further than half a metre.
+    assert reached[-1][0] == pytest.approx(min(last_step / 15 * 0.25, 0.5))
     page.get_by_role("button", name="Stop").click()
     expect(page.locator("#comparison_state")).to_contain_text("stopped")
     expect(pad).to_be_hidden()
+
+
+@pytest.fixture
+def tell(page):
+    """Changes what the live link says about a topic, now and from now on."""
+    changes, newest, sockets = {}, {}, []
+
+    def send(topic):
+        data = newest.get(topic, {}) | changes.get(topic, {})
+        sockets[-1].send(json.dumps({"topic": topic, "data": data}))
+
+    def connect(socket):
+        sockets.append(socket)
+
+        def pass_on(text):
+            if isinstance(text, bytes):
+                socket.send(text)
+                return
+            message = json.loads(text)
+            newest[message["topic"]] = message["data"]
+            send(message["topic"])
+
+        socket.connect_to_server().on_message(pass_on)
+
+    def change(topic, **fields):
+        changes[topic] = fields
+        send(topic)
+
+    page.route_web_socket("**/v1/live", connect)
+    return change
+
+
+@pytest.mark.slow
+def test_a_chosen_episode_stays_chosen(page, serve_dashboard, tmp_path, item, tell):
+    store = EpisodeStore(str(tmp_path / "store"))
+    write(store, toy.demonstration("reach", 5))
+    episodes = "**/v1/episode_store/episodes?*"
+    problem = {"detail": "the store starts"}
+    page.route(episodes, lambda route: route.fulfill(status=503, json=problem))
+    page.goto(f"{serve_dashboard()[0]}/rollouts")
+    note = page.locator("#offer_note")
+    expect(note).to_have_text("Episodes cannot be listed: the store starts")
+    page.unroute(episodes)
+    expect(note).to_have_text("")
+    chosen = page.get_by_label("Episode")
+    expect(chosen.locator("option")).to_have_count(2)
+    for episode_id in ("reach-5-0", item.episode_id):
+        chosen.select_option(episode_id)
+        tell("rollouts", worlds=[])
+        expect(page.locator("#drive")).to_be_hidden()
+        tell("rollouts")
+        expect(page.locator("#drive")).to_be_visible()
+        expect(chosen).to_have_value(episode_id)
+    write(store, toy.demonstration("reach", 6))
+    page.get_by_role("button", name="Replay").focus()
+    chosen.focus()
+    expect(chosen.locator("option")).to_have_count(3)
+    expect(chosen).to_have_value(item.episode_id)
+
+
+@pytest.mark.slow
+def test_what_is_shown_stays_while_a_world_or_the_dashboard_is_away(page, serve_dashboard, tell):
+    page.goto(f"{serve_dashboard()[0]}/rollouts")
+    page.get_by_role("button", name="Move hands").click()
+    expect(page.locator("#drive_pad")).to_be_focused()
+    page.get_by_role("button", name="Watch").first.click()
+    about = page.locator("#watched_about")
+    expect(page.locator("#step_text")).to_contain_text("step 0")
+    tell("rollouts", rollouts=[])
+    expect(page.locator("tr[data-watch]")).to_have_count(0)
+    expect(about).to_contain_text("running")
+    tell("comparison", state="none")
+    expect(page.locator("#comparison_state")).to_contain_text("stopped")
+    expect(page.locator("#drive_pad")).to_be_hidden()
+    expect(page.locator("#replay_stop")).to_be_hidden()
 
 
 @pytest.mark.slow

@@ -125,3 +125,22 @@ def test_an_invited_rater_opens_a_link_and_keeps_keys_of_their_own(serve, page, 
     expect(page.get_by_role("table", name="raters")).to_contain_text("revoked")
     page.goto(link)
     expect(page.get_by_role("alert")).to_contain_text("was revoked or replaced")
+
+
+@pytest.mark.slow
+def test_a_refresh_keeps_what_was_said_and_says_when_it_fails(serve, page, settings):
+    key = {"name": "lead", "key": "the-lead's-own-key-4711", "scopes": ("rate_lead",)}
+    url = serve(create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)})))
+    page.clock.install()
+    page.goto(f"{url}/lead")
+    page.get_by_label("Key").fill(key["key"])
+    page.get_by_role("button", name="Show").click()
+    page.get_by_label("Name").fill("lead")
+    page.get_by_role("button", name="Make a link").click()
+    expect(page.get_by_role("alert")).to_contain_text("a key has this name")
+    with page.expect_response("**/invitations"):
+        page.clock.fast_forward(15_000)
+    expect(page.get_by_role("alert")).to_contain_text("a key has this name")
+    page.route("**/agreement", lambda route: route.abort())
+    page.clock.fast_forward(15_000)
+    expect(page.get_by_role("status")).to_contain_text("; not refreshed: ")

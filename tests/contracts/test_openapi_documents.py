@@ -26,7 +26,8 @@ OPERATIONS = {
         drop_calibration_place finish_calibration_run cancel_calibration_run""",
     "dashboard": """
         get_heatmap_layout get_overview operate_recorder retry_upload get_camera_image
-        start_comparison stop_comparison get_comparison_chunk get_system list_audit_entries""",
+        start_comparison move_hands stop_comparison get_comparison_chunk get_system
+        list_audit_entries""",
     "episode_store": """
         create_recording upload_batch finish_recording get_recording list_uploads expire_uploads
         list_recordings list_episodes get_hours get_hours_by_field list_items
@@ -41,7 +42,7 @@ OPERATIONS = {
     "rating": """
         get_next_rollout get_step_image submit_mark get_agreement list_invitations invite_rater
         revoke_rater""",
-    "studies": "list_studies get_study list_study_rollouts",
+    "studies": "list_studies get_study get_study_picture list_study_rollouts",
     "teleoperation": "stop_hand",
     "worlds": """
         list_worlds start_rollout get_rollout delete_rollout send_chunk fork_rollout

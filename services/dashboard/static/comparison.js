@@ -1,18 +1,26 @@
 // Real against imagined: replays an episode or moves hands, follows the chunks as they arrive, and goes back to any step.
 
+import { get, post } from "./catalog/api.js";
 import { chunkOf, difference, uncertaintyAt, firstUnreliable, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
 import { ComparisonCharts } from "./comparison_charts.js";
-import { element, setText } from "./dom.js";
+import { element, find, levelBadge, say, setText, showChildren } from "./dom.js";
 import { number } from "./format.js";
 import { HandDriving } from "./hand_driving.js";
 import { HandCanvas } from "./hands.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, uncertaintyOf } from "./rollout_rows.js";
+import { uncertaintyOf } from "./rollout_rows.js";
 import { ask } from "./session.js";
 import { StepPlayer } from "./step_player.js";
 
+const OUTCOMES = { true: "success", false: "failure", null: "outcome unknown" };
+const RETRY_MS = 2000;
 const LEVELS = { running: "OK", finished: "OK", stopped: "STALE", failed: "ERROR" };
-const find = (id) => document.getElementById(id);
+
+// Values of a list with their words; what was chosen stays chosen.
+function fill(list, choices, chosen = list.value) {
+  showChildren(list, choices.map(([value, text]) => element("option", { value }, text)));
+  if (choices.some(([value]) => value === chosen)) list.value = chosen;
+}
 
 export class ComparisonPanel {
   constructor(heatmap) {
@@ -23,10 +31,7 @@ export class ComparisonPanel {
       [side, new HandCanvas(find(`${world}_${side}`), { summary: find(`${world}_${side}_text`) }, side, heatmap)]))]));
     this.charts = new ComparisonCharts(find("charts"), find("uncertainty_strip"), (step) => this.goTo(step));
     this.player = new StepPlayer({ show: (step) => this.showStep(step) });
-    this.driving = new HandDriving(find("drive_pad"), find("drive_sides"), async (moves) => {
-      const view = await this.post(`/v1/comparisons/${this.view.id}/moves`, moves);
-      if (view) this.show(view);
-    });
+    this.driving = new HandDriving(find("drive_pad"), find("drive_sides"), async (moves) => this.show(await post(`/v1/comparisons/${this.view.id}/moves`, moves)));
     find("replay").addEventListener("submit", (event) => {
       event.preventDefault();
       this.start({ episode_id: find("replay_episode").value });
@@ -35,60 +40,72 @@ export class ComparisonPanel {
       event.preventDefault();
       if (await this.start({ task: find("drive_task").value, seed: Number(find("drive_seed").value) })) find("drive_pad").focus();
     });
-    find("replay_stop").addEventListener("click", () => this.post("/v1/comparisons/stop"));
+    find("replay_stop").addEventListener("click", () => post("/v1/comparisons/stop").catch((error) => this.say(error.message, "ERROR")));
+    for (const one of [window, find("replay_episode")]) one.addEventListener("focus", () => this.offerAgain());
     find("comparison_step").addEventListener("input", (event) => this.goTo(Number(event.target.value)));
     find("comparison_pause").addEventListener("click", () => this.pause(!this.player.paused));
     find("go_to_moment").addEventListener("click", () => this.goTo(this.charts.left));
   }
 
-  // The answer's body, where there is one, or null where the request was refused.
-  async post(path, body) {
-    const options = { method: "POST" };
-    if (body) Object.assign(options, { headers: { "content-type": "application/json" }, body: JSON.stringify(body) });
-    const answer = await ask(path, options);
-    if (answer.status === 204) return {};
-    const said = await answer.json();
-    if (!answer.ok) this.note(said.detail ?? `refused (${answer.status})`, "ERROR");
-    return answer.ok ? said : null;
+  say(text, level) {
+    say(find("comparison_note"), text, level);
   }
 
   async start(asked) {
-    this.note("Starting.");
-    const view = await this.post("/v1/comparisons", asked);
-    if (view) {
-      this.note("");
+    this.say("Starting.");
+    try {
+      const view = await post("/v1/comparisons", asked);
+      this.say("");
       this.show(view);
+      return true;
+    } catch (error) {
+      this.say(error.message, "ERROR");
+      return false;
     }
-    return view;
   }
 
   // Robot episodes of tasks that the world model knows, with one that the address names, and tasks to move hands in.
-  async offer(worlds) {
-    const tasksOf = (kind) => worlds.find((one) => one.kind === kind)?.tasks ?? [];
+  async offer(listed) {
+    this.listed = listed;
+    const tasksOf = (kind) => listed.worlds.find((one) => one.kind === kind)?.tasks ?? [];
     const [real, imagined] = [tasksOf("twin"), tasksOf("model")];
-    const key = JSON.stringify([real, imagined]);
+    const key = JSON.stringify([real, imagined, listed.has_episodes]);
     if (key === this.offered) return;
     this.offered = key;
-    const answer = await ask("/v1/episode_store/episodes?domain=robot&limit=100").catch(() => null);
-    const found = answer?.ok ? (await answer.json()).episodes : [];
-    // Those of a station have no seed, by which the twin places its objects.
-    const suitable = found.filter(({ task, origin }) => imagined.includes(task) && (origin === "recorded" || real.includes(task)));
-    const outcomes = { true: "success", false: "failure", null: "outcome unknown" };
-    const wanted = new URLSearchParams(location.search).get("replay");
-    const named = wanted && !suitable.some((one) => one.episode_id === wanted) ? [element("option", { value: wanted }, wanted)] : [];
-    find("replay_episode").replaceChildren(...named, ...suitable.map((one) => element("option", { value: one.episode_id },
-      `${one.task}: ${one.episode_id}, ${one.duration_s.toFixed(1)} s, ${outcomes[one.success]}, against ${one.origin === "recorded" ? "its recording" : "the twin"}`)));
-    if (wanted) find("replay_episode").value = wanted;
-    find("replay_button").disabled = !find("replay_episode").value;
+    clearTimeout(this.retry);
     const both = real.filter((task) => imagined.includes(task));
-    find("drive_task").replaceChildren(...both.map((task) => element("option", {}, task)));
+    fill(find("drive_task"), both.map((task) => [task, task]));
     find("drive").hidden = both.length === 0;
-    setText(find("offer_note"), !imagined.length ? "Replays need a world model: dextouch up serves one." : suitable.length ? "" : "No robot episode of a task that the world model knows yet: dextouch demo records one, dextouch twin record as many as you want.");
+    let found = [];
+    let problem = "";
+    try {
+      if (listed.has_episodes) found = (await get("/v1/episode_store/episodes?domain=robot&limit=100")).episodes;
+    } catch (error) {
+      problem = `Episodes cannot be listed: ${error.message}`;
+    }
+    if (this.offered !== key) return;
+    // The episodes of before stay.
+    if (problem) this.retry = setTimeout(() => this.offerAgain(), RETRY_MS);
+    else this.fillEpisodes(found, real, imagined);
+    const none = find("replay_episode").value ? "" : !listed.has_episodes ? "Replays need an episode store: this dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL."
+      : "No robot episode of a task that the world model knows yet: dextouch demo records one, dextouch twin record as many as you want.";
+    setText(find("offer_note"), problem || (imagined.length ? none : "Replays need a world model: dextouch up serves one."));
   }
 
-  note(text, level = "") {
-    find("comparison_note").dataset.level = level;
-    setText(find("comparison_note"), text);
+  offerAgain() {
+    this.offered = null;
+    if (this.listed) this.offer(this.listed);
+  }
+
+  fillEpisodes(found, real, imagined) {
+    // Those of a station have no seed, by which the twin places its objects.
+    const suitable = found.filter(({ task, origin }) => imagined.includes(task) && (origin === "recorded" || real.includes(task)));
+    const list = find("replay_episode");
+    const wanted = list.value || new URLSearchParams(location.search).get("replay");
+    const named = wanted && !suitable.some((one) => one.episode_id === wanted) ? [[wanted, wanted]] : [];
+    fill(list, [...named, ...suitable.map((one) => [one.episode_id,
+      `${one.task}: ${one.episode_id}, ${one.duration_s.toFixed(1)} s, ${OUTCOMES[one.success]}, against ${one.origin === "recorded" ? "its recording" : "the twin"}`])], wanted);
+    find("replay_button").disabled = !list.value;
   }
 
   pause(paused) {
@@ -102,7 +119,11 @@ export class ComparisonPanel {
   }
 
   show(view) {
-    if (view.state === "none") return;
+    if (view.state === "none") {
+      // The dashboard was started again since; what has arrived stays.
+      if (this.view?.state === "running") this.show({ ...this.view, state: "stopped", num_chunks: this.chunks.length });
+      return;
+    }
     const isNew = this.view?.id !== view.id;
     this.view = view;
     if (isNew) {
@@ -110,13 +131,13 @@ export class ComparisonPanel {
       this.player.load(0);
       this.pause(false);
     }
-    find("comparison_state").replaceChildren(badge({ level: LEVELS[view.state], word: view.state }),
+    find("comparison_state").replaceChildren(levelBadge(LEVELS[view.state], view.state),
       element("span", {}, `${view.task}, ${view.episode_id || `hands moved by you, seed ${view.seed}`}`),
       element("span", { class: "quiet" }, `step ${Math.max(0, view.pixel_error.length - 1)} of ${view.num_steps}`));
     find("replay_stop").hidden = view.state !== "running";
     find("drive_pad").hidden = view.state !== "running" || view.episode_id !== "";
     for (const name of document.querySelectorAll(".real_name")) setText(name, view.worlds.real === "recording" ? "Recording" : "Twin");
-    if (view.note) this.note(view.note, view.state === "failed" ? "ERROR" : "WARN");
+    if (view.note) this.say(view.note, view.state === "failed" ? "ERROR" : "WARN");
     find("compared").hidden = view.pixel_error.length === 0;
     this.charts.show(view);
     this.showMoment();
@@ -134,7 +155,7 @@ export class ComparisonPanel {
     find("go_to_moment").hidden = !first;
     const imagined = uncertainties.at(-1)?.uncertainty?.success_probability ?? null;
     const isWhole = this.view.pixel_error.length > num_steps;
-    setText(find("outcomes"), isWhole && real_success !== null ? `Real: ${real_success ? "success" : "failure"}. Imagined: ${imagined === null ? "no estimate" : `success with ${(100 * imagined).toFixed(0)} %`}.` : "");
+    setText(find("outcomes"), isWhole && (real_success !== null || imagined !== null) ? `Real: ${OUTCOMES[real_success]}. Imagined: ${imagined === null ? "no estimate" : `success with ${(100 * imagined).toFixed(0)} %`}.` : "");
   }
 
   // Chunks are fetched one after the other, in order, and played as they come.
@@ -144,8 +165,8 @@ export class ComparisonPanel {
     try {
       while (this.view && this.chunks.length < this.view.num_chunks) {
         const { id, rate_hz } = this.view;
-        const answer = await ask(`/v1/comparisons/${id}/chunks/${this.chunks.length}`);
-        if (!answer.ok || this.view.id !== id) break;
+        const answer = await ask(`/v1/comparisons/${id}/chunks/${this.chunks.length}`).catch(() => null);
+        if (!answer?.ok || this.view.id !== id) break;
         const chunk = readChunk(await answer.arrayBuffer());
         this.chunks.push(chunk);
         const count = chunk.first_step + chunk.num_steps;

@@ -1,6 +1,6 @@
 // Hands moved from keyboard or gamepad: what is held down becomes shares of the largest speed, chunk after chunk.
 
-import { setText } from "./dom.js";
+import { say } from "./dom.js";
 
 const KEYS = { w: ["forward", 1], s: ["forward", -1], d: ["right", 1], a: ["right", -1], r: ["up", 1], f: ["up", -1],
   e: ["turn", 1], q: ["turn", -1], t: ["tilt", 1], g: ["tilt", -1], " ": ["close", 1], c: ["close", -1] };
@@ -29,7 +29,7 @@ export function moveOf(held, pad = null) {
 export class HandDriving {
   // `send` gets the moves of a chunk and resolves once it was made.
   constructor(pad, sides, send) {
-    Object.assign(this, { pad, sides, send, held: new Set(), sending: false });
+    Object.assign(this, { pad, sides, send, held: new Set(), sending: false, isRefused: false });
     pad.addEventListener("keydown", (event) => {
       const key = event.key.toLowerCase();
       if (event.ctrlKey || event.metaKey || event.altKey || !(key in KEYS || key === WAIT)) return;
@@ -44,12 +44,21 @@ export class HandDriving {
   async tick() {
     if (this.sending || document.activeElement !== this.pad) return;
     const move = moveOf(this.held, navigator.getGamepads?.().find(Boolean));
-    if (!Object.keys(move).length && !this.held.has(WAIT)) return;
+    if (!Object.keys(move).length && !this.held.has(WAIT)) this.isRefused = false;
+    else if (!this.isRefused) await this.make(move);
+  }
+
+  // After a refusal nothing is sent until all keys were let go.
+  async make(move) {
+    const output = this.pad.querySelector("output");
     this.sending = true;
-    setText(this.pad.querySelector("output"), Object.entries(move).map(([name, share]) => `${name} ${share.toFixed(1)}`).join(", ") || "waiting");
+    say(output, Object.entries(move).map(([name, share]) => `${name} ${share.toFixed(1)}`).join(", ") || "waiting");
     const sides = this.sides.value === "both" ? ["left", "right"] : [this.sides.value];
     try {
       await this.send({ hands: Object.fromEntries(sides.map((side) => [side, move])) });
+    } catch (error) {
+      this.isRefused = true;
+      say(output, error.message, "ERROR");
     } finally {
       this.sending = false;
     }

@@ -3,7 +3,7 @@
 import { CameraPanel } from "./cameras.js";
 import { css } from "./canvas.js";
 import { DevicesPanel } from "./devices.js";
-import { element, setText } from "./dom.js";
+import { element, find, setText } from "./dom.js";
 import { age } from "./format.js";
 import { FollowLines } from "./following.js";
 import { Freshness } from "./freshness.js";
@@ -18,7 +18,6 @@ import { showLegend } from "./taxel_marks.js";
 import { PADS } from "./taxels.js";
 import { onTheme } from "./theme.js";
 
-const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = {
   left: new HandCanvas(find("hand_left"), textsOf("left"), "left", heatmap),

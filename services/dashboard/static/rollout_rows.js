@@ -1,6 +1,6 @@
 // Open rollouts and those that ended last → rows of the table, and the words for their state, uncertainty and outcome.
 
-import { element, showChildren } from "./dom.js";
+import { element, levelBadge, showChildren } from "./dom.js";
 import { age } from "./format.js";
 
 const IDLE_S = 30;
@@ -42,18 +42,14 @@ function why(text) {
   return text ? element("span", { class: "why" }, text) : null;
 }
 
-export function badge({ level, word }) {
-  return element("span", { class: "level", "data-level": level }, word);
-}
-
-export function rolloutRow(rollout, isWatched, watch) {
+function rolloutRow(rollout, isWatched, watch) {
   const state = stateOf(rollout);
   const uncertainty = uncertaintyOf(rollout);
   const button = rollout.isOver ? "" : element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
   if (button) button.addEventListener("click", () => watch(rollout));
   return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.isOver ? null : rollout.watch_id,
     "data-over": rollout.isOver ? rollout.watch_id : null, "data-key": `${rollout.watch_id}${Boolean(rollout.isOver)}` },
-    element("td", {}, badge(state), why(rollout.ended)),
+    element("td", {}, levelBadge(state.level, state.word), why(rollout.ended)),
     element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
     element("td", {}, rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")),
     element("td", { class: "task" }, rollout.task, why(rollout.instruction)),

@@ -1,17 +1,16 @@
 // The rollouts screen: open rollouts of all worlds, and the newest steps of the one that is watched.
 
 import { ComparisonPanel } from "./comparison.js";
-import { element, setText } from "./dom.js";
+import { element, find, levelBadge, say, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
+import { outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
 import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
 import { onTheme } from "./theme.js";
 
-const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = Object.fromEntries(["left", "right"].map((side) =>
   [side, new HandCanvas(find(`hand_${side}`), { summary: find(`hand_${side}_text`) }, side, heatmap)]));
@@ -49,14 +48,11 @@ function watch(rollout) {
   showTable();
 }
 
-function note(text, level = "") {
-  const node = find("watched_note");
-  node.dataset.level = level;
-  setText(node, text);
-}
+const note = (text, level) => say(find("watched_note"), text, level);
 
 function about(rollout) {
-  find("watched_about").replaceChildren(badge(stateOf(rollout)),
+  const { level, word } = stateOf(rollout);
+  find("watched_about").replaceChildren(levelBadge(level, word),
     element("strong", {}, `${rollout.world}: ${rollout.task}`),
     element("span", { class: "quiet" }, rollout.instruction),
     rollout.isOver ? element("strong", {}, outcomeOf(rollout)) : "",
@@ -69,18 +65,20 @@ function showTable() {
 
 function showListed(view) {
   listed = view;
-  comparison.offer(view.worlds);
+  comparison.offer(view);
   setText(find("summary"), `${view.num_open} open`);
   find("world_list").replaceChildren(...view.worlds.map((world) => element("li", { title: world.tasks.join(", ") },
     element("strong", {}, world.name), element("span", { class: "quiet" }, `${world.kind}, ${world.tasks.length} tasks`))));
   find("problems").replaceChildren(...view.problems.map((text) => element("p", { class: "note", "data-level": "WARN" }, text)));
-  const now = view.rollouts.find((one) => watched && topicOf(one) === watched.topic);
+  const isWatched = (one) => topicOf(one) === watched?.topic;
+  const now = view.rollouts.find(isWatched);
+  const over = view.over.find(isWatched);
   if (now) {
     watched.rollout = now;
     about(now);
-  } else if (watched && steps) {
-    // What was shown last stays, with the state that it has now.
-    about({ ...(view.over.find((one) => topicOf(one) === watched.topic) ?? watched.rollout), isOver: true });
+  } else if (over) {
+    // What was shown last stays, with what came of it; so it does while a world does not answer.
+    about({ ...over, isOver: true });
   } else if (!watched) {
     const wanted = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
     if (wanted) {
@@ -132,7 +130,10 @@ const link = new LiveLink({
   onTopic: (topic, data) => {
     if (topic === "rollouts") showListed(data);
     else if (topic === "comparison") comparison.show(data);
-    else if (topic === watched?.topic) note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+    else if (topic === watched?.topic) {
+      note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+      if (data.gone && !listed.over.some((one) => topicOf(one) === topic)) about({ ...watched.rollout, isOver: true });
+    }
   },
   onBinary: (buffer) => {
     const message = readSteps(buffer);

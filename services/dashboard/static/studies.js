@@ -1,18 +1,16 @@
 // The list of studies, with the progress of those that run.
 
 import { date } from "./dates.js";
-import { element, setText, showChildren } from "./dom.js";
+import { element, find, setText, showChildren } from "./dom.js";
 import { LiveLink } from "./live.js";
 import { pagePath } from "./session.js";
-import { badge, progress, stateOf, why } from "./study_parts.js";
-
-const find = (id) => document.getElementById(id);
+import { progress, stateBadge, why } from "./study_parts.js";
 
 function row(study) {
   const title = study.problem ? element("strong", {}, study.name)
     : element("a", { href: pagePath(`/studies/${encodeURIComponent(study.name)}`) }, study.title || study.name);
   return element("tr", { "data-level": study.problem ? "ERROR" : null },
-    element("td", {}, badge(stateOf(study))),
+    element("td", {}, stateBadge(study)),
     element("td", { class: "name" }, title, study.title && study.title !== study.name ? why(study.name) : null, why(study.problem)),
     element("td", {}, study.problem ? "–" : progress(study)),
     element("td", { class: "number" }, study.problem ? "–" : String(study.num_failed)),

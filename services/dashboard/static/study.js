@@ -1,13 +1,13 @@
 // One study: its tables, sorted as the operator wants, and its rollouts, disagreements first; what it has none of is hidden.
 
-import { element, setText } from "./dom.js";
+import { get } from "./catalog/api.js";
+import { element, find, say, setText } from "./dom.js";
 import { LiveLink } from "./live.js";
-import { ask } from "./session.js";
+import { ask, checked } from "./session.js";
 import { sorted } from "./sorting.js";
-import { badge, progress, stateOf } from "./study_parts.js";
+import { progress, stateBadge } from "./study_parts.js";
 import { agreementRow, rateCell, rateRows, rolloutRow } from "./study_tables.js";
 
-const find = (id) => document.getElementById(id);
 const PAGE = 50;
 const RETRY_MS = 5000;
 const name = decodeURIComponent(location.pathname.split("/").pop());
@@ -17,18 +17,7 @@ let figures = null;
 let order = { key: "task", descending: false };
 let filter = null; // disagreements where there are any, else all, until the operator chooses
 let rows = [];
-
-async function read(path) {
-  const answer = await ask(path);
-  const body = await answer.json();
-  if (!answer.ok) throw new Error(body.detail ?? `refused (${answer.status})`);
-  return body;
-}
-
-function note(id, text, level = "") {
-  find(id).dataset.level = level;
-  setText(find(id), text);
-}
+let pictures = 0; // that were asked for
 
 function sortButton(key, label) {
   const button = element("button", { type: "button", class: "sort" }, label);
@@ -54,7 +43,7 @@ function showRates() {
 function showFigures() {
   const { summary, meanings } = figures;
   setText(find("study_title"), summary.title || summary.name);
-  find("study_state").replaceChildren(badge(stateOf(summary)), progress(summary));
+  find("study_state").replaceChildren(stateBadge(summary), progress(summary));
   setText(find("summary"), summary.worlds.length ? `${figures.num_disagreements} imagined outcomes differ from the real ones` : "no imagined world to compare");
   setText(find("rate_meaning"), `${meanings.rate} Cannot tell: ${meanings.unreliable}`);
   const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
@@ -76,10 +65,16 @@ async function showPicture() {
   const query = { world: find("picture_world").value, task: find("picture_task").value };
   const address = (form) => `${base}/picture?${new URLSearchParams({ ...query, form })}`;
   for (const form of ["svg", "png", "tex"]) find(`picture_${form}`).href = address(form);
-  const answer = await ask(address("svg"));
-  if (!answer.ok) return;
-  const drawn = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
-  find("picture").replaceChildren(document.importNode(drawn, true));
+  const number = (pictures += 1);
+  let shown;
+  try {
+    const drawn = new DOMParser().parseFromString(await (await checked(await ask(address("svg")))).text(), "image/svg+xml");
+    shown = document.importNode(drawn.documentElement, true);
+  } catch (error) {
+    shown = element("p", { class: "note", "data-level": "ERROR" }, error.message);
+  }
+  // Of an older choice, which a newer one has replaced.
+  if (number === pictures) find("picture").replaceChildren(shown);
 }
 
 function showChoices({ worlds, tasks }) {
@@ -112,7 +107,7 @@ function showRollouts(total) {
   const what = filter.disagreements ? "outcomes that differ between a world and the real one" : "rollouts, those that differ from the real one first";
   const missing = rows.some((row) => row.episode_id) && rows.every((row) => !row.episode_id || playable.has(row.episode_id)) && !rows.some((row) => kept.has(row.episode_id) || kept.has(row.real_episode_id))
     ? " They are not in this dashboard's episode store, so they cannot be played here: run the study with --store." : "";
-  note("rollouts_note", `${rows.length} of ${total} ${what}${of}.${missing}`);
+  say(find("rollouts_note"), `${rows.length} of ${total} ${what}${of}.${missing}`);
   find("more").hidden = rows.length >= total;
   find("only_disagreements").setAttribute("aria-pressed", String(Boolean(filter.disagreements)));
   find("all_rollouts").setAttribute("aria-pressed", String(!filter.disagreements));
@@ -122,14 +117,14 @@ async function load(offset) {
   const asked = filter;
   const query = new URLSearchParams({ ...filter, limit: PAGE, offset });
   try {
-    const { rollouts, num_matching } = await read(`${base}/rollouts?${query}`);
+    const { rollouts, num_matching } = await get(`${base}/rollouts?${query}`);
     if (asked !== filter) return;
     rows = offset ? [...rows, ...rollouts] : rollouts;
     showRollouts(num_matching);
     await findPlayable(rollouts);
     if (asked === filter) showRollouts(num_matching);
   } catch (error) {
-    note("rollouts_note", error.message, "ERROR");
+    say(find("rollouts_note"), error.message, "ERROR");
   }
 }
 
@@ -141,14 +136,14 @@ function open(wanted) {
 
 async function refresh() {
   try {
-    figures = await read(base);
+    figures = await get(base);
     showFigures();
     const none = figures.summary.num_done ? "" : "No rollout has a result yet; the first ones appear here as the study runs.";
-    note("study_note", none);
+    say(find("study_note"), none);
     filter ??= figures.num_disagreements ? { disagreements: true } : {};
     if (rows.length <= PAGE) await load(0);
   } catch (error) {
-    note("study_note", error.message, "ERROR");
+    say(find("study_note"), error.message, "ERROR");
     setTimeout(refresh, RETRY_MS);
   }
 }
@@ -158,7 +153,7 @@ const link = new LiveLink({
   onTopic: (topic, data) => {
     if (topic !== "studies") return;
     const study = data.studies.find((one) => one.name === name);
-    if (!study && data.note) note("study_note", data.note, "ERROR");
+    if (!study && data.note) say(find("study_note"), data.note, "ERROR");
     const now = JSON.stringify(study ?? null);
     if (now !== newest) {
       newest = now;

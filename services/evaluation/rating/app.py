@@ -23,7 +23,6 @@ from dextouch.serving import (
 )
 from services.evaluation.rating.invitations import Invitations, invitation_router
 from services.evaluation.rating.marks import (
-    DECIDING,
     Judgement,
     Mark,
     MarkLog,
@@ -112,13 +111,15 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
     page = file_router(STATIC, FILES, page_headers(images="'self' blob:"))
-    pool = f"{settings.study or 'all rollouts'}, {', '.join(sorted(tasks))} of {store.root}"
+    # Not the tasks that rubrics are for, of which a release may bring more.
+    of_tasks = ", ".join(sorted(settings.tasks)) or "all tasks"
+    pool = f"{settings.study or 'all rollouts'}, {of_tasks} of {store.root.resolve()}"
     invitations = Invitations(marks, pool)
     routers = [
         page,
         rating_router(queue, marks, rubrics, pictures, on_mark=given.inc),
         invitation_router(invitations),
-        agreement_router(marks, rollouts, rubrics),
+        agreement_router(marks, rollouts, rubrics, settings.raters_per_rollout),
     ]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),
@@ -192,8 +193,7 @@ def rating_router(
         mark = Mark.model_validate(
             fields | {"rater": _rater(request, given.rater, key), "episode_id": rollout.episode_id}
         )
-        if mark.presentation == DECIDING:
-            queue.check_deciding(mark.rater, rollout.token)
+        queue.check(mark)
         if not mark.cannot_judge:
             rubric_of(rollout.task, rubrics).score(mark.holds)
         number = marks.add(mark)
@@ -204,7 +204,10 @@ def rating_router(
 
 
 def agreement_router(
-    marks: MarkLog, rollouts: Sequence[RatedRollout], rubrics: Mapping[str, Rubric]
+    marks: MarkLog,
+    rollouts: Sequence[RatedRollout],
+    rubrics: Mapping[str, Rubric],
+    raters_per_rollout: int,
 ) -> APIRouter:
     """Router of the agreement so far, which raters must not see."""
     leads = Depends(RequireScope("rate_lead"))
@@ -214,7 +217,8 @@ def agreement_router(
     @router.get("/agreement")
     def get_agreement() -> dict[str, Any]:
         """The report of all marks until now without single rollouts, with the rollouts by task."""
-        report = rating_report(marks.latest().values(), task_of, rubrics, {})
+        given = marks.latest().values()
+        report = rating_report(given, task_of, rubrics, {}, raters_per_rollout=raters_per_rollout)
         return report | {"rollouts": dict(Counts(task_of.values()))}
 
     return router

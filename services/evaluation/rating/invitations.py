@@ -89,7 +89,7 @@ class Invitations:
 
     def __init__(self, marks: MarkLog, pool: str) -> None:
         self._marks, self._pool = marks, pool
-        self._access, self._reserved = AccessControl(()), frozenset[str]()
+        self._access = AccessControl(())
         self._lock = threading.Lock()
         self._invited: list[tuple[bytes, InvitedRater]] = []
         with marks.connected("opened") as connection:
@@ -97,7 +97,7 @@ class Invitations:
 
     def connect(self, access: AccessControl) -> None:
         """Accept the links beside the keys of the settings, now and at every change."""
-        self._access, self._reserved = access, access.names
+        self._access = access
         self._accept()
 
     def listing(self) -> list[Invitation]:
@@ -121,7 +121,7 @@ class Invitations:
                 "the service has no api_keys, so that raters need no link either; set api_keys, "
                 "without which only this machine reaches it (docs/access.md)"
             )
-        if rater in self._reserved:
+        if rater in self._access.key_names:
             raise ConflictError(f"rater {rater!r}: a key has this name; choose another name")
         secret = secrets.token_urlsafe(NUM_SECRET_BYTES)
         ends_at = datetime.now(UTC) + timedelta(days=days)

@@ -79,12 +79,12 @@ class StoredMark:
 
 
 def by_people(marks: Iterable[Mark]) -> dict[str, list[Mark]]:
-    """Marks of people by episode, without those of rollouts that they were shown again."""
-    found: dict[str, list[Mark]] = {}
+    """Marks of people by episode, the first of each, without those of rollouts shown again."""
+    found: dict[str, dict[str, Mark]] = {}
     for mark in marks:
         if mark.kind == "human" and mark.presentation != REPEAT:
-            found.setdefault(mark.episode_id, []).append(mark)
-    return found
+            found.setdefault(mark.episode_id, {}).setdefault(mark.rater, mark)
+    return {episode_id: list(given.values()) for episode_id, given in found.items()}
 
 
 @dataclass(frozen=True)

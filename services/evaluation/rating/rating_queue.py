@@ -111,13 +111,14 @@ class RatingQueue:
             episode_id: sum(one.presentation == FIRST for one in marks)
             for episode_id, marks in given.items()
         }
+        every = self._rollouts.values()
         waiting = [
             one
-            for one in self._rollouts.values()
+            for one in every
             if one.episode_id not in seen
             and raters.get(one.episode_id, 0) < self._raters_per_rollout
         ]
-        tied = [one for one in self._rollouts.values() if self._decides(rater, one, given)]
+        tied = [one for one in every if self._decides(rater, given.get(one.episode_id, ()))]
         num_open = len(waiting) + len(tied)
         repeated = self._repeat(rater, mine, len(seen))
         if repeated is not None:
@@ -130,27 +131,29 @@ class RatingQueue:
         )
         return Assignment(chosen, FIRST if waiting else DECIDING, len(seen), num_open)
 
-    def check_deciding(self, rater: str, token: str) -> None:
-        """Refuse a mark that is to decide, unless the rollout's raters are tied without it.
+    def check(self, mark: Mark) -> None:
+        """Refuse a mark by which a rater would count twice, or decide what is not tied.
 
         Raises:
-            ConflictError: they are not, or the rater is one of them.
+            ConflictError: its presentation is not that of the rater's assignment.
         """
-        rollout = self.rollout(token)
         latest = (stored.mark for stored in self._marks.latest().values())
-        marks = by_people(latest).get(rollout.episode_id, [])
-        others = [one for one in marks if one.presentation == FIRST]
-        if rater in {one.rater for one in others} or not vote(others).tied:
+        given = [one for one in latest if one.episode_id == mark.episode_id]
+        first = [one for one in given if (one.presentation, one.kind) == (FIRST, "human")]
+        deciders = {one.rater for one in given if one.presentation == DECIDING}
+        if (
+            not self._decides(mark.rater, first)
+            if mark.presentation == DECIDING
+            else mark.presentation == FIRST and mark.rater in deciders
+        ):
             raise ConflictError(
-                f"rollout {token!r}: a mark with presentation {DECIDING} decides where other "
-                "raters are tied; ask for the next rollout and use its presentation"
+                f"rollout {token_of(mark.episode_id)!r}: got presentation {mark.presentation}, but "
+                f"{DECIDING} decides where other raters are complete and tied, and {FIRST} is not "
+                "for whoever did; ask for the next rollout and use its presentation"
             )
 
-    def _decides(
-        self, rater: str, rollout: RatedRollout, given: Mapping[str, Sequence[Mark]]
-    ) -> bool:
+    def _decides(self, rater: str, marks: Sequence[Mark]) -> bool:
         """Whether a rollout's raters are complete and tied, and the rater is none of them."""
-        marks = given.get(rollout.episode_id, ())
         num_first = sum(one.presentation == FIRST for one in marks)
         is_new = rater not in {one.rater for one in marks}
         return is_new and num_first >= self._raters_per_rollout and bool(vote(marks).tied)
@@ -159,7 +162,8 @@ class RatingQueue:
         repeats = {one.mark.episode_id for one in mine if one.mark.presentation == REPEAT}
         if len(repeats) >= int(num_seen * self._repeat_share):
             return None
-        old = [one.mark.episode_id for one in mine[: max(0, len(mine) - REPEAT_GAP)]]
+        shown = (one.mark for one in mine[: max(0, len(mine) - REPEAT_GAP)])
+        old = [mark.episode_id for mark in shown if mark.presentation == FIRST]
         known = [self._rollouts[t] for t in map(token_of, old) if t in self._rollouts]
         fresh = [one for one in known if one.episode_id not in repeats]
         return min(fresh, key=lambda one: _order(rater, one.episode_id), default=None)

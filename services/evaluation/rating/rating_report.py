@@ -164,6 +164,8 @@ def rating_report(
     task_of: Mapping[str, str],
     rubrics: Mapping[str, Rubric],
     state_scores: Mapping[str, float],
+    *,
+    raters_per_rollout: int = 1,
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
@@ -174,9 +176,10 @@ def rating_report(
         task_of: task of each episode id; marks of others are skipped.
         rubrics: by task.
         state_scores: true scores by episode id, where they are known.
+        raters_per_rollout: of fewer nothing is tied yet.
     """
     known = [one.mark for one in marks if one.mark.episode_id in task_of]
-    decided = _decided(known, task_of, rubrics)
+    decided = _decided(known, task_of, rubrics, raters_per_rollout)
     tasks = sorted({task_of[mark.episode_id] for mark in known})
     rollouts = [
         row
@@ -217,7 +220,10 @@ def _rollouts(
 
 
 def _decided(
-    marks: list[Mark], task_of: Mapping[str, str], rubrics: Mapping[str, Rubric]
+    marks: list[Mark],
+    task_of: Mapping[str, str],
+    rubrics: Mapping[str, Rubric],
+    raters_per_rollout: int,
 ) -> dict[str, dict[str, Any]]:
     """Of each rollout with marks of people the score of their majority, and what is tied."""
     found: dict[str, dict[str, Any]] = {}
@@ -227,9 +233,11 @@ def _decided(
         if most.holds and not most.tied:
             rubric = rubric_of(task_of[episode_id], rubrics)
             score = rubric.score(most.holds, is_inconsistent=most.is_inconsistent)
-        first = vote([mark for mark in given if mark.presentation == FIRST])
-        was_tied = bool(first.tied) and len(given) > 1
-        found[episode_id] = {"decided_score": score, "tied": list(most.tied), "was_tied": was_tied}
+        first = [mark for mark in given if mark.presentation == FIRST]
+        is_complete = len(first) >= raters_per_rollout
+        was_tied = is_complete and bool(vote(first).tied) and len(given) > 1
+        tied = list(most.tied) if is_complete else []
+        found[episode_id] = {"decided_score": score, "tied": tied, "was_tied": was_tied}
     return found
 
 

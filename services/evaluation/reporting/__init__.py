@@ -47,6 +47,7 @@ from services.evaluation.reporting.sections import (
 )
 
 __all__ = [
+    "MAX_MOVING",
     "ActionPicture",
     "EpisodePicture",
     "PredictionPicture",

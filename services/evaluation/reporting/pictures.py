@@ -26,6 +26,7 @@ from dextouch.tactile.layout import (
     Side,
     TactileLayout,
 )
+from services.evaluation.reporting.policy_picture import NAMESPACE, Rate, policy_picture
 from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
 
 # Photographs larger than this are embedded as JPEG.
@@ -37,7 +38,7 @@ _PALETTE = (
     "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
 )  # fmt: skip
 _KEY_PX = 24
-_WIDTH, _HEIGHT, _SIDE = 560, 240, 300
+_WIDTH, _HEIGHT = 560, 240
 # Pressure at the end of `colour`'s scale.
 FULL_SCALE_KPA: Final = 40.0
 MOVING_S: Final = 5.0
@@ -270,18 +271,6 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Point:
-    """One policy in two worlds, with the confidence interval of each score."""
-
-    label: str
-    real: float
-    imagined: float
-    real_interval: tuple[float, float]
-    imagined_interval: tuple[float, float]
-    style: int = 0
-
-
-@dataclass(frozen=True)
 class _Axes:
     """Scaling from data to picture coordinates."""
 
@@ -327,28 +316,6 @@ def line_chart(lines: Sequence[Line], *, x_label: str, y_label: str) -> Markup:
             f"<title>{escape(line.label)}</title></polyline>"
         )
     return _svg(body, axes, f"{y_label} over {x_label}")
-
-
-def agreement_chart(points: Sequence[Point]) -> Markup:
-    """Imagined over real success, both 0 … 1, with intervals and the identity line."""
-    axes = _Axes((-0.04, 1.04), (-0.04, 1.04), _SIDE + _LEFT - _TOP, _SIDE)
-    (x0, y0), (x1, y1) = axes.to_px(0.0, 0.0), axes.to_px(1.0, 1.0)
-    body = [
-        _grid(axes, "success in the twin", "success imagined"),
-        f'<line class="guide" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>',
-    ]
-    for point in points:
-        x, y = axes.to_px(point.real, point.imagined)
-        low_x, low_y = axes.to_px(point.real_interval[0], point.imagined_interval[0])
-        high_x, high_y = axes.to_px(point.real_interval[1], point.imagined_interval[1])
-        body.append(
-            f'<g class="s{point.style % NUM_STYLES}"><path class="whisker" '
-            f'd="M{low_x:.1f} {y:.1f}H{high_x:.1f}M{x:.1f} {low_y:.1f}V{high_y:.1f}"/>'
-            f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="5">'
-            f"<title>{escape(point.label)}: real {point.real:.2f}, "
-            f"imagined {point.imagined:.2f}</title></circle></g>"
-        )
-    return _svg(body, axes, "imagined over real success of each policy")
 
 
 def stand_alone(charts: Sequence[Markup], keys: Mapping[str, int]) -> str:
@@ -508,31 +475,27 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
     panels = []
     for task in dict.fromkeys(str(e["task"]) for e in entries):
         rows = [e for e in entries if e["task"] == task]
-        points = [
-            Point(
-                str(entry["policy"]),
-                float(entry["real"]),
-                float(entry["imagined"]),
-                _interval(entry, "real"),
-                _interval(entry, "imagined"),
-                style=index,
-            )
-            for index, entry in enumerate(rows)
-            if is_number(entry.get("real"))
-            and is_number(entry.get("imagined"))
-            and entry.get("imagined_comparable", True)
-        ]
-        chart = agreement_chart(points) if points else None
+        pairs = {
+            str(one["policy"]): [(_rate(one, "real"), _rate(one, "imagined"))]
+            for one in rows
+            if is_number(one.get("real"))
+            and is_number(one.get("imagined"))
+            and one.get("imagined_comparable", True)
+        }
+        title = f"{report.get('imagined_world', 'imagined')}, {task.replace('_', ' ')}"
+        drawn = policy_picture(pairs, title, "svg").decode() if pairs else ""
+        # Names are escaped, the rest are numbers; within a page a picture needs no namespace.
+        chart = Markup(drawn.replace(f" {NAMESPACE}", "")) if drawn else None  # noqa: S704
         figures = agreement_figures(agreement.get(task, {}))
         rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
         panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
     return panels
 
 
-def _interval(entry: Mapping[str, Any], world: str) -> tuple[float, float]:
-    """Interval of a score, or the score itself if the report has none."""
+def _rate(entry: Mapping[str, Any], world: str) -> Rate:
+    """A score with its interval, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
-    return float(low), float(high)
+    return float(entry[world]), float(low), float(high)
 
 
 def strips(pictures: ReportPictures) -> list[Strip]:
@@ -566,8 +529,13 @@ def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePi
 def episode_pair(
     title: str, true: EpisodeReader, imagined: EpisodeReader, num_moments: int | None = None
 ) -> PredictionPicture:
-    """A true and an imagined episode, at all steps that both have or evenly spaced ones."""
+    """A true and an imagined episode, at evenly spaced steps that both have.
+
+    Without their number at all steps of the first five seconds, of which moving pictures are.
+    """
     num_steps = min(true.num_steps, imagined.num_steps)
+    if num_moments is None:
+        num_steps = min(num_steps, math.ceil(MOVING_S * imagined.attributes.model_rate_hz) + 1)
     shown = np.linspace(0, num_steps - 1, num_moments or num_steps).round().astype(np.int64)
     left, right = (one.window(0, num_steps, cameras=(HEAD_CAMERA,)) for one in (true, imagined))
     return PredictionPicture(

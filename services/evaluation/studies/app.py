@@ -18,6 +18,7 @@ from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
+from services.evaluation.reporting.policy_picture import Format
 from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies.results import FILE, NAME_PATTERN, StudyDefinition, StudyResults
 from services.evaluation.studies.study_figures import (
@@ -28,7 +29,7 @@ from services.evaluation.studies.study_figures import (
     study_rollouts,
     study_summary,
 )
-from services.evaluation.studies.study_pictures import Format, picture, picture_name
+from services.evaluation.studies.study_pictures import picture, picture_name
 
 SCOPE: Final = "study_read"
 PICTURE_TYPES: Final = {"svg": "image/svg+xml", "png": "image/png", "tex": "application/x-tex"}

@@ -6,13 +6,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+import structlog
 from pydantic import AwareDatetime
 
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
+from dextouch.errors import DexTouchError
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.filmed_pairs import telling_pairs, title_of
+from services.evaluation.filmed_pairs import example_pairs, title_of
 from services.evaluation.reporting import (
+    MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
@@ -39,6 +42,8 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
+
+logger = structlog.get_logger(__name__)
 
 # From this difference of success on, two worlds disagree about a start.
 DISAGREEMENT: Final = 0.5
@@ -325,12 +330,16 @@ def _agreed(
 def kept_pairs(
     report: ClosedLoopReport, world: str, results: StudyResults
 ) -> tuple[PredictionPicture, ...]:
-    """The telling pairs of a study of those rollouts that its folder keeps."""
-    store, found = EpisodeStore(str(results.path.with_name(KEPT_FOLDER))), []
-    for pair in telling_pairs(report, world).values():
+    """The example pairs of a study of those rollouts that its folder keeps, whole ones only."""
+    store = EpisodeStore(str(results.path.with_name(KEPT_FOLDER)))
+    found = list[PredictionPicture]()
+    for pair in example_pairs(report, world).values():
         ids = [rollout_episode_id(results.header, cell_of(score)) for score in pair]
-        if all(map(store.exists, ids)):
-            found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
+        if len(found) < MAX_MOVING and all(map(store.exists, ids)):
+            try:
+                found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
+            except DexTouchError as error:
+                logger.warning("pair_not_shown", pair=title_of(pair), reason=error.message)
     return tuple(found)
 
 

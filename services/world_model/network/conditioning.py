@@ -146,12 +146,12 @@ class VideoCondition(ExpertCondition):
         # Of each latent frame after the first, as the right hand sees them.
         actions = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
         if self.actions is not None:
-            terms.append(after_first(told(self.actions(actions.flatten(2)), inputs)))
+            terms.append(after_first(without_dropped(self.actions(actions.flatten(2)), inputs)))
         if self.action_tokens is not None:
-            tokens = after_first(told(self.action_tokens(actions), inputs))
+            tokens = after_first(without_dropped(self.action_tokens(actions), inputs))
         if self.geometry is not None:
             near = split_axis(inputs.geometry[:, 1:], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
-            terms.append(after_first(told(self.geometry(near), inputs)))
+            terms.append(after_first(without_dropped(self.geometry(near), inputs)))
         return Constants((*terms, self.static(inputs)[:, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
@@ -177,14 +177,16 @@ class TactileCondition(ExpertCondition):
         """What does not depend on the flow time."""
         terms, tokens = [], None
         if self.actions is not None:
-            terms.append(after_first(told(self.actions(features.per_hand[:, 1:]), inputs)))
+            terms.append(
+                after_first(without_dropped(self.actions(features.per_hand[:, 1:]), inputs))
+            )
         if self.action_tokens is not None:
             tokens = self.action_tokens(features.per_hand[:, 1:, :, None])
-            tokens = after_first(told(tokens, inputs)).flatten(1, 2)
+            tokens = after_first(without_dropped(tokens, inputs)).flatten(1, 2)
         if self.geometry is not None:
             own = inputs.geometry[:, 1:]
             near = self.geometry(torch.cat([own, own.flip(2)], dim=-1))
-            terms.append(after_first(told(near, inputs)))
+            terms.append(after_first(without_dropped(near, inputs)))
         if self.scene is not None and self.layout is not None:
             terms.append((self.scene(inputs) + self.layout(features.layout))[:, None])
         return Constants((*terms, self.static(inputs)[:, None, None]), tokens)
@@ -244,10 +246,10 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
     )
 
 
-def told(
+def without_dropped(
     condition: Float32[Tensor, "batch later ..."], inputs: ModelInputs
 ) -> Float32[Tensor, "batch later ..."]:
-    """Zeros for windows whose actions the network is not told."""
+    """The condition, and zeros for windows without actions."""
     return condition * inputs.acting.view(-1, *[1] * (condition.ndim - 1))
 
 

@@ -183,7 +183,7 @@ class PredictionRequest:
 class ModelInputs:
     """Batched tensors of requests in physical units; normalized inside the network.
 
-    `acting` is 0 for windows whose actions the network is not told, otherwise 1.
+    `acting` is 0 for windows without actions, otherwise 1.
     """
 
     first_image: UInt8[Tensor, "batch px px 3"]
@@ -206,10 +206,6 @@ class ModelInputs:
     def __len__(self) -> int:
         return len(self.first_image)
 
-    def __getitem__(self, rows: slice) -> "ModelInputs":
-        """Some of the requests."""
-        return replace(self, **{name: one[rows] for name, one in vars(self).items()})
-
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
         return self._changed(lambda _, one: one.to(device), self.instructions)
@@ -224,10 +220,10 @@ class ModelInputs:
             digests.append(hashlib.sha256(b"".join(parts)).digest())
         return digests
 
-    def rows(self, indices: list[int]) -> "ModelInputs":
+    def rows(self, indices: Sequence[int]) -> "ModelInputs":
         """Some of the windows."""
         texts = tuple(self.instructions[index] for index in indices)
-        return self._changed(lambda _, one: one[indices], texts)
+        return self._changed(lambda _, one: one[list(indices)], texts)
 
     def joined(self, others: "ModelInputs") -> "ModelInputs":
         """These windows, then others."""

@@ -219,18 +219,14 @@ class JointWorldModel(nn.Module):
 
         Residuals from the first latents, or the latents themselves, as the configuration says.
         """
-        video = self.codec.encode(to_unit(images))
-        if self.config.video_target == "residual":
-            video = video - video[:, :1]
+        video = from_first(self.codec.encode(to_unit(images)), self.config.video_target)
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
 
     def tactile_targets(
         self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
         """Clean tactile latents; as `targets`."""
-        tactile = self.tokenizer.encode(tactile_kpa)
-        if self.config.tactile_target == "residual":
-            tactile = tactile - tactile[:, :1]
+        tactile = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
         return tactile / self.tactile_residual_std
 
     def forward(
@@ -255,10 +251,6 @@ class JointWorldModel(nn.Module):
             self.video_condition.constants(inputs, features),
             None if touch is None else touch.constants(inputs, features),
         )
-
-    def with_clean_tokens(self, context: Context, noisy: JointLatents) -> Context:
-        """The context with its clean tokens."""
-        return replace(context, clean=self.clean_tokens(context, noisy))
 
     def clean_tokens(self, context: Context, noisy: JointLatents) -> CleanTokens:
         """Clean tokens, which no value of `noisy` changes."""
@@ -357,12 +349,12 @@ class JointWorldModel(nn.Module):
         """
         inputs, sampling = inputs.to(self.device), sampling or Sampling()
         noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
-        told = inputs
+        conditions = inputs
         if sampling.guidance != 1.0:
             everything = torch.ones(num_windows, dtype=torch.bool, device=self.device)
-            told = inputs.joined(inputs.without(everything, everything))
-        first, kept = self._observe(told, noise, sampling, precision)
-        clean = self.sample(told, first, noise, sampling, precision=precision, kept=kept)
+            conditions = inputs.joined(inputs.without(everything, everything))
+        first, kept = self._observe(conditions, noise, sampling, precision)
+        clean = self.sample(conditions, first, noise, sampling, precision=precision, kept=kept)
         first = mapped(first, lambda one: one[:num_windows])
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
@@ -431,9 +423,12 @@ class JointWorldModel(nn.Module):
                 )
             found = guess.video.float(), guess.tactile.float()
             if is_guided:
-                (told, free), (touch, free_touch) = (one.chunk(2) for one in found)
+                (conditioned, unconditional), touch = (one.chunk(2) for one in found)
                 scale = sampling.guidance
-                found = torch.lerp(free, told, scale), torch.lerp(free_touch, touch, scale)
+                found = (
+                    torch.lerp(unconditional, conditioned, scale),
+                    torch.lerp(touch[1], touch[0], scale),
+                )
             if self.config.prediction == "clean":
                 return found
             return (
@@ -486,6 +481,11 @@ def products_in(precision: Precision, device_type: str) -> Iterator[None]:
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:
     """Stack the noise of several rollouts into a batch."""
     return combined(noises, torch.cat)
+
+
+def from_first(latents: Float32[Tensor, "batch time ..."], target: str) -> Tensor:
+    """Residuals of latents from the first ones, or themselves if `target` is "plain"."""
+    return latents - latents[:, :1] if target == "residual" else latents
 
 
 def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:

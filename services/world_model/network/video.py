@@ -30,8 +30,8 @@ from services.world_model.network.conditioning import (
     ActionFeatures,
     Condition,
     after_first,
-    told,
     two_layers,
+    without_dropped,
 )
 from services.world_model.network.configuration import (
     FLOAT32_PARTS,
@@ -301,10 +301,10 @@ def last_images(
 ) -> Float[Tensor, "batch 3 shown height width"]:
     """The last images of a video in -1 … 1, by diffusers' decoder, to rounding.
 
-    Latents are decoded one after another, with the decoder's cache of earlier frames. In the blocks
-    at the full resolution, half of the work, only those frames are computed that the images depend
-    on: three convolutions of three frames a block reach back two frames each. Blocks before them
-    need every latent.
+    Latents are decoded one after another, with the decoder's cache of earlier frames. In the last
+    block and the head, at the full resolution, only those frames are computed that the images
+    depend on: three convolutions of three frames a block reach back two frames each. Blocks before
+    them need every latent. At full size this saves 16.5 % of the decoder's work.
     """
     from diffusers.models.autoencoders.autoencoder_kl_wan import unpatchify
 
@@ -414,7 +414,7 @@ class WanVideoCondition(nn.Module):
         """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = self.actions(groups.to(self.commanded.dtype)).float()
-        actions = after_first(told(actions, inputs))
+        actions = after_first(without_dropped(actions, inputs))
         kind = inputs.commanded[:, None, None] * self.commanded.float()
         texts = inputs.instructions
         if self.kept_texts is None:

@@ -61,8 +61,8 @@ class LossOptions:
     output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
     learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
-    `text_dropout` and `action_dropout` are the shares of windows whose instruction, and whose
-    actions, are not told, for guidance; the smaller share is without both.
+    `text_dropout` and `action_dropout` are the shares of windows without instruction, and
+    without actions, for guidance; the smaller share is without both.
     """
 
     context_noise: float = 0.0
@@ -94,14 +94,14 @@ class Examples:
         """The windows in equal parts, whose losses sum to that of all."""
         size = len(self.t) // count
         for start in range(0, len(self.t), size):
-            yield self._rows(slice(start, start + size), self.share / count)
+            yield self._rows(range(start, start + size), self.share / count)
 
-    def _rows(self, rows: slice, share: float) -> "Examples":
+    def _rows(self, rows: range, share: float) -> "Examples":
         def own(part: _Part) -> _Part:
-            return mapped(part, lambda tensor: tensor[rows])
+            return mapped(part, lambda tensor: tensor[rows.start : rows.stop])
 
         return Examples(
-            self.inputs[rows],
+            self.inputs.rows(rows),
             own(self.first),
             own(self.noisy),
             own(self.t),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
@@ -23,7 +24,7 @@ from services.networks.weight_files import on_device
 from services.world_model import checkpoints
 from services.world_model.network.configuration import WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import JointWorldModel
+from services.world_model.network.model import JointWorldModel, from_first
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.network.video import to_unit
 from services.world_model.paper_settings import TrainSettings, command_line
@@ -143,14 +144,10 @@ class TrainingRun:
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
         # The pretrained expert takes its latents as they are.
         if config.wan is None:
-            videos = model.codec.encode(to_unit(batch.images))
-            if config.video_target == "residual":
-                videos = videos - videos[:, :1]
+            videos = from_first(model.codec.encode(to_unit(batch.images)), config.video_target)
             model.video_residual_std.copy_(videos[:, 1:].std().clamp_min(1e-3))
         if config.use_touch:
-            touch = model.tokenizer.encode(batch.tactile_kpa)
-            if config.tactile_target == "residual":
-                touch = touch - touch[:, :1]
+            touch = from_first(model.tokenizer.encode(batch.tactile_kpa), config.tactile_target)
             model.tactile_residual_std.copy_(touch[:, 1:].std().clamp_min(1e-3))
         for part in fitted:
             part.to(model.device)
@@ -400,6 +397,8 @@ def train_on(
     del run
     if averaged is None:
         return None
+    windows = settings.windows
+    dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
     metadata = checkpoints.CheckpointMetadata(
         name=settings.name,
         network=averaged.config,
@@ -426,6 +425,8 @@ def train_on(
             ancestor=None if ancestor is None else ancestor.digest,
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
+        text_dropout=dropped[0],
+        action_dropout=dropped[1],
     )
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
     del averaged
@@ -512,6 +513,12 @@ def _run_or_resume(
     if settings.resume and files.exists():
         like = {**training_state.moments_like(run.learned), **run.state(identity).tensors}
         run.restore(files.read(identity, like))
+        if run.budget.share() >= 1.0 and is_cut_short(settings, run.budget):
+            raise ConflictError(
+                f"training: cut short at step {run.budget.step} of {settings.step_limit} after "
+                f"{run.budget.wall_s:.0f} s ({run.budget.cpu_s:.0f} CPU s), and limits count in "
+                "all; resume with a larger --wall-budget-s or --cpu-budget-s"
+            )
     elif ancestor is None:
         run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
     kept_s = run.budget.wall_s
@@ -520,8 +527,11 @@ def _run_or_resume(
         nonlocal kept_s
         is_last = now.budget.share() >= 1.0 and is_cut_short(settings, now.budget)
         if is_last or now.budget.wall_s - kept_s >= settings.state_every_s:
+            began_s = time.monotonic()
             files.write(now.state(identity))
-            kept_s = now.budget.wall_s
+            spent = torch.tensor(time.monotonic() - began_s, dtype=torch.float64)
+            # The same in all processes, which must decide alike.
+            kept_s = now.budget.wall_s + run.processes.mean(spent).item()
 
     return run.run(on_progress, keep)
 

@@ -40,7 +40,7 @@ _OPTIMIZER: Final = "optimizer."
 _FREE_SETTINGS: Final = {
     "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_s", "init",
     "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks", "new_tasks",
-    "device", "wan", "plan", "recompute", "accumulate", "replicas",
+    "device", "wan", "plan", "plan_processes", "recompute", "accumulate", "replicas",
 }  # fmt: skip
 
 

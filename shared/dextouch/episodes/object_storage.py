@@ -202,7 +202,7 @@ class ObjectStorage:
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
 
-    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes, *, replaces: bool) -> EpisodeWriter:
         """Writer of a new group.
 
         Raises ConflictError for an id that exists, InvalidInputError if the work folder belongs to
@@ -217,7 +217,7 @@ class ObjectStorage:
                 f"{kind} {item_id!r} waits in {target} to be uploaded; `complete_uploads` does so, "
                 "as does the store's service while it runs"
             )
-        if self.exists(kind, item_id):
+        if not replaces and self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
         stage = new_stage(self.root, kind, item_id)
         writer = UploadingWriter(stage=stage, target=target, attributes=attributes)

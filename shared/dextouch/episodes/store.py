@@ -102,8 +102,12 @@ class EpisodeStore:
         """The folder that other machines must see to use this store; none for a bucket."""
         return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
 
-    def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
+    def writer(
+        self, *, kind: Kind = "episode", attributes: Attributes, replaces: bool = False
+    ) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
+
+        With `replaces` its id may exist until the end of the context, where it must be gone.
 
         Raises ConflictError for an id that exists, InvalidInputError for attributes of the other
         kind.
@@ -114,7 +118,7 @@ class EpisodeStore:
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
             )
         _check(kind, attributes_id(attributes))
-        return self._storage.writer(kind, attributes)
+        return self._storage.writer(kind, attributes, replaces=replaces)
 
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
@@ -262,16 +266,19 @@ class EpisodeStore:
             self._set_remark(kind, item_id, NOTES_FILE, found if found.notes else None)
         return found
 
-    def copy_remarks(self, source: "EpisodeStore", item_id: str, *, kind: Kind) -> bool:
+    def copy_remarks(
+        self, source: "EpisodeStore", item_id: str, *, kind: Kind, only_missing: bool = False
+    ) -> bool:
         """Make the remarks on an item those of another store, byte for byte; whether any changed.
 
-        Raises NotFoundError without the id in both.
+        With `only_missing` those that it has stay. Raises NotFoundError without the id in both.
         """
         theirs, ours = source.files(item_id, kind=kind), self.files(item_id, kind=kind)
         changed = {
             name: content
             for name in REMARK_FILES
-            if (content := theirs.get(name)) != ours.get(name)
+            if (content := theirs.get(name)) != (own := ours.get(name))
+            and not (only_missing and own is not None)
         }
         for name, content in changed.items():
             self._storage.set_remark(kind, item_id, name, content)
@@ -413,9 +420,9 @@ class _LocalStorage:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes, *, replaces: bool) -> EpisodeWriter:
         target = self._folder(kind, attributes_id(attributes))
-        if target.exists():
+        if target.exists() and not replaces:
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
         stage = new_stage(self.root, kind, target.name)
         return EpisodeWriter(stage=stage, target=target, attributes=attributes)

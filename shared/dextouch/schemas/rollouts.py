@@ -301,7 +301,8 @@ class WatchedRollouts(FrozenModel):
     """Response of GET /v1/watch: the newest rollouts first, and how many there are.
 
     Attributes:
-        over: those that their clients ended last, the newest first, as they were then.
+        over: those that their clients ended last, the newest first, as they were then,
+            but for `age_s` and `idle_s`, which go on.
     """
 
     rollouts: tuple[WatchedRollout, ...]

@@ -132,9 +132,14 @@ class AccessControl:
         return bool(self._keys)
 
     @property
+    def key_names(self) -> frozenset[str]:
+        """Names of the keys of the settings."""
+        return frozenset(key.name for _, key in self._keys)
+
+    @property
     def names(self) -> frozenset[str]:
         """Names of all keys."""
-        return frozenset(grant.name for _, grant in (*self._keys, *self._enrolled))
+        return self.key_names | {grant.name for _, grant in self._enrolled}
 
     def set_enrolled(self, enrolled: Sequence[tuple[bytes, Grant]]) -> None:
         """Accept these keys, given as digests, beside those of the settings, and no earlier ones.

@@ -168,8 +168,14 @@ def reload_keys_at_hangup(app: FastAPI, load: Callable[[], ServiceSettings]) -> 
             logger.error("keys_not_reloaded", reason=reason)
             return
         hide_secrets(settings)
-        app.state.access.set_keys(settings.api_keys)
-        logger.warning("keys_reloaded", names=sorted({key.name for key in settings.api_keys}))
+        access = app.state.access
+        others = access.names - access.key_names
+        access.set_keys(settings.api_keys)
+        logger.warning("keys_reloaded", names=sorted(access.key_names))
+        if doubled := sorted(others & access.key_names):
+            # Such as two people who would be one rater.
+            reason = "a link or an enrolled key has this name, too; choose another, or revoke it"
+            logger.error("key_names_doubled", names=doubled, reason=reason)
 
     if sys.stdin is None or not sys.stdin.isatty():
         signal.signal(signal.SIGHUP, reload)

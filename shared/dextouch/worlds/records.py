@@ -48,6 +48,8 @@ ID_LETTERS: Final = 32
 OVER_KEY: Final = "rollouts over"
 NUM_OVER: Final = 10
 OVER_TTL_S: Final = 86_400.0
+# Chosen: as many as end at once when a study stops; after that a rollout is not listed.
+MAX_TRIES: Final = 32
 # More images are encoded as JPEG beside the event loop; JPEG takes some 15 ms for a megabyte.
 MAX_INLINE_IMAGE_BYTES: Final = 2**16
 
@@ -247,16 +249,22 @@ class RecordStore:
         if not await self._store.delete(_key_of(rollout_id)):
             raise _unknown(rollout_id)
         if note:
-            with suppress(ConflictError, StorageError, UnavailableError):
-                # Of two that end at once in two processes, one is listed.
-                stored = await self._store.get(OVER_KEY)
-                kept = [] if stored is None else msgpack.unpackb(stored.value)
+            with suppress(StorageError, UnavailableError):
+                await self._keep_ended(note)
+
+    async def _keep_ended(self, note: bytes) -> None:
+        for _ in range(MAX_TRIES):
+            stored = await self._store.get(OVER_KEY)
+            kept = [] if stored is None else msgpack.unpackb(stored.value)
+            # Of several that end at once, one is written; the others try again.
+            with suppress(ConflictError):
                 await self._store.set(
                     OVER_KEY,
                     msgpack.packb([note, *kept][:NUM_OVER]),
                     expected_version=0 if stored is None else stored.version,
                     ttl_s=OVER_TTL_S,
                 )
+                return
 
     async def notes_of_ended(self) -> list[bytes]:
         """Notes of the rollouts that were deleted last, the newest first."""

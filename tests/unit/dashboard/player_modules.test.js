@@ -12,7 +12,7 @@ import { binCentres, componentWords, isSignal, withGaps } from "./static/player/
 import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
 import { FetchQueue } from "./static/player/fetch_queue.js";
 import { byStage, largestChange, worstOf } from "./static/player/figures.js";
-import { moveOf } from "./static/hand_driving.js";
+import { HandDriving, moveOf } from "./static/hand_driving.js";
 import { outcomeOf } from "./static/rollout_rows.js";
 import { unpack } from "./static/packed.js";
 import { apply, matrixOfPose } from "./static/projection.js";
@@ -226,6 +226,28 @@ test("held keys and a gamepad move hands, opposite keys cancel, and a stick at r
   const pad = { axes: [0.5, -1, 0.1, 0.4], buttons: Array.from({ length: 8 }, (_, index) => ({ value: index === 6 ? 1 : 0 })) };
   assert.deepEqual(moveOf(new Set(), pad), { right: 0.5, forward: 1, up: -0.4, close: -1 });
   assert.deepEqual(moveOf(new Set(["w"]), pad).forward, 1);
+});
+
+test("a refused move is said once, and tried again after the keys were let go", async () => {
+  const listeners = {}, output = { dataset: {} };
+  const pad = { addEventListener: (name, work) => { listeners[name] = work; }, querySelector: () => output };
+  globalThis.document = { activeElement: pad };
+  globalThis.navigator ??= {};
+  let asked = 0;
+  const driving = new HandDriving(pad, { value: "both" }, async () => { asked += 1; throw new Error("it is over"); });
+  const press = () => listeners.keydown({ key: "W", preventDefault: () => {} });
+  press();
+  for (let frame = 0; frame < 9; frame += 1) {
+    await driving.tick();
+    press(); // as keys that are held down repeat
+  }
+  assert.deepEqual([asked, output.textContent, output.dataset.level], [1, "it is over", "ERROR"]);
+  listeners.keyup({ key: "w" });
+  await driving.tick();
+  press();
+  await driving.tick();
+  assert.equal(asked, 2);
+  delete globalThis.document;
 });
 
 test("an outcome is what the world knows, else its own estimate", () => {

@@ -1,5 +1,6 @@
 """Replay in two worlds at once: the actions sent, the worlds that are refused, the errors."""
 
+import asyncio
 from contextlib import AsyncExitStack
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import EVERYTHING
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.dashboard import comparison
+from services.dashboard import comparison, hand_driving
 from services.dashboard.comparison import Comparisons, StartComparison, compared
 from services.dashboard.comparison_sides import fitted
 from services.dashboard.feeds import Feeds
@@ -102,6 +103,54 @@ async def test_an_episode_of_a_station_is_compared_with_its_recording(compare):
     np.testing.assert_array_equal(view.pixel_error, np.zeros(toy.STEPS))
 
 
+async def test_a_part_of_a_recording_has_no_outcome(compare, monkeypatch):
+    monkeypatch.setattr(comparison, "MAX_STEPS", 76)
+    worlds = NotedWorld("twin", judge=True), NotedWorld("dream", judge=False)
+    view = await compare(*worlds, StartComparison(episode_id="of-a-station"))
+    assert (view.num_steps, view.real_success) == (76, None)
+
+
+async def test_of_two_that_begin_at_once_one_is_ended(compare):
+    worlds = NotedWorld("twin", judge=True), NotedWorld("dream", judge=False)
+    runs = []
+
+    async def drive(comparisons, _):
+        ends = comparisons._supervise
+
+        async def supervise(run, actions):
+            runs.append(run)
+            await ends(run, actions)
+
+        comparisons._supervise = supervise
+        asked = StartComparison(task="reach")
+        await asyncio.gather(*(comparisons.start(asked) for _ in range(2)))
+        await asyncio.gather(comparisons.stop(), comparisons.stop())
+        assert [run.view.state for run in runs] == ["stopped", "stopped"]
+
+    view = await compare(*worlds, StartComparison(task="reach"), drive)
+    assert view.id == runs[-1].view.id
+
+
+async def test_one_that_is_over_ends_its_rollouts_though_stopped_meanwhile(compare, monkeypatch):
+    ending, allowed, ended = asyncio.Event(), asyncio.Event(), []
+
+    async def end(side):
+        ending.set()
+        await allowed.wait()
+        ended.append(side.name)
+
+    async def drive(comparisons, _):
+        await ending.wait()
+        stopping = asyncio.create_task(comparisons.stop())
+        await asyncio.sleep(0)
+        allowed.set()
+        await stopping
+
+    monkeypatch.setattr(comparison.WorldSide, "end", end)
+    await compare(NotedWorld("twin", judge=True), NotedWorld("dream", judge=False), drive=drive)
+    assert ended == ["twin", "dream"]
+
+
 class SharingWorld(NotedWorld):
     """Reports how much of its bound every chunk uses."""
 
@@ -119,8 +168,13 @@ async def test_uncertainty_is_known_as_often_as_the_worlds_allow(compare):
     ]
 
 
-async def test_hands_are_moved_in_both_worlds_within_their_speed(compare):
+async def test_hands_are_moved_in_both_worlds_within_their_speed(compare, monkeypatch):
     twin, model = NotedWorld("twin", judge=True), NotedWorld("dream", judge=False)
+
+    built = []
+    monkeypatch.setattr(
+        hand_driving, "RobotHand", lambda side: built.append(side) or RobotHand(side)
+    )
 
     async def drive(comparisons, begun):
         for move in ({"right": 1.0, "up": 1.0, "close": 1.0}, {"turn": -1.0}, {}):
@@ -133,6 +187,7 @@ async def test_hands_are_moved_in_both_worlds_within_their_speed(compare):
 
     view = await compare(twin, model, StartComparison(task="reach", seed=5), drive)
     assert (view.state, len(view.pixel_error)) == ("stopped", 13)
+    assert built == ["left", "right"]
     rows = unpack_action(np.array(twin.rows))
     np.testing.assert_array_equal(twin.rows, model.rows)
     places_m = rows.wrist_right[:, :3]

@@ -346,3 +346,7 @@ def test_the_backup_is_made_by_a_command_that_exists():
     (words,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
     command, rest = find_command(words.split())
     assert (command, store_parser().parse_args(rest).command) == ("store", "backup")
+    # Of the store that is served, wherever its settings say that it is.
+    served = (ROOT / "deploy/systemd/dextouch-store.service").read_text()
+    (settings,) = re.findall(r"^EnvironmentFile=.+$", served, re.M)
+    assert settings in unit.splitlines()

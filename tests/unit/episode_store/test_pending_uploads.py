@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.trash import put_into_trash
 from dextouch.errors import StorageError, UnavailableError
-from services.episode_store.app import PendingUploads, TrashRetention, create_app
+from services.episode_store.app import PendingUploads, create_app, purge_old_trash
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episode_store.episodes import write_episode
@@ -87,5 +87,5 @@ def test_the_trash_is_emptied_after_some_days(tmp_path, keep_days, left):
         write_episode(store, name)
         deleted_ns = time.time_ns() - age_days * 86_400 * 10**9
         put_into_trash(tmp_path, "episode", name, now_ns=deleted_ns)
-    TrashRetention(store, keep_days).work()
+    purge_old_trash(store, keep_days)
     assert [entry.item_id for entry in store.trash_list()] == left

@@ -11,7 +11,14 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords, DeletionRequest, TakeFacts, delete_for_good
 from dextouch.episodes.editing import back_up, restore_backup
-from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, NotFoundError
+from dextouch.episodes.editing.backup import read_backup_list
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    InvalidInputError,
+    NotFoundError,
+    StorageFullError,
+)
 from dextouch.schemas import EpisodeClicks, ItemNotes, Review, TimedNote
 from services.cli.main import main
 from tests.contracts.s3_server import CREDENTIALS, running_s3
@@ -140,7 +147,7 @@ def test_an_episode_never_comes_without_the_recording_that_was_there(stores):
         copy = restored(backup, target)
         for name in copy.list():
             assert copy.exists(name.removesuffix("-aligned"), kind="recording")
-    assert copy.list() == ["first-aligned", "take-0-aligned", "take-1-aligned"]
+    assert copy.list() == ["first-aligned", *(f"take-{number}-aligned" for number in range(4))]
 
 
 def test_what_is_gone_moves_to_the_trash_of_the_backup_unless_it_is_most_of_it(stores):
@@ -252,6 +259,106 @@ def test_interrupted_backups_and_restorations_are_completed(stores):
     assert not differences(source, target)
 
 
+def test_an_interrupted_backup_restores_what_it_copied(stores):
+    source, backup, target = stores
+    for name in ("a", "b", "c"):
+        write_episode(source, name)
+    copied = []
+
+    def kill(_):
+        copied.append(1)
+        if len(copied) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        back_up(source, backup, on_item=kill)
+    assert set(actions(restore_backup(backup, target)).values()) == {"copied"}
+    assert len(target.list()) == 2
+    # Of an unlisted backup, too, most does not go by itself.
+    shutil.rmtree(source.root / "episodes")
+    (source.root / "episodes").mkdir()
+    with pytest.raises(ConflictError, match="2 of 2 items"):
+        back_up(source, backup)
+
+
+def test_a_restoration_keeps_what_the_store_has_got_since(stores):
+    source, backup, target = stores
+    for name in ("judged", "other", "damaged"):
+        write_episode(source, name)
+    back_up(source, backup)
+    restore_backup(backup, target)
+    target.set_review("judged", ACCEPTED)
+    target.delete("other", for_good=True)
+    write_episode(target, "other", seed=2)
+    for place in (target, backup):
+        (place.root / "episodes/damaged/action/c/0/0").write_bytes(b"")
+    found = actions(restore_backup(backup, target))
+    assert {name: action for (_, name), action in found.items()} == {
+        "judged": "there",
+        "other": "refused",
+        "damaged": "damaged",
+    }
+    assert target.review("judged") == ACCEPTED
+    assert target.open("other").attributes.seed == 2
+    assert target.exists("damaged")
+
+
+def test_a_full_disk_costs_no_earlier_copy(stores, monkeypatch):
+    source, backup, _ = stores
+    write_episode(source, "a")
+    back_up(source, backup)
+    source.delete("a")
+    write_episode(source, "a", seed=2)
+
+    def full(*_args, **_changes):
+        raise StorageFullError("copy a: no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dextouch.episodes.writer.copy_files", full)
+        assert actions(back_up(source, backup)) == {("episode", "a"): "refused"}
+    assert backup.open("a").attributes.seed != 2
+    assert actions(back_up(source, backup)) == {("episode", "a"): "copied"}
+    assert backup.open("a").attributes.seed == 2
+
+
+def test_what_is_deleted_while_it_is_backed_up_stays_deleted(stores, tmp_path):
+    source, backup, target = stores
+    for name in ("hers", "his"):
+        write_take(source, name, operator={"hers": "p-1"}.get(name, "p-2"), started_at=NOON)
+    deleted = []
+
+    def delete(_):
+        deleted.append(1)
+        if len(deleted) == 4:
+            delete_for_good(source.root, DeletionRequest(operator="p-1"), tmp_path / "receipt")
+
+    back_up(source, backup, on_item=delete)
+    assert backup.list(kind="recording") == ["his"]
+    assert {one.item_id for one in backup.trash_list()} == set()
+    # A backup that was killed before it retired them.
+    write_take(backup, "hers", operator="p-1", started_at=NOON)
+    found = actions(restore_backup(backup, target))
+    assert found["recording", "hers"] == found["episode", "hers-aligned"] == "erased"
+    assert target.list(kind="recording") == ["his"]
+
+
+def test_items_and_records_that_vanish_meanwhile_are_no_failure(stores, monkeypatch):
+    source, backup, _ = stores
+    write_episode(source, "a")
+    records = source.root / ".deleted/records"
+    records.mkdir(parents=True)
+    (records / "x.json.partial").write_bytes(b"{")
+    (records / "gone.json").symlink_to(records / "nothing")
+
+    def vanish(*_args, **_changes):
+        source.delete("a")
+        raise CorruptDataError("a: arrays/x: No such file or directory")
+
+    monkeypatch.setattr("dextouch.episodes.writer.copy_files", vanish)
+    assert back_up(source, backup) == []
+    assert read_backup_list(backup).files == {}
+
+
 def test_what_cannot_be_done_is_refused_and_changes_nothing(stores):
     source, backup, target = stores
     write_episode(source, "a")
@@ -262,6 +369,8 @@ def test_what_cannot_be_done_is_refused_and_changes_nothing(stores):
         back_up(source, EpisodeStore(source.root / "backup"))
     with pytest.raises(InvalidInputError, match="both the store and its backup"):
         back_up(source, EpisodeStore(source.root))
+    with pytest.raises(InvalidInputError, match=r"^restore-backup: .* lie in one another"):
+        restore_backup(source, EpisodeStore(source.root / "new"))
     with pytest.raises(NotFoundError, match=r"has no backup\.json: it is no backup"):
         restore_backup(source, backup)
     back_up(source, backup)

@@ -1,11 +1,18 @@
 """Links of raters: what they allow, when they end, and that agreement is for the lead alone."""
 
+import signal
+import sys
 from datetime import UTC, datetime, timedelta
 
+import httpx
 import pytest
+from structlog.testing import capture_logs
 
+from dextouch.serving.running import reload_keys_at_hangup
 from services.evaluation.rating import invitations as module
+from services.evaluation.rating.app import create_rating_app
 from services.evaluation.rating.marks import Mark, MarkLog
+from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation.test_rating_app import client, given, settings  # noqa: F401
 
 LEAD = {"name": "lead", "key": "the-lead's-own-key-4711", "scopes": ("rate_lead",)}
@@ -88,15 +95,18 @@ async def test_a_link_is_refused_when_it_has_ended_was_revoked_or_replaced(keyed
         assert (listed[0]["rater"], listed[0]["state"]) == ("carl", "expired_link")
 
 
-async def test_a_link_is_for_the_rollouts_of_one_pool(keyed, tmp_path):
-    """Two services with one file of marks, of other tasks."""
+async def test_a_link_is_for_the_rollouts_of_one_pool(keyed, tmp_path, monkeypatch):
+    """Services with one file of marks: from another folder, with one more rubric, of one task."""
     rubrics = tmp_path / "others.toml"
     rubrics.write_text(keyed["rubrics"].read_text().replace("[reach", "[push"))
     rubrics.write_text(rubrics.read_text() + keyed["rubrics"].read_text())
     async with client(keyed) as http:
         secret = await invited(http)
         assert (await refusal(http, secret))[0] == 200
-    async with client(keyed | {"rubrics": rubrics}) as http:
+    monkeypatch.chdir(tmp_path)
+    async with client(keyed | {"rubrics": rubrics, "store_url": "store"}) as http:
+        assert (await refusal(http, secret))[0] == 200
+    async with client(keyed | {"tasks": ("reach",)}) as http:
         assert await refusal(http, secret) == (403, "other_pool")
         assert (await http.get(INVITATIONS, headers=BY_LEAD)).json() == []
 
@@ -118,20 +128,37 @@ async def test_guesses_are_unknown_keys_and_are_limited(keyed):
     assert secret.encode() not in stored
 
 
-async def test_invitations_need_keys_and_names_of_their_own(keyed, settings):  # noqa: F811
+async def test_invitations_need_keys_and_names_of_their_own(keyed, settings, monkeypatch):  # noqa: F811
     async with client(keyed) as http:
         taken = await http.post(INVITATIONS, json={"rater": "lead"}, headers=BY_LEAD)
         assert taken.status_code == 409
         for wrong in ({"rater": "Bob B"}, {"rater": "bob", "days": 0}, {"rater": "b", "days": 91}):
             answer = await http.post(INVITATIONS, json=wrong, headers=BY_LEAD)
             assert answer.status_code == 422
+    # A key that the settings got since, and one more rater of its name before.
+    monkeypatch.setattr(sys, "stdin", None)
+    more = {"name": "p07", "key": "another-key-4711-0815", "scopes": ("rate",)}
+    app = create_rating_app(RatingSettings(**keyed))
+    before = signal.getsignal(signal.SIGHUP)
+    reload_keys_at_hangup(app, lambda: RatingSettings(**keyed | {"api_keys": (LEAD, more)}))
+    transport = httpx.ASGITransport(app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
+        await invited(http, "p07")
+        try:
+            with capture_logs() as said:
+                signal.raise_signal(signal.SIGHUP)
+        finally:
+            signal.signal(signal.SIGHUP, before)
+        assert ("key_names_doubled", ["p07"]) in [(one["event"], one["names"]) for one in said]
+        taken = await http.post(INVITATIONS, json={"rater": "p07"}, headers=BY_LEAD)
+        assert taken.status_code == 409
     async with client(settings) as http:
         answer = await http.post(INVITATIONS, json={"rater": "bob"})
         assert (answer.status_code, "api_keys" in answer.text) == (409, True)
 
 
 async def test_agreement_is_told_while_the_rating_runs(keyed):
-    async with client(keyed) as http:
+    async with client(keyed, raters_per_rollout=2) as http:
         before = (await http.get(AGREEMENT, headers=BY_LEAD)).json()
         assert (before["rollouts"], before["tasks"]) == ({"reach": 2}, {})
         for rater, stays in (("ada", True), ("bob", False)):

@@ -13,10 +13,11 @@ from services.evaluation.rating.marks import (
     REPEAT,
     Mark,
     MarkLog,
+    by_people,
     read_rubrics,
     vote,
 )
-from services.evaluation.rating.rating_queue import RatedRollout, RatingQueue, token_of
+from services.evaluation.rating.rating_queue import Assignment, RatedRollout, RatingQueue, token_of
 from services.evaluation.rating.rating_report import rating_report
 
 IDS = [f"rollout-{number}" for number in range(12)]
@@ -193,13 +194,43 @@ def test_nobody_decides_without_a_tie_or_twice(log):
     for rater, stands in (("ada", True), ("bob", False)):
         log.add(mark(rater, IDS[0], standing=stands))
         log.add(mark(rater, IDS[1]))
-    queue.check_deciding("carl", token_of(IDS[0]))
+    queue.check(mark("carl", IDS[0], presentation=DECIDING))
     for rater, name in (("ada", IDS[0]), ("carl", IDS[1])):
-        with pytest.raises(ConflictError, match="other raters are tied"):
-            queue.check_deciding(rater, token_of(name))
+        with pytest.raises(ConflictError, match="other raters are complete and tied"):
+            queue.check(mark(rater, name, presentation=DECIDING))
+    more = RatingQueue(rollouts(IDS[:2]), log, raters_per_rollout=3)
+    with pytest.raises(ConflictError, match="other raters are complete and tied"):
+        more.check(mark("carl", IDS[0], presentation=DECIDING))
     # The work of two who decide at the same time is kept.
     log.add(mark("carl", IDS[0], presentation=DECIDING))
-    queue.check_deciding("dora", token_of(IDS[0]))
+    queue.check(mark("dora", IDS[0], presentation=DECIDING))
+    with pytest.raises(ConflictError, match="got presentation 1"):
+        queue.check(mark("carl", IDS[0]))
+    queue.check(mark("carl", IDS[1]))
+    # Marks of before that was refused: one rater, one vote.
+    log.add(mark("carl", IDS[0]))
+    latest = (stored.mark for stored in log.latest().values())
+    assert [one.rater for one in by_people(latest)[IDS[0]]] == ["ada", "bob", "carl"]
+
+
+def test_a_deciding_mark_is_not_repeated(log):
+    queue = RatingQueue(rollouts(), log, raters_per_rollout=2, repeat_share=0.5)
+    for number, name in enumerate(IDS):
+        log.add(mark("carl", name, presentation=DECIDING if number < 2 else FIRST))
+    assert queue.next("carl") is None
+    log.add(mark("carl", "of-another-store"))
+    assert queue.next("carl") == Assignment(queue.rollout(token_of(IDS[2])), REPEAT, 13, 0)
+
+
+def test_a_tie_is_a_conflict_once_its_raters_are_complete(log):
+    for rater, stands in (("ada", True), ("bob", False)):
+        log.add(mark(rater, IDS[0], standing=stands))
+    known, rubrics, found = log.latest().values(), read_rubrics(), []
+    for num in (2, 3):
+        tasks = {IDS[0]: "stand_bottle"}
+        report = rating_report(known, tasks, rubrics, {}, raters_per_rollout=num)
+        found.append(report["tasks"]["stand_bottle"]["conflicts"]["open"])
+    assert found == [1, 0]
 
 
 def test_votes_count_each_criterion_by_itself():

@@ -22,8 +22,6 @@ from services.evaluation.reporting import (
 )
 from services.evaluation.reporting.pictures import (
     Line,
-    Point,
-    agreement_chart,
     data_address,
     hands_image,
     line_chart,
@@ -370,7 +368,6 @@ def test_charts_are_well_formed_and_inside():
             assert 0 <= x <= width
             assert 0 <= y <= height
     assert [line.attrib["class"] for line in root.iter("polyline")] == ["curve s0", "curve s1"]
-    ET.fromstring(agreement_chart([Point("p", 1.0, 0.0, (0.5, 1.0), (0.0, 0.5))]))  # noqa: S314
 
 
 def test_long_curves_are_thinned():

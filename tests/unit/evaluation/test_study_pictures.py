@@ -9,9 +9,10 @@ import pytest
 from PIL import Image
 
 from dextouch.errors import UnknownNameError
+from services.evaluation.reporting.policy_picture import COLOURS, policy_picture
 from services.evaluation.studies.app import StudyFolders
 from services.evaluation.studies.results import StudyResults
-from services.evaluation.studies.study_pictures import COLOURS, picture, write_pictures
+from services.evaluation.studies.study_pictures import picture, write_pictures
 from tests.unit.evaluation.study_rows import ROWS, TASKS, counted, interval, write_study
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -66,6 +67,13 @@ def test_svg_draws_marks_and_intervals_where_they_belong(figures):
         np.testing.assert_allclose((across[:, 0] - LEFT) / SIDE, real[1:], atol=1e-4)
         np.testing.assert_allclose((TOP + SIDE - along[:, 1]) / SIDE, imagined[1:], atol=1e-4)
         np.testing.assert_allclose(along[:, 0], LEFT + SIDE * real[0], atol=6e-3)
+
+
+def test_names_are_text_in_every_format():
+    pairs = {"a < b_c": [((1.0, 0.5, 1.0), (0.0, 0.0, 0.5))]}
+    root = ET.fromstring(policy_picture(pairs, "t & u", "svg"))  # noqa: S314 - ours
+    assert {"a < b_c", "t & u"} <= {one.text for one in root.iter(f"{SVG}text")}
+    assert r"b\_c" in policy_picture(pairs, "t & u", "tex").decode()
 
 
 def test_png_has_300_dots_an_inch_and_the_marks(figures):

@@ -4,8 +4,11 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
+from services.world_model.checkpoints import Checkpoint, dropout_shares, write_checkpoint
+from services.world_model.command_line import open_by_digest
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import Sampling
+from services.world_model.settings import Placement, WorldModelSettings
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.objective import LossOptions, losses
 from services.world_model.world import open_world
@@ -100,3 +103,32 @@ def test_shares_of_dropped_windows_are_nested(tiny_config, batch):
 def test_guidance_of_a_model_that_was_not_trained_for_it_is_refused():
     with pytest.raises(InvalidInputError, match=r"windows\.text-dropout"):
         open_world(paper_form_checkpoint(), sampling=Sampling(guidance=2.0))
+
+
+@pytest.mark.parametrize("shares", [(0.0, 0.1), (0.1, 0.0), (0.2, 0.1)])
+def test_both_shares_of_dropped_windows_are_needed(tiny_model, metadata, tmp_path, shares):
+    path = tmp_path / "model.safetensors"
+    both = dict(zip(("text_dropout", "action_dropout"), shares, strict=True))
+    # The flag alone says nothing: it may be zero, or of the other condition.
+    known = {**both, "command": "dextouch train world-model --windows.text-dropout=0.0"}
+    digest = write_checkpoint(path, tiny_model, metadata.model_copy(update=known))
+    settings = WorldModelSettings(
+        checkpoint=tmp_path / "newer.safetensors", guidance=2.0, objects=None,
+        placement=Placement(decode_window=2),
+    )  # fmt: skip
+    # A rollout of an older checkpoint continues without what this cannot take.
+    world = open_by_digest(settings, settings.world_name, digest)
+    assert world._sampling.guidance == (2.0 if all(shares) else 1.0)
+    if all(shares):
+        assert open_world(path, sampling=Sampling(guidance=2.0))
+        return
+    with pytest.raises(InvalidInputError, match=r"in (0|10)% of windows .*with both"):
+        open_world(path, sampling=Sampling(guidance=2.0))
+
+
+def test_shares_of_dropped_windows_are_inherited(tiny_model, metadata):
+    given = metadata.model_copy(update={"text_dropout": 0.2, "action_dropout": 0.1})
+    ancestor = Checkpoint(tiny_model, given, "0")
+    assert dropout_shares(0.0, 0.0, ancestor) == (0.2, 0.1)
+    assert dropout_shares(0.0, 0.0, None) == (0.0, 0.0)
+    assert dropout_shares(0.0, 0.5, ancestor) == (0.0, 0.5)

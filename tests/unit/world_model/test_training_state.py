@@ -6,13 +6,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
+from services.networks import optimizer
 from services.world_model.checkpoints import read_checkpoint
+from services.world_model.training import trainer
 from services.world_model.training.distribution import ALONE
 from services.world_model.training.trainer import TrainingRun, train, train_on
 from services.world_model.training.training_state import StateFiles, state_path
@@ -172,3 +175,26 @@ def test_a_state_is_kept_now_and_then(toy_episodes, toy_episode, settings, monke
     often = settings.model_copy(update={"max_steps": 3, "state_every_s": 0.0})
     train_on(toy_episodes, [toy_episode(9, 25)], often)
     assert kept == [1, 2, 3]
+
+
+def test_seconds_between_states_count_from_the_end_of_the_last_one(
+    toy_episodes, settings, monkeypatch
+):
+    now_s, kept = [0.0], []
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], process_time=lambda: 0.0)
+    for module in (optimizer, trainer):
+        monkeypatch.setattr(module, "time", clock)
+
+    def learn(run, batch):
+        now_s[0] += 1.0
+        return 0.0, 0.0
+
+    def write(files, state):
+        now_s[0] += 10.0
+        kept.append(state.facts.step)
+
+    monkeypatch.setattr(TrainingRun, "learn", learn)
+    monkeypatch.setattr(StateFiles, "write", write)
+    slow = settings.model_copy(update={"max_steps": 12, "state_every_s": 5.0})
+    trainer._run_or_resume(TrainingRun(toy_episodes, slow), None, None, None)
+    assert kept == [5, 10]

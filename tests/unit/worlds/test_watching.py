@@ -13,6 +13,7 @@ from pydantic import SecretStr
 from dextouch.clients import RolloutClient
 from dextouch.schemas import RolloutUncertainty, Uncertainty, decode_answer
 from dextouch.serving.keys import ApiKey
+from dextouch.serving.state import MemoryState
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.records import RecordStore, RolloutWatch
@@ -101,6 +102,22 @@ async def test_the_last_ten_that_ended_are_listed_as_they_were(client):
     assert [one["client"] for one in page["over"]] == [f"policy-{n}" for n in range(11, 1, -1)]
     assert {one["last_step"] for one in page["over"]} == {4}
     assert begun.rollout.id not in str(page)
+
+
+async def test_rollouts_that_end_at_once_are_all_listed(client, monkeypatch):
+    begun = [await start(client, **{"dextouch-client": f"policy-{n}"}) for n in range(8)]
+    get = MemoryState.get
+
+    async def get_and_wait(store, key):
+        stored = await get(store, key)
+        await asyncio.sleep(0)
+        return stored
+
+    monkeypatch.setattr(MemoryState, "get", get_and_wait)
+    paths = [f"/v1/rollouts/{one.rollout.id}" for one in begun]
+    await asyncio.gather(*(client.delete(path, headers=bearer("policy")) for path in paths))
+    over = (await listed(client))["over"]
+    assert sorted(one["client"] for one in over) == [f"policy-{n}" for n in range(8)]
 
 
 class DoubtfulWorld(SumWorld):

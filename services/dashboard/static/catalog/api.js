@@ -9,7 +9,8 @@ export async function get(path) {
 
 export async function post(path, body) {
   const headers = { "content-type": "application/json" };
-  return (await checked(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }))).json();
+  const answer = await checked(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }));
+  return answer.status === 204 ? null : answer.json();
 }
 
 // Lists of a form's filters, by name and what is chosen; that is listed even where the store does not have it.

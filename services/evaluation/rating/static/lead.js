@@ -67,5 +67,8 @@ at("invite").addEventListener("submit", (event) => {
     await show();
   });
 });
-// While people rate.
-setInterval(() => { if (!at("lead").hidden && !document.hidden) void attempt(show); }, 15000);
+// While people rate. What is said of a refused invitation stays, and old tables say that they are.
+setInterval(() => {
+  if (at("lead").hidden || document.hidden) return;
+  void show().catch(({ message }) => (at("progress").textContent = `${at("progress").textContent.split(";")[0]}; not refreshed: ${message}`));
+}, 15000);

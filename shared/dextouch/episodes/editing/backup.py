@@ -2,7 +2,7 @@
 
 import shutil
 from base64 import b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -30,7 +30,10 @@ from dextouch.frozen_model import FrozenModel
 BACKUP_FILE: Final = "backup.json"
 # What a store must not forget, beside its items. The journals of running deletions stay: they name
 # operators, and the records say enough.
-_KEPT: Final = ("enrolments.json", ".deleted/salt", ".deleted/records/*", ".deleted/stations/*")
+_KEPT: Final = (
+    *("enrolments.json", ".deleted/salt"),
+    *(".deleted/records/*.json", ".deleted/stations/*.json"),
+)
 # An episode is listed before the recording that it was made of can have been missed.
 _ORDER: Final[tuple[Kind, ...]] = ("episode", "recording")
 Action = Literal["copied", "there", "updated", "retired", "erased", "refused", "damaged"]
@@ -47,7 +50,10 @@ class BackedUpItem(FrozenModel):
 
 
 class BackupList(FrozenModel):
-    """What a backup holds, replaced as a whole at the end of each one; `files` are of `_KEPT`."""
+    """What a backup knew at its end, by which the next one tells changes; `files` are of `_KEPT`.
+
+    It may lack items of a backup that was interrupted.
+    """
 
     backup_version: Literal[1] = 1
     source: str
@@ -66,8 +72,8 @@ class BackupReport:
     """What became of one item.
 
     `copied`, or `there` already; `updated` if only remarks changed; `retired` to the backup's trash
-    (in a bucket: deleted) as it is gone from the source, `erased` as it was permanently deleted
-    there; `refused` or `damaged` for a reason.
+    (in a bucket: deleted) as it is gone from the source, `erased` or not restored as it was
+    permanently deleted there; `refused` or `damaged` for a reason.
     """
 
     kind: Kind
@@ -108,39 +114,39 @@ def back_up(
         InvalidInputError: one store lies in the other.
         NotFoundError: the source has no folder.
     """
-    _check_apart(source, target)
+    _check_apart(source, target, "backup")
     if source.folders and not source.root.is_dir():
         raise NotFoundError(f"backup: store {source.root}: no such folder; mount or name it")
     with disk_errors(f"back up to {target.root}"):
         target.root.mkdir(parents=True, exist_ok=True)
     # Another backup to the same place ends first; in a bucket, one from this machine.
     with held_folder(target.root):
-        former = read_backup_list(target) or _begin(source, target)
-        known, found = former.by_name, dict[tuple[Kind, str], str]()
+        before = (read_backup_list(target) or _begin(source, target)).by_name
+        present = {(kind, name) for kind in KINDS for name in target.list(kind=kind)}
+        held, found = present | before.keys(), dict[tuple[Kind, str], str]()
         for kind in _ORDER:
             numbers = source.folder_numbers(kind=kind)
             stamps = source.stamps(numbers, kind=kind)
             for name in numbers:
-                if name in stamps or (kind, name) in known:
+                if name in stamps or (kind, name) in held:
                     # Without a stamp its commit record was lost: it is damaged, not gone.
                     found[kind, name] = " ".join(stamps[name][1:]) if name in stamps else ""
-        gone = known.keys() - found.keys()
-        if 2 * len(gone) > len(former.items) and not accept_deletions:
+        gone = held - found.keys()
+        if 2 * len(gone) > len(held) and not accept_deletions:
             raise ConflictError(
-                f"backup: {len(gone)} of {len(former.items)} items of {target.url} are gone from "
+                f"backup: {len(gone)} of {len(held)} items of {target.url} are gone from "
                 f"{source.url}; if they were deleted on purpose, repeat it with --accept-deletions"
             )
-        run = _Backup(source, target, former, on_item)
+        run = _Backup(source, target, before, present, on_item)
         for (kind, name), stamp in found.items():
             run.follow(kind, name, stamp)
-        run.retire({(kind, name) for kind in KINDS for name in target.list(kind=kind)} - set(found))
-        listing = BackupList(
-            source=source.url,
-            finished_at=datetime.now(UTC),
-            items=tuple(run.items),
-            files=_kept_files(source),
-        )
-        target.put_file(BACKUP_FILE, listing.model_dump_json().encode())
+        # Some were deleted meanwhile. What is deleted from here on is in the files that are kept.
+        order = reversed(_ORDER)
+        left = {(kind, name) for kind in order for name in source.folder_numbers(kind=kind)}
+        left &= found.keys()
+        run.items = [one for one in run.items if (one.kind, one.id) in left]
+        _write_list(source, target, run.items)
+        run.retire({(kind, name) for kind in KINDS for name in target.list(kind=kind)} - left)
     return run.reports
 
 
@@ -149,21 +155,24 @@ def restore_backup(
 ) -> list[BackupReport]:
     """Restore a store from its backup, and verify every item of it; repeatable.
 
-    What the store must not forget, such as deletions, is restored before its items.
+    What the store must not forget, such as deletions, is restored before its items; what these
+    cover is not restored. Nothing whole is written over, and remarks stay where there are any.
 
     Raises:
         ConflictError: the target has other items or records of its own.
         InvalidInputError: one store lies in the other.
         NotFoundError: there is no backup.
     """
-    _check_apart(backup, target)
+    _check_apart(backup, target, "restore-backup")
     listing = read_backup_list(backup)
     if listing is None:
         raise NotFoundError(
             f"restore-backup: {backup.url} has no {BACKUP_FILE}: it is no backup; `dextouch store "
             "merge` copies other stores"
         )
-    wanted = listing.by_name
+    # Also what a backup copied that was interrupted.
+    wanted = {(kind, name) for kind in KINDS for name in backup.list(kind=kind)}
+    wanted |= listing.by_name.keys()
     present = [(kind, name) for kind in KINDS for name in target.list(kind=kind)]
     if others := [name for kind, name in present if (kind, name) not in wanted]:
         raise ConflictError(
@@ -172,22 +181,11 @@ def restore_backup(
         )
     _write_kept_files(target, listing)
     reports = []
-    for item in sorted(listing.items, key=lambda item: (item.kind != "recording", item.id)):
-        kind, name = item.kind, item.id
-        report = BackupReport(kind, name, "there")
+    for kind, name in sorted(wanted, key=lambda item: (item[0] != "recording", item[1])):
         try:
-            is_whole = _content(target, kind, name) == item.sha256 and not _damage(target, item)
-            if not is_whole:
-                if (found := _content(backup, kind, name)) != item.sha256:
-                    state = "lacks it" if found is None else "has other content"
-                    raise NotFoundError(f"{kind} {name!r}: the backup {state}")
-                if target.exists(name, kind=kind):
-                    target.delete(name, kind=kind, for_good=True)
-                copy_item(backup, target, backup.open_item(kind, name))
-                report = BackupReport(kind, name, "copied")
-            target.copy_remarks(backup, name, kind=kind)
-            if not is_whole and (findings := _damage(target, item)):
-                raise CorruptDataError("; ".join(one.message for one in findings))
+            report = _restored(backup, target, kind, name)
+        except ConflictError as error:
+            report = BackupReport(kind, name, "refused", error.message)
         except DexTouchError as error:
             report = BackupReport(kind, name, "damaged", error.message)
         reports.append(report)
@@ -195,24 +193,44 @@ def restore_backup(
     return reports
 
 
+def _restored(backup: EpisodeStore, target: EpisodeStore, kind: Kind, name: str) -> BackupReport:
+    if not backup.exists(name, kind=kind):
+        raise NotFoundError(f"{kind} {name!r}: the backup lacks it")
+    reader = backup.open_item(kind, name)
+    covered = deletion_of(care.DeletionRecords(target.root), reader.attributes)
+    if covered is not None and not covered.is_later:
+        reason = f"it was permanently deleted on {covered.deleted_at:%Y-%m-%d}"
+        return BackupReport(kind, name, "erased", reason)
+    action: Action = "there"
+    is_whole = target.exists(name, kind=kind) and not _damage(target, kind, name)
+    if is_whole and _content(target, kind, name) != reader.content_sha256:
+        raise ConflictError(
+            f"{kind} {name!r}: {target.url} has other content; restore into an empty folder"
+        )
+    if not is_whole:
+        reader.verify()
+        copy_item(backup, target, reader, replaces=True)
+        action = "copied"
+    target.copy_remarks(backup, name, kind=kind, only_missing=True)
+    if not is_whole and (findings := _damage(target, kind, name)):
+        raise CorruptDataError("; ".join(one.message for one in findings))
+    return BackupReport(kind, name, action)
+
+
 @dataclass
 class _Backup:
     source: EpisodeStore
     target: EpisodeStore
-    former: BackupList
+    before: Mapping[tuple[Kind, str], BackedUpItem]
+    present: Set[tuple[Kind, str]]
     on_item: OnItem
     items: list[BackedUpItem] = field(default_factory=list)
     reports: list[BackupReport] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self._before = self.former.by_name
-        self._held = {kind: set(self.target.list(kind=kind)) for kind in KINDS}
-
     def follow(self, kind: Kind, name: str, stamp: str) -> None:
         """Copy an item if it is new or changed; one that was deleted meanwhile is left out."""
-        before = self._before.get((kind, name))
-        is_held = name in self._held[kind]
-        if before is not None and is_held and before.stamp == stamp:
+        before = self.before.get((kind, name))
+        if before is not None and (kind, name) in self.present and before.stamp == stamp:
             self._note(BackupReport(kind, name, "there"), before)
             return
         try:
@@ -221,20 +239,16 @@ class _Backup:
             if content is None or content != _content(self.target, kind, name):
                 reader = self.source.open_item(kind, name)
                 reader.verify()
-                if is_held:
-                    self.target.delete(name, kind=kind)
-                copy_item(self.source, self.target, reader)
+                copy_item(self.source, self.target, reader, replaces=True)
                 action = "copied"
             if self.target.copy_remarks(self.source, name, kind=kind) and action == "there":
                 action = "updated"
             item = BackedUpItem(kind=kind, id=name, sha256=content or "", stamp=stamp)
             self._note(BackupReport(kind, name, action), item)
-        except NotFoundError as error:
-            # Otherwise deleted since it was listed: the next backup retires what was copied of it.
-            if not stamp and before is not None:
-                self._note(BackupReport(kind, name, "refused", error.message), before)
         except DexTouchError as error:
-            self._note(BackupReport(kind, name, "refused", error.message), before)
+            # Otherwise deleted since it was listed, so that what was copied of it is retired.
+            if not stamp or self.source.exists(name, kind=kind):
+                self._note(BackupReport(kind, name, "refused", error.message), before)
 
     def retire(self, gone: set[tuple[Kind, str]]) -> None:
         """Remove what the source lacks; what was permanently deleted there, from the trash, too."""
@@ -268,18 +282,18 @@ def _content(store: EpisodeStore, kind: Kind, name: str) -> str | None:
     return stated_sha256(store.files(name, kind=kind).get_now(COMMIT_FILE))
 
 
-def _damage(store: EpisodeStore, item: BackedUpItem) -> tuple[care.Finding, ...]:
-    return care.inspect_group(store.files(item.id, kind=item.kind), item.kind).findings
+def _damage(store: EpisodeStore, kind: Kind, name: str) -> tuple[care.Finding, ...]:
+    return care.inspect_group(store.files(name, kind=kind), kind).findings
 
 
-def _check_apart(source: EpisodeStore, target: EpisodeStore) -> None:
+def _check_apart(source: EpisodeStore, target: EpisodeStore, command: str) -> None:
     if source.url == target.url:
-        raise InvalidInputError(f"backup: {source.url} is both the store and its backup")
+        raise InvalidInputError(f"{command}: {source.url} is both the store and its backup")
     if source.folders and target.folders:
         one, other = source.root.resolve(), target.root.resolve()
         if one.is_relative_to(other) or other.is_relative_to(one):
             raise InvalidInputError(
-                f"backup: {one} and {other} lie in one another; name a folder apart"
+                f"{command}: {one} and {other} lie in one another; name a folder apart"
             )
 
 
@@ -290,17 +304,30 @@ def _begin(source: EpisodeStore, target: EpisodeStore) -> BackupList:
             f"backup: {target.url} has items and is no backup; name an empty folder or prefix, or "
             "`dextouch store merge` the stores"
         )
-    listing = BackupList(source=source.url, finished_at=datetime.now(UTC))
+    return _write_list(source, target, ())
+
+
+def _write_list(
+    source: EpisodeStore, target: EpisodeStore, items: Iterable[BackedUpItem]
+) -> BackupList:
+    listing = BackupList(
+        source=source.url,
+        finished_at=datetime.now(UTC),
+        items=tuple(items),
+        files=_kept_files(source),
+    )
     target.put_file(BACKUP_FILE, listing.model_dump_json().encode())
     return listing
 
 
 def _kept_files(source: EpisodeStore) -> dict[str, bytes]:
     with disk_errors(f"read what {source.root} must not forget"):
-        paths = sorted(path for pattern in _KEPT for path in source.root.glob(pattern))
-        return {
-            path.relative_to(source.root).as_posix(): b64encode(path.read_bytes()) for path in paths
-        }
+        found = {}
+        for path in sorted(path for pattern in _KEPT for path in source.root.glob(pattern)):
+            # Records may go while they are read.
+            with suppress(FileNotFoundError):
+                found[path.relative_to(source.root).as_posix()] = b64encode(path.read_bytes())
+        return found
 
 
 def _write_kept_files(target: EpisodeStore, listing: BackupList) -> None:

@@ -336,8 +336,13 @@ def copy_item(
     reader: EpisodeReader | RecordingReader,
     attributes: Attributes | None = None,
     remarks: Mapping[str, BaseModel | None] = MappingProxyType({}),
+    *,
+    replaces: bool = False,
 ) -> None:
-    """Copy a group with what is beside its content, byte for byte unless its attributes change."""
+    """Copy a group with what is beside its content, byte for byte unless its attributes change.
+
+    With `replaces` one of its id is moved to the trash, or deleted in a bucket, once all is copied.
+    """
     attributes = attributes or reader.attributes
     kind, name = kind_of(attributes), reader.item_id
     files = source.files(name, kind=kind)
@@ -349,8 +354,10 @@ def copy_item(
         raise NotFoundError(f"{kind} {name!r}: was deleted while it was copied")
     # Its streams are files that exist already.
     shell = attributes.model_copy(update={"streams": ()})
-    with target.writer(kind=kind, attributes=shell) as writer:
+    with target.writer(kind=kind, attributes=shell, replaces=replaces) as writer:
         writer.take_files(files, metadata=metadata, commit=commit, link=False)
         for remark, found in remarks.items():
             if found is not None:
                 writer.add_remark(remark, found)
+        if replaces and target.exists(name, kind=kind):
+            target.delete(name, kind=kind)

@@ -239,6 +239,9 @@ def test_a_run_that_time_ended_goes_on_with_more(settings, episodes, tmp_path):
     )
     assert train_on(episodes[:2], episodes[2:], cut).steps == 1
     assert state_path(cut.output).is_file()
+    # The limit counts in all: the same command would take no step.
+    with pytest.raises(ConflictError, match=r"step 1 of 4 .*larger --wall-budget-s"):
+        train_on(episodes[:2], episodes[2:], cut)
     more = cut.model_copy(update={"wall_budget_s": 1e9})
     report = train_on(episodes[:2], episodes[2:], more)
     assert report.steps == 4
