@@ -67,7 +67,7 @@ function clocks(item, reports, onSpan) {
 // A button that goes to the second in which a figure is worst.
 function worstButton(find, text, onSpan) {
   if (!find) return null;
-  const button = element("button", { type: "button", class: "plain", "aria-label": `worst second of ${text}` }, "Go");
+  const button = element("button", { type: "button", class: "plain", "aria-label": `Go to the worst second of ${text}` }, "Go");
   button.addEventListener("click", async () => {
     button.disabled = true;
     const span = await find().catch((error) => error);
