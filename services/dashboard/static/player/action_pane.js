@@ -79,7 +79,7 @@ export class ActionPane {
     const { context, width, height, scale } = found;
     const bar = width / ACTION_SIZE;
     const label_px = 14 * scale;
-    const middle = (height - label_px) / 2;
+    const middle = height / 2, reach = middle - label_px; // names below, scales above the bars
     const quiet = css("--quiet");
     context.font = `${11 * scale}px system-ui, sans-serif`;
     BLOCKS.forEach(({ name, first, count, scale: full }, place) => {
@@ -95,7 +95,7 @@ export class ActionPane {
       context.fillStyle = colour;
       values.forEach((value, index) => {
         const share = Math.min(Math.max(value / FULL[this.words[index].unit], -1), 1);
-        if (Number.isFinite(share)) paint(index * bar, -share * (middle - 2 * scale));
+        if (Number.isFinite(share)) paint(index * bar, -share * (reach - 2 * scale));
       });
     };
     draw(this.values.measured, css("--accent"), (x, size) => context.fillRect(x + 0.15 * bar, middle, 0.7 * bar, size || scale));
