@@ -290,7 +290,8 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
             if too_many:
                 answer.headers["retry-after"] = str(error.details["retry_after_s"])
             return answer
-        request.state.person = sessions.person_of(token)
+        # Without keys there is nobody to name.
+        request.state.person = sessions.person_of(token) or ""
         entered = RedirectResponse(wanted, 303)
         entered.set_cookie(
             COOKIE,

@@ -392,8 +392,10 @@ def _watched_points(
     actions: np.ndarray, anchor: AnchorPoses
 ) -> Float32[np.ndarray, "steps 2 points 3"]:
     """Points of each hand, then of the head camera, in the world: none moves while all is still."""
-    motion = hand_motion(actions, anchor)
-    camera_m = apply(motion.Ts_world_camera, _CAMERA_POINTS_M).astype(np.float32)
+    # Poses beyond single precision are infinite, which is refused elsewhere.
+    with np.errstate(over="ignore"):
+        motion = hand_motion(actions, anchor)
+        camera_m = apply(motion.Ts_world_camera, _CAMERA_POINTS_M).astype(np.float32)
     return np.concatenate([motion.points_m, np.stack([camera_m, camera_m], axis=1)], axis=2)
 
 

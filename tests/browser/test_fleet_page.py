@@ -62,7 +62,7 @@ def test_a_station_that_stops_is_stale_and_first(wall, stations):
     sys.stdout.write(f"STALE {shown} s after SIGSTOP\n")
     assert min(delays_s) < 1.0, delays_s
     # The other one may be in trouble of its own on a machine under load.
-    if wall.locator("[data-station=desk_1]").get_attribute("data-level") != "ERROR":
+    if wall.locator("li[data-station=desk_1]").get_attribute("data-level") != "ERROR":
         assert names(wall)[0] == "desk_2"
     stations["desk_2"].go_on()
     expect(tile).not_to_have_attribute("data-level", "STALE")
