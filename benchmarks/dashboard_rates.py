@@ -38,7 +38,7 @@ def serve_child(kind: str, *arguments: str) -> None:
         app = create_dashboard(DashboardSettings(stations=json.loads(arguments[0])))
     else:
         streams = [s for s in pattern.pattern_streams() if s.descriptor.name in arguments[1:]]
-        pattern.pattern_streams = lambda *_: streams
+        pattern.pattern_streams = lambda *_, **__: streams
         app = create_app(AcquisitionSettings(spool=Path(arguments[0]), mock=True))
 
     def tell() -> None:

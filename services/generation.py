@@ -22,6 +22,7 @@ from dextouch.schemas import (
 from dextouch.tactile.layout import TactileLayout
 
 SHORT_CHUNK_STEPS: Final = 4
+_MAX_ID_LENGTH: Final = 128
 
 
 def imagine_episode(
@@ -142,8 +143,15 @@ def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[i
 
 
 def imagined_id(episode_id: str, world_digest: str) -> str:
-    """Id of an imagined episode, from its source and an abbreviated world digest."""
-    return f"imagined-{world_digest[:8]}-{episode_id}"
+    """Id of an imagined episode, from its source and an abbreviated world digest.
+
+    A source's id that is too long to be a part of it is cut, and distinguished by its digest.
+    """
+    name = f"imagined-{world_digest[:8]}-{episode_id}"
+    if len(name) <= _MAX_ID_LENGTH:
+        return name
+    digest = hashlib.sha256(episode_id.encode()).hexdigest()[:16]
+    return f"{name[: _MAX_ID_LENGTH - len(digest) - 1]}-{digest}"
 
 
 def _sha256(digest: str) -> str | None:

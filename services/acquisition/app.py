@@ -26,7 +26,13 @@ from services.acquisition.retention import (
     remove_take,
     spooled_takes,
 )
-from services.acquisition.routes import live_router, recorder_router, station_router, uploads_router
+from services.acquisition.routes import (
+    faults_router,
+    live_router,
+    recorder_router,
+    station_router,
+    uploads_router,
+)
 from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
@@ -163,6 +169,8 @@ def create_app(
     mock = _mock_station(settings, follow) if settings.mock else None
     station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
+    wanted = settings.require_consent
+    station.recorder.needs_consent = not settings.mock if wanted is None else wanted
     practice = Practice(partial(practice_app, settings) if settings.mock else None)
     return _station_app(settings, station, mock, uploads, practice)
 
@@ -212,6 +220,7 @@ def _station_app(
             station_router(station, uploads),
             uploads_router(uploads),
             live_router(station),
+            faults_router(mock),
             *([practice.router()] if practice is not None else []),
         ],
         lifespan=lifespan,

@@ -4,13 +4,15 @@ import threading
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import get_args
 
 import structlog
 
-from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.schemas import Matrix, SaveTake, TakeCheck, TakePrompt
+from dextouch.errors import ConflictError, DeviceError, InvalidInputError
+from dextouch.schemas import Matrix, SaveTake, SimulatedFault, TakeCheck, TakePrompt
 from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.devices.camera import CameraDecoder
@@ -28,7 +30,7 @@ from services.acquisition.mocks.cameras_and_robot import (
     RobotStateSource,
     video_camera,
 )
-from services.acquisition.mocks.faults import FaultScript, Ledger
+from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -48,6 +50,10 @@ logger = structlog.get_logger(__name__)
 LEDGER_FILE = "mock_ledger.json"
 LEAD_NS = 20_000_000
 LIVE_LEAD_NS = 200_000_000
+# Longer than five periods of a glove or tracker, from which on health calls it an error.
+SLOW_S = 0.1
+# A raw cell that all kinds of gloves have.
+DEAD_CELL = 9
 
 
 def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
@@ -227,6 +233,7 @@ class MockStation:
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []
+        self._setting = threading.Lock()
         self._epoch_ns = 0
 
     def __enter__(self) -> "MockStation":
@@ -287,6 +294,36 @@ class MockStation:
         ledger.save(path / LEDGER_FILE)
         truth = _known_of(self.pairs, self._seed, error_ms=0.0)
         return MockTake(status.recording_id, path, ledger, check, truth)
+
+    def set_fault(self, fault: SimulatedFault, *, is_on: bool) -> tuple[SimulatedFault, ...]:
+        """Begin or end a fault, of one glove or of the whole station; gives those that are on.
+
+        Raises:
+            ConflictError: no glove is simulated, or one of a kind that cannot have the fault.
+        """
+        gloves = [pair.device for pair in self.pairs if pair.device.name.startswith("glove")]
+        if not gloves and fault != "slow_host":
+            raise ConflictError(f"fault {fault}: no glove is simulated here, expected one")
+        needs: dict[str, Pinned] = {"drift": "saturated", "dead_taxel": "dead"}
+        if fault in needs and not gloves[0].source.edits.pins(needs[fault]):
+            raise ConflictError(
+                f"fault {fault}: the packets of {gloves[0].name} cannot show it, expected a mock "
+                f"whose PacketEdits are given what a {needs[fault]!r} cell shows"
+            )
+        with self._setting:
+            before = self.station.faults or ()
+            known = get_args(SimulatedFault)
+            now = tuple(f for f in known if (is_on if f == fault else f in before))
+            self.station.slow_s = SLOW_S if "slow_host" in now else 0.0
+            for glove in gloves[:1]:
+                if fault == "unplug":
+                    glove.set_plugged("fault", is_plugged=not is_on)
+                edits = glove.source.edits
+                dead = partial(edits.pin, cells=(DEAD_CELL,), how="dead")
+                cells: dict[str, Edit] = {"drift": edits.move_zero, "dead_taxel": dead}
+                glove.extra_edits = tuple(edit for f, edit in cells.items() if f in now)
+            self.station.faults = now
+        return now
 
     def play_forever(self) -> None:
         """Let the devices go round and round, for a station that an operator uses.

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError, StorageError
+from dextouch.errors import ConflictError, InvalidInputError, StorageError
 from dextouch.schemas import (
     Matrix,
     RecorderAction,
@@ -43,6 +43,8 @@ from services.acquisition.take_check import DeviceEvents, TakeWatch, incomplete_
 logger = structlog.get_logger(__name__)
 
 SESSION_FILE: Final = "session.json"
+# Takes of these tasks show devices and a board; guided runs record them without an operator.
+CALIBRATION: Final = ("calibrate-glove", "calibrate-time")
 ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
@@ -68,6 +70,8 @@ class Recorder:
     All samples are written to the spool first. A full disk ends the take, which can still be saved
     or discarded. Actions that name their recording are idempotent; an action for another take than
     the current one is refused. `take` is the running or ended one, which reader threads append to.
+
+    With `needs_consent`, no take is armed without an operator who consented.
 
     `device_events` gives, by device, counts of named events since the station's start (those of the
     drivers if None), `latencies` the measured path delays of streams.
@@ -103,6 +107,7 @@ class Recorder:
         self._state: RecorderState = "idle"
         self._discarded_id: str | None = None
         self._session = SessionCount(spool_root)
+        self.needs_consent = False
         self._arm(None)
 
     def status(self) -> RecorderStatus:
@@ -123,10 +128,22 @@ class Recorder:
                 problems=(*(take.problems() if take else ()), *problems),
                 check=check,
                 session=self._session.now,
+                needs_consent=self.needs_consent,
             )
 
     def arm(self, prompt: TakePrompt) -> RecorderStatus:
-        """Set the prompt of the next take."""
+        """Set the prompt of the next take.
+
+        Raises:
+            InvalidInputError: no operator or no consent, at a station that needs both.
+        """
+        is_agreed = bool(prompt.operator) and prompt.consent
+        if self.needs_consent and not is_agreed and prompt.task not in CALIBRATION:
+            given = "no consent" if prompt.operator else "no operator"
+            raise InvalidInputError(
+                f"arm: got {given}, expected the pseudonym of an operator who agreed to be "
+                "recorded; name both, or start the station with --no-require-consent"
+            )
         return self._act("arm", None, partial(self._arm, prompt))
 
     def record(self, recording_id: str | None = None) -> RecorderStatus:

@@ -1,11 +1,12 @@
 """HTTP routes of a station: the recorder, its health, live views and uploads."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from fastapi import APIRouter, Body, Depends, Query, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from dextouch.errors import ConflictError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     CameraList,
@@ -13,6 +14,8 @@ from dextouch.schemas import (
     HealthHistory,
     RecorderStatus,
     SaveTake,
+    SetFault,
+    SimulatedFault,
     StationHealth,
     StationOverview,
     StoreId,
@@ -27,6 +30,9 @@ from services.acquisition.health.monitor import PERIOD_NS
 from services.acquisition.health.station import DiskCheck, judge_uploads
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
+
+if TYPE_CHECKING:
+    from services.acquisition.mock_station import MockStation
 
 Named = Annotated[TakeName | None, Body()]
 
@@ -79,6 +85,23 @@ def recorder_router(station: Station) -> APIRouter:
     return router
 
 
+def faults_router(mock: "MockStation | None") -> APIRouter:
+    """Faults that a simulated station shows on request; real ones have none (409)."""
+    router = _router("/v1/faults")
+
+    @router.post("/{fault}")
+    async def set_fault(fault: SimulatedFault, body: SetFault) -> tuple[SimulatedFault, ...]:
+        """Begin or end a fault; those that are on."""
+        if mock is None:
+            raise ConflictError(
+                f"fault {fault}: this station has real devices, expected simulated ones "
+                "(dextouch up --mock); nothing was changed"
+            )
+        return await run_in_threadpool(mock.set_fault, fault, is_on=body.on)
+
+    return router
+
+
 class HistoryQuery(FrozenModel):
     """Which rows of the health's history, and in which format."""
 
@@ -98,7 +121,8 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     @router.get("/health")
     async def get_station_health() -> StationHealth:
         """Every stream and device."""
-        return await run_in_threadpool(station.health.report)
+        health = await run_in_threadpool(station.health.report)
+        return health.model_copy(update={"faults": station.faults})
 
     @router.get("/health/events")
     async def list_health_events(since_ns: int = 0) -> HealthEvents:

@@ -133,6 +133,11 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety, Retention):
         "left glove with dead, stuck, saturated and drifted taxels",
     )
     mock_links: MockLinks = MockLinks()
+    require_consent: bool | None = Field(
+        default=None,
+        description="arm no take without an operator who consented, except for calibration "
+        "(default: with real devices)",
+    )
     seed: int = Field(default=0, ge=0, description="random seed of mock devices")
     devices: tuple[ChosenDevice, ...] = Field(
         default=(), description="real devices, see docs/stations.md"

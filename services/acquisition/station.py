@@ -1,6 +1,7 @@
 """A running station: supervisors of its devices, recorder, health and what viewers see."""
 
 import threading
+import time
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from jaxtyping import Float32
 from dextouch.errors import DeviceError, NotFoundError, StaleDataError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.images import encode_jpeg
-from dextouch.schemas import CameraLive, Matrix
+from dextouch.schemas import CameraLive, Matrix, SimulatedFault
 from dextouch.streams import H264_UNIT, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
@@ -38,6 +39,9 @@ MOUNTS = {
 class Station:
     """Everything that runs beside the devices.
 
+    `faults` are those that a simulated station shows on request, None of real devices; meanwhile
+    each reading takes `slow_s` longer.
+
     `follow` makes the check whether the robot's hand can follow a tracked one; without it there is
     none.
     """
@@ -56,6 +60,8 @@ class Station:
     ) -> None:
         self.name = name
         self.clock = clock
+        self.faults: tuple[SimulatedFault, ...] | None = () if simulated else None
+        self.slow_s = 0.0
         self.live = LiveView(drivers, calibration)
         self.supervisors = [
             DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
@@ -126,6 +132,8 @@ class Station:
         return is_read and self.health.is_running and (take is None or take.is_working())
 
     def _accept(self, readings: Readings) -> None:
+        if self.slow_s:
+            time.sleep(self.slow_s)
         take = self.recorder.take
         if take is not None:
             take.accept(readings)

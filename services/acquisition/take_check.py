@@ -262,7 +262,10 @@ class TakeFindings:
             if any((entry.stream, code) in known_codes for code in codes):
                 continue
             times = "once" if entry.count == 1 else f"{entry.count} times"
-            text = f"{entry.event} found {times}. {CODES[entry.event].advice}"
+            # Nothing of a simulated device can be plugged or replaced.
+            is_simulated = entry.stream in self._simulated
+            advice = "" if is_simulated else f". {CODES[entry.event].advice}"
+            text = f"{entry.event} found {times}{advice}"
             found.append(_problem(entry.stream, entry.event, "WARN", text))
         return found
 

@@ -70,11 +70,18 @@ def store_enrol_main(argv: Sequence[str]) -> int:
     parser = _administration(
         "enrol", "Get a one-time token with which a station gets a key of its own.", "desk_3"
     )
+    parser.add_argument(
+        "--renew",
+        action="store_true",
+        help="a new key beside the present one, until revoke --former",
+    )
     options = parser.parse_args(list(argv))
     from dextouch.schemas import EnrolmentToken
 
     with _link(options) as link:
-        got = _ask(link, EnrolmentToken, "POST", PATH, {"station": options.station})
+        got = _ask(
+            link, EnrolmentToken, "POST", PATH, {"station": options.station, "renew": options.renew}
+        )
     command = f"dextouch station enrol {options.url} {got.token}"
     print(f"run this on {got.station}, once, before {_shown(got.expires_at)}:\n\n  {command}\n")
     write_result(options.json, got.model_dump(mode="json") | {"command": command})
@@ -101,15 +108,17 @@ def store_stations_main(argv: Sequence[str]) -> int:
 def store_revoke_main(argv: Sequence[str]) -> int:
     """Revoke the key of a station."""
     parser = _administration(
-        "revoke", "Refuse the key of an enrolled station, or its unused token, at once.", "desk_3"
+        "revoke", "Refuse the keys of an enrolled station, or its unused token, at once.", "desk_3"
     )
+    parser.add_argument("--former", action="store_true", help="all but the newest key")
     options = parser.parse_args(list(argv))
     from dextouch.schemas import StationEnrolments
 
-    path = f"{PATH}/{quote(options.station, safe='')}/revoke"
+    query = "?former=true" if options.former else ""
+    path = f"{PATH}/{quote(options.station, safe='')}/revoke{query}"
     with _link(options) as link:
         listed = _ask(link, StationEnrolments, "POST", path)
-    print(f"revoked: {options.station}")
+    print(f"revoked: {options.station}{' (former keys)' * options.former}")
     write_result(options.json, listed.model_dump(mode="json"))
     return 0
 
@@ -141,7 +150,11 @@ def _link(options: argparse.Namespace) -> "closing[HttpLink]":
 
 
 def _ask(
-    link: "HttpLink", form: type[FormT], method: str, path: str, body: dict[str, str] | None = None
+    link: "HttpLink",
+    form: type[FormT],
+    method: str,
+    path: str,
+    body: dict[str, str | bool] | None = None,
 ) -> FormT:
     reply = link.request(method, path, body=None if body is None else json.dumps(body).encode())
     try:

@@ -167,6 +167,8 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
 
     if settings.mock or "station" in settings.model_fields_set:
         given["station"] = settings.station
+    if settings.mock_faults is not None:
+        given["mock_faults"] = settings.mock_faults
     if settings.mock_episode_id is not None:
         given |= {"mock_store": settings.store_url, "mock_episode_id": settings.mock_episode_id}
     station = AcquisitionSettings.model_validate(
@@ -194,16 +196,11 @@ def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
 def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     from dextouch.worlds import create_world_app
+    from services.world_model.command_line import open_model
     from services.world_model.settings import WorldModelSettings
-    from services.world_model.world import open_world
 
     settings = WorldModelSettings()
-    world = open_world(
-        settings.checkpoint,
-        sampling_steps=settings.sampling_steps,
-        sampler=settings.sampler,
-        objects=settings.objects,
-    )
+    world = open_model(settings.checkpoint, settings)
     return create_world_app({settings.world_name: world}, settings, name="world_model")
 
 

@@ -41,6 +41,10 @@ class UpSettings(CommandSettings):
     mock_episode_id: str | None = Field(
         default=None, description="episode of the store that the mock devices play"
     )
+    mock_faults: Literal["none", "first_light", "worn_glove"] | None = Field(
+        default=None,
+        description="faults of the mock devices, as of dextouch station serve (default: none)",
+    )
     align_new: bool = Field(default=True, description="align saved takes automatically")
     without: tuple[str, ...] = Field(default=(), description="services not to start")
     dashboard_port: int = Field(default=8080, ge=0, le=65535, description=PORT)

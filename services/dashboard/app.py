@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, Gauge
 
-from dextouch.serving import AccessControl, create_service_app, serve
+from dextouch.serving import create_service_app, serve
 from services.dashboard import routes
 from services.dashboard.audit import AuditLog, AuditTrail
 from services.dashboard.comparison import Comparisons
@@ -40,7 +40,6 @@ def create_app(
     system = System(stations, upstreams)
     audit_log = AuditLog(settings.audit_folder, max_bytes=settings.audit_max_bytes)
     sessions = Sessions(
-        AccessControl(settings.api_keys),
         needs_key=bool(settings.api_keys),
         lifetime_s=3600 * settings.session_hours,
     )
@@ -85,6 +84,8 @@ def create_app(
     num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
     num_sessions.set_function(lambda: sessions.num_open)
     app.state.sessions = sessions
+    # The same keys, also after they were exchanged.
+    sessions.access = app.state.access
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app

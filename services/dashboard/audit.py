@@ -51,8 +51,11 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/sign_out": "sign out",
     "/v1/recorder/{action}": "recorder",
     "/v1/uploads/{recording_id}/retry": "send upload again",
+    "/v1/acquisition/faults/{fault}": "simulate fault",
     "/v1/comparisons": "start replay",
     "/v1/comparisons/stop": "stop replay",
+    # Several a second; that they began is noted.
+    "/v1/comparisons/{comparison_id}/moves": "",
     "/v1/episode_store/catalog/reviews": "review",
     "/v1/episode_store/episodes/{item_id}/clicks": "mark objects",
     "/v1/episode_store/episodes/{item_id}/trim": "trim",
@@ -81,7 +84,7 @@ NAMED: Final = ("station", "verdict", "kind", "subject", "task", "recording_id",
 ALL_ACTIONS: Final = tuple(
     sorted(
         [
-            *set(ACTIONS.values()) - {"recorder"},
+            *set(ACTIONS.values()) - {"recorder", ""},
             ENROLMENT,
             *(f"recorder: {action}" for action in RECORDER_ACTIONS),
         ]
@@ -331,7 +334,7 @@ def _known(scope: Scope) -> tuple[str, str, list[str]] | None:
     if scope["method"] in SAFE_METHODS:
         return None
     for pattern, path, action in _ROUTES:
-        if match := pattern.match(scope["path"]):
+        if action and (match := pattern.match(scope["path"])):
             names = match.groupdict()
             verb = names.pop("action", None)
             named = action if verb is None else f"{action}: {_clean(verb)}"

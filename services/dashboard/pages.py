@@ -35,6 +35,7 @@ from dextouch.serving import (
     Grant,
     not_signed_in,
     page_headers,
+    secret_digest,
     takes,
 )
 from services.dashboard.settings import DashboardSettings
@@ -198,13 +199,14 @@ SCREENS: Final = (
 class Sessions:
     """Access of browsers: open on loopback without keys, otherwise by signing in."""
 
-    access: AccessControl
+    # Of the application, which is made later.
+    access: AccessControl = field(init=False)
     _: KW_ONLY
     needs_key: bool
     lifetime_s: float
     clock_s: Callable[[], float] = time.monotonic
-    # What its key allows and the end of the session, by its token.
-    _open: dict[str, tuple[Grant, float]] = field(default_factory=dict)
+    # The digest of its key and the end of the session, by its token.
+    _open: dict[str, tuple[bytes, float]] = field(default_factory=dict)
 
     @property
     def num_open(self) -> int:
@@ -218,13 +220,13 @@ class Sessions:
         Raises:
             AccessDeniedError: an unknown key or one without the scope.
         """
-        grant = self.access.granted(f"Bearer {key}", SCOPE)
+        self.access.check(f"Bearer {key}", SCOPE)
         now_s = self.clock_s()
         self._open = {token: one for token, one in self._open.items() if one[1] > now_s}
         while len(self._open) >= MAX_SESSIONS:
             self._open.pop(next(iter(self._open)))
         token = secrets.token_urlsafe(32)
-        self._open[token] = grant, now_s + self.lifetime_s
+        self._open[token] = secret_digest(key.strip()), now_s + self.lifetime_s
         return token
 
     def sign_out(self, connection: HTTPConnection) -> None:
@@ -245,8 +247,9 @@ class Sessions:
         return None if grant is None else grant.name
 
     def _grant(self, token: str) -> Grant | None:
-        grant, end_s = self._open.get(token, (None, 0.0))
-        return grant if end_s > self.clock_s() else None
+        digest, end_s = self._open.get(token, (b"", 0.0))
+        # A key that the settings no longer have takes its sessions along.
+        return self.access.of_digest(digest) if end_s > self.clock_s() else None
 
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""
@@ -287,7 +290,8 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
             if too_many:
                 answer.headers["retry-after"] = str(error.details["retry_after_s"])
             return answer
-        request.state.person = sessions.person_of(token)
+        # Without keys there is nobody to name.
+        request.state.person = sessions.person_of(token) or ""
         entered = RedirectResponse(wanted, 303)
         entered.set_cookie(
             COOKIE,
@@ -351,6 +355,7 @@ def _shown(
             settings=settings,
             goals=json.dumps(settings.goal_hours),
             signed_in=sessions.needs_key,
+            person=sessions.person(request) or "",
             document=document,
         )
 

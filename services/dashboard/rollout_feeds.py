@@ -3,7 +3,7 @@
 import asyncio
 import re
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +20,7 @@ from services.dashboard.settings import DashboardSettings
 
 WORLD_SERVICES: Final = ("twin", "world_model")
 MAX_LISTED: Final = 100
+NUM_OVER: Final = 10
 MAX_RESPONSE_BYTES: Final = 2**28
 # Of one message; of more images, only every second, third, … step is sent.
 MAX_IMAGE_BYTES: Final = 4 * 2**20
@@ -51,11 +52,17 @@ class ListedRollout(schemas.WatchedRollout):
 
 
 class RolloutsView(FrozenModel):
-    """Open rollouts of all services; `problems` are the reasons of services that list none."""
+    """Open rollouts of all services; `problems` are the reasons of services that list none.
+
+    `over` are the ten that ended last, by when their last chunk was. `has_episodes` if a store is
+    configured, whose episodes can be replayed.
+    """
 
     worlds: tuple[WorldView, ...] = ()
     rollouts: tuple[ListedRollout, ...] = ()
+    over: tuple[ListedRollout, ...] = ()
     num_open: int = 0
+    has_episodes: bool = False
     problems: tuple[str, ...] = ()
 
 
@@ -98,7 +105,11 @@ class RolloutFeeds:
         return RolloutsView(
             worlds=tuple(world for view in found for world in view.worlds),
             rollouts=tuple(rollouts),
+            over=tuple(
+                sorted((one for view in found for one in view.over), key=_idle_s)[:NUM_OVER]
+            ),
             num_open=sum(view.num_open for view in found),
+            has_episodes=self._feeds.has("episode_store"),
             problems=tuple(text for view in found for text in view.problems),
         )
 
@@ -116,23 +127,32 @@ class RolloutFeeds:
                 reason = f"no answer from {upstream.address}; is the service running?"
             return RolloutsView(problems=(f"{service}: {reason}",))
         worlds = {world.name: world for world in described.worlds}
-        shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch", "tactile_layout")
-        return RolloutsView(
-            worlds=tuple(
-                WorldView(service=service, **{name: getattr(world, name) for name in shown})
-                for world in described.worlds
-            ),
-            rollouts=tuple(
+
+        def shown_of(rollouts: Iterable[schemas.WatchedRollout]) -> tuple[ListedRollout, ...]:
+            return tuple(
                 ListedRollout(
                     service=service,
                     kind=worlds[one.world].kind if one.world in worlds else None,
                     model_rate_hz=worlds[one.world].model_rate_hz if one.world in worlds else None,
                     **dict(one),
                 )
-                for one in listed.rollouts
+                for one in rollouts
+            )
+
+        shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch", "tactile_layout")
+        return RolloutsView(
+            worlds=tuple(
+                WorldView(service=service, **{name: getattr(world, name) for name in shown})
+                for world in described.worlds
             ),
+            rollouts=shown_of(listed.rollouts),
+            over=shown_of(listed.over),
             num_open=listed.num_open,
         )
+
+
+def _idle_s(rollout: ListedRollout) -> float:
+    return rollout.idle_s
 
 
 class _Watched:

@@ -40,6 +40,7 @@ from services.dashboard.feeds import (
     skeleton_bones,
 )
 from services.dashboard.fleet import Fleet
+from services.dashboard.hand_driving import Moves
 from services.dashboard.pages import COOKIE, SCOPE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
@@ -143,8 +144,14 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
     @router.post("", status_code=202)
     @takes({JSON: KIB})
     async def start_comparison(body: StartComparison) -> ComparisonView:
-        """Replay an episode in the twin and in the world model; ends the comparison before."""
-        return await comparisons.start(body.episode_id)
+        """Replay an episode, or begin with hands to be moved; ends the comparison before."""
+        return await comparisons.start(body)
+
+    @router.post("/{comparison_id}/moves")
+    @takes({JSON: KIB})
+    async def move_hands(comparison_id: str, body: Moves) -> ComparisonView:
+        """Move the hands for one chunk of actions in both worlds."""
+        return await comparisons.move(comparison_id, body)
 
     @router.post("/stop", status_code=204)
     async def stop_comparison() -> None:
@@ -320,6 +327,7 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/enrolments", "POST", scope=ENROL),
     Forwarded("episode_store", "/enrolments/{station}/revoke", "POST", scope=ENROL),
     Forwarded("acquisition", "/uploads"),
+    Forwarded("acquisition", "/faults/{fault}", "POST"),
     Forwarded("alignment", "/alignments"),
     Forwarded("alignment", "/alignments", "POST"),
     Forwarded("alignment", "/alignments/{alignment_id}"),
@@ -338,6 +346,7 @@ FORWARDED: Final = (
     Forwarded("studies", "/studies"),
     Forwarded("studies", "/studies/{name}"),
     Forwarded("studies", "/studies/{name}/rollouts"),
+    Forwarded("studies", "/studies/{name}/picture"),
 )
 
 

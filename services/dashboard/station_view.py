@@ -16,6 +16,7 @@ from dextouch.schemas import (
     RecorderSession,
     RecorderStatus,
     RobotFollowing,
+    SimulatedFault,
     StationHealth,
     StreamHealth,
     TakePrompt,
@@ -27,6 +28,8 @@ from services.dashboard.upstream import Upstream
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
 LEVELS: tuple[HealthLevel, ...] = ("OK", "WARN", "STALE", "ERROR")
+# Of the recorder's status, shown as it is.
+KEPT = {"state", "actions", "recording_id", "prompt", "session", "needs_consent"}
 # What the station finds of its computer.
 HOST_FINDINGS = {"overload", "disk", "host_suspended", "wall_clock_set"}
 
@@ -58,7 +61,7 @@ class CauseView(FrozenModel):
     message: str
     advice: str
     lasted_s: float | None
-    num_streams: int
+    streams: tuple[str, ...]
     findings: tuple[str, ...]
 
 
@@ -76,7 +79,7 @@ class RecorderView(FrozenModel):
     """State of the recorder and its available actions.
 
     `cause` is the root cause of the worst problem of the ended take and `advice` what to do about
-    it; `problems` lists all findings, worst first.
+    it; `problems` are its `num_findings`, one line a stream, worst first.
     """
 
     state: str
@@ -89,7 +92,9 @@ class RecorderView(FrozenModel):
     cause: str = ""
     advice: str = ""
     problems: tuple[str, ...] = ()
+    num_findings: int = 0
     session: RecorderSession | None = None
+    needs_consent: bool = False
 
 
 class GloveView(FrozenModel):
@@ -117,6 +122,7 @@ class StationView(FrozenModel):
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
     gloves: Mapping[str, GloveView] = {}
     following: Mapping[str, RobotFollowing] = {}
+    faults: tuple[SimulatedFault, ...] | None = None
 
 
 def trouble(error: DexTouchError, address: str) -> tuple[str, str]:
@@ -142,7 +148,7 @@ def silent_view(error: DexTouchError, address: str) -> StationView:
         message=message,
         advice=advice,
         lasted_s=None,
-        num_streams=0,
+        streams=(),
         findings=(error.message,) if error.message != message else (),
     )
     return StationView(summary="no answer", note="", causes=(cause,))
@@ -175,6 +181,7 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
             for item in station.streams
             if item.hand is not None and item.following is not None
         },
+        faults=station.faults,
     )
 
 
@@ -185,18 +192,24 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
     found = sorted(check.problems, key=lambda problem: problem.level) if check else []
     checked = [problem.message for problem in found]
     own = [message for message in recorder.problems if message not in checked]
-    problems = tuple(dict.fromkeys([*own, *checked]))
+    lines: dict[str, list[str]] = {}
+    for item in found:
+        text = item.message.removeprefix(f"{item.stream}: ")
+        if text not in lines.setdefault(item.stream, []):
+            lines[item.stream].append(text)
+    problems = (*dict.fromkeys(own), *(f"{s}: {' · '.join(texts)}" for s, texts in lines.items()))
     complete = check is None or check.complete
     cause = check.cause if check else None
     level: HealthLevel = "WARN" if complete else "ERROR"
     return RecorderView(
-        **recorder.model_dump(include={"state", "actions", "recording_id", "prompt", "session"}),
+        **recorder.model_dump(include=KEPT),
         elapsed_s=recorder.duration_s,
         level=level if problems else "OK",
         complete=complete,
         cause=cause.message if cause else next(iter(problems), ""),
         advice=cause.advice if cause else "",
         problems=problems,
+        num_findings=len({*own, *checked}),
     )
 
 
@@ -235,9 +248,8 @@ def _cause_view(cause: HealthCause, station: StationHealth) -> CauseView:
     # What the message of the cause says already needs no second line.
     says_all = len(found) == 1 and found[0][1] in cause.message
     return CauseView(
-        **cause.model_dump(include={"level", "message", "advice", "lasted_s"}),
+        **cause.model_dump(include={"level", "message", "advice", "lasted_s", "streams"}),
         key=f"{cause.code} {cause.subject}",
-        num_streams=len(cause.streams),
         findings=() if says_all else tuple(lines),
     )
 
@@ -276,9 +288,13 @@ Stage = Literal["saved", "uploading", "refused", "stored", "aligning", "aligned"
 
 
 class TakeStateView(FrozenModel):
-    """Stage of a take; `reason` says why it goes no further, or how far it is."""
+    """Stage of a take; `reason` says why it goes no further, or how far it is.
+
+    `player` is the path of what can be played of it: nothing before it is stored.
+    """
 
     recording_id: str
+    player: str = ""
     stage: Stage
     level: HealthLevel = "OK"
     reason: str = ""
@@ -290,6 +306,7 @@ class _RefusedPart(FrozenModel):
 
 
 class _Report(FrozenModel):
+    episode_id: str = ""
     num_steps: int
     duration_s: float = 0.0
     refused_parts: tuple[_RefusedPart, ...] = ()
@@ -334,7 +351,9 @@ async def _last_state(
         if upload.error is None:
             return _view(recording_id, "uploading")
         return _view(recording_id, "saved", "WARN", upload.error)
-    return await _aligned(recording_id, upload.stored_as or recording_id, alignment)
+    stored_as = upload.stored_as or recording_id
+    view = await _aligned(recording_id, stored_as, alignment)
+    return view if view.player else view.model_copy(update={"player": f"recording/{stored_as}"})
 
 
 async def _aligned(recording_id: str, stored_as: str, alignment: Upstream | None) -> TakeStateView:
@@ -349,7 +368,9 @@ async def _aligned(recording_id: str, stored_as: str, alignment: Upstream | None
         return _view(recording_id, "stored", reason="not aligned yet")
     job = jobs[-1]
     if job.state == "done":
-        return _view(recording_id, "aligned", *_reported(job.report))
+        episode_id = job.report.episode_id if job.report else ""
+        played = {"player": f"episode/{episode_id}"} if episode_id else {}
+        return _view(recording_id, "aligned", *_reported(job.report)).model_copy(update=played)
     if job.state in {"waiting", "running"}:
         share = f"{job.progress:.0%}" if job.state == "running" else "waits for its turn"
         return _view(recording_id, "aligning", reason=share)

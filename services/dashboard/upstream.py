@@ -1,5 +1,6 @@
 """HTTP client of another service, whose failures become UnavailableError."""
 
+import ssl
 import time
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -47,7 +48,13 @@ class Upstream:
         headers = {"authorization": f"Bearer {key.get_secret_value()}"} if key else {}
         limits = httpx.Limits(max_connections=8, max_keepalive_connections=4)
         client = httpx.AsyncClient(
-            base_url=url, headers=headers, timeout=timeout_s, limits=limits, trust_env=False
+            base_url=url,
+            headers=headers,
+            timeout=timeout_s,
+            limits=limits,
+            # Authorities of the system, or of SSL_CERT_FILE; no proxy settings.
+            verify=ssl.create_default_context(),
+            trust_env=False,
         )
         return Upstream(name, client)
 

@@ -1,9 +1,9 @@
 """Application of the episode store, with its threads in the background."""
 
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Final
 
 import structlog
@@ -37,25 +37,30 @@ logger = structlog.get_logger(__name__)
 ENROLMENTS_FILE = "enrolments.json"
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
 RETRY_PERIOD_S: Final = 30.0
+TRASH_PERIOD_S: Final = 3600.0
 # How soon a deletion reaches an upload that nobody continues.
 WATCH_PERIOD_S: Final = 1.0
 
 
-class PeriodicThread(ABC):
-    """Calls `work` again and again, between `start` and `stop`.
+class PeriodicThread:
+    """Calls `work` once a period from `start` on; `stop` waits for it, at most `patience_s`.
 
     A failure, such as a bucket that cannot be reached or a read-only folder, is logged as `event`
     when it begins or changes; the service still serves everything else.
     """
 
-    def __init__(self, event: str, period_s: float) -> None:
-        self._event, self._period_s = event, period_s
+    def __init__(
+        self,
+        event: str,
+        period_s: float,
+        work: Callable[[], None],
+        *,
+        patience_s: float | None = None,
+    ) -> None:
+        self._event, self._period_s, self._work = event, period_s, work
+        self._patience_s = patience_s
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=event, daemon=True)
-
-    @abstractmethod
-    def work(self) -> None:
-        """What is done once a period."""
 
     def start(self) -> None:
         """Begin in the background."""
@@ -64,13 +69,13 @@ class PeriodicThread(ABC):
     def stop(self) -> None:
         """End the thread, after the work that is under way."""
         self._stopping.set()
-        self._thread.join()
+        self._thread.join(self._patience_s)
 
     def _run(self) -> None:
         problem = ""
         while not self._stopping.is_set():
             try:
-                self.work()
+                self._work()
                 problem = ""
             except DexTouchError as error:
                 if error.message != problem:
@@ -88,7 +93,7 @@ class PendingUploads(PeriodicThread):
     """Uploads what waits in a store's outbox, and removes the stages of killed writers once."""
 
     def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
-        super().__init__("uploads_not_completed", period_s)
+        super().__init__("uploads_not_completed", period_s, self.work)
         self._store, self._is_swept = store, False
 
     def work(self) -> None:
@@ -106,6 +111,13 @@ class PendingUploads(PeriodicThread):
                 logger.info("unfinished_writes_removed", count=removed)
 
 
+def purge_old_trash(store: EpisodeStore, keep_days: float | None) -> None:
+    """Permanently delete what has been in the trash of a store in a folder for some days."""
+    if keep_days is not None and store.folders:
+        for entry in store.purge(older_than_s=86_400.0 * keep_days):
+            logger.info("trash_purged", kind=entry.kind, id=entry.item_id)
+
+
 class DeletionWatch(PeriodicThread):
     """Drops uploads of deleted takes that nobody continues, soon after the deletion.
 
@@ -118,7 +130,7 @@ class DeletionWatch(PeriodicThread):
     def __init__(
         self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
     ) -> None:
-        super().__init__("fail_deletions", WATCH_PERIOD_S)
+        super().__init__("fail_deletions", WATCH_PERIOD_S, self.work)
         self._records, self._drop, self._ended = records, drop, ended
         self._revision = ""
 
@@ -129,23 +141,6 @@ class DeletionWatch(PeriodicThread):
             for recording_id in self._drop():
                 self._ended(recording_id)
             self._revision = revision
-
-
-class CatalogCheck(PeriodicThread):
-    """Compares a catalog with its store: at once, as a large one takes time, and now and then."""
-
-    def __init__(self, catalog: Catalog) -> None:
-        super().__init__("catalog_not_checked", catalog.index.check_period_s)
-        self._index = catalog.index
-
-    def work(self) -> None:
-        """Check once."""
-        self._index.check()
-
-    def stop(self) -> None:
-        """End soon: reading a large store takes minutes, and can be interrupted anywhere."""
-        self._stopping.set()
-        self._thread.join(timeout=2.0)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
@@ -160,21 +155,29 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     )
     metrics = UploadMetrics(limits, catalog.num_items())
     deletions = DeletionRecords(store.root)
-    watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
-    pending, check = PendingUploads(store), CatalogCheck(catalog)
+    index = catalog.index
+    threads = (
+        PendingUploads(store),
+        # Reading a large store takes minutes, and can be interrupted anywhere.
+        PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0),
+        DeletionWatch(deletions, ingest.drop_deleted, limits.end),
+        PeriodicThread(
+            "trash_not_purged",
+            TRASH_PERIOD_S,
+            partial(purge_old_trash, store, settings.keep_trash_days),
+        ),
+    )
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        pending.start()
-        check.start()
-        watch.start()
+        for thread in threads:
+            thread.start()
         try:
             yield
         finally:
-            pending.stop()
-            check.stop()
-            watch.stop()
+            for thread in threads:
+                thread.stop()
             ingest.close()
 
     app = create_service_app(

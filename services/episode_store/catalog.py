@@ -4,10 +4,10 @@ import json
 import sqlite3
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -66,7 +66,7 @@ FIRST_PAGE: Final = Page()
 # Limit of the values of a field in one response.
 MAX_VALUES: Final = 500
 MAX_NODES: Final = 200
-SECONDS_AN_HOUR: Final = 3600.0
+HOUR_NS: Final = 3600 * 10**9
 DAY_US: Final = 24 * 3600 * 10**6
 # Larger limits overflow SQLite's numbers once they are added to an offset.
 MAX_LIMIT: Final = 1 << 60
@@ -89,6 +89,18 @@ _PRODUCTS: Final = """SELECT i.row, p.id
   CROSS JOIN item p ON p.row = l.row AND p.kind = 'episode' AND p.origin <> 'imagined'
   WHERE i.kind = 'recording' AND i.row IN (SELECT value FROM json_each(?))
   ORDER BY p.id, l.position"""
+
+
+class ListedRow(NamedTuple):
+    """An item as a command lists it; `size` are steps of an episode, samples of a recording."""
+
+    id: str
+    task: str
+    domain: str
+    origin: str
+    size: int
+    success: bool | None
+    recovered: bool
 
 
 @dataclass(frozen=True)
@@ -145,6 +157,13 @@ class Catalog:
             return tuple(model.model_validate_json(bodies[row]) for row, _ in found), facts
 
         return self.index.read(read)
+
+    def rows(self, kind: Kind, query: CatalogFilter) -> list[ListedRow]:
+        """All matching items of a kind in the order of ids, far faster than as summaries."""
+        where = Condition(terms=["i.kind = ?"], values=[kind])
+        query.restrict(where)
+        text = f"SELECT {', '.join(ListedRow._fields)} FROM item i WHERE {where.sql} ORDER BY i.id"
+        return self.index.read(lambda c: list(map(ListedRow._make, c.execute(text, where.values))))
 
     def values(self) -> CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
@@ -234,16 +253,16 @@ class Catalog:
 
     def hours(self, query: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
-        columns = "count(*), coalesce(sum(i.success), 0), sum(i.duration_s)"
+        columns = "sum(i.num), coalesce(sum(i.success * i.num), 0), sum(i.duration_ns)"
         by = ("task", "domain", "origin")
         rows = [
             HoursRow(
                 **dict(zip(by, names, strict=True)),
                 num_episodes=count,
                 num_successes=num_successes,
-                hours=seconds / SECONDS_AN_HOUR,
+                hours=duration_ns / HOUR_NS,
             )
-            for *names, count, num_successes, seconds in self._sums(
+            for *names, count, num_successes, duration_ns in self._sums(
                 [f"i.{name}" for name in by], columns, query
             )
         ]
@@ -261,9 +280,9 @@ class Catalog:
             first_us = query.utc_offset_min * 60 * 10**6 - microseconds(EARLIEST)
             column = f"(i.at_us + {first_us}) / {DAY_US}"
         found: defaultdict[Any, dict[str | None, tuple[int, float]]] = defaultdict(dict)
-        sums = self._sums((column, "i.verdict"), "count(*), sum(i.duration_s)", query)
-        for value, verdict, count, seconds in sums:
-            found[value][verdict] = count, seconds / SECONDS_AN_HOUR
+        sums = self._sums((column, "i.verdict"), "sum(i.num), sum(i.duration_ns)", query)
+        for value, verdict, count, duration_ns in sums:
+            found[value][verdict] = count, duration_ns / HOUR_NS
         rows = []
         # SQLite sorts episodes without a value first.
         for value in sorted(found, key=lambda value: value is None):
@@ -282,8 +301,10 @@ class Catalog:
         """Sums over matching episodes by values, in their order."""
         where = Condition(terms=["i.kind = 'episode'"])
         query.restrict(where)
-        names = ", ".join(by)
-        text = f"SELECT {names}, {columns} FROM item i WHERE {where.sql} "
+        names, rows = ", ".join(by), "tally"
+        if not where.is_tallied or "i.at_us" in names:
+            rows = "(SELECT *, 1 AS num, duration_s * 1e9 AS duration_ns FROM item)"
+        text = f"SELECT {names}, {columns} FROM {rows} i WHERE {where.sql} "
         text += f"GROUP BY {names} ORDER BY {names}"
         return self.index.read(lambda connection: connection.execute(text, where.values).fetchall())
 
@@ -305,21 +326,17 @@ class _Order:
     def columns(self) -> str:
         """Columns to order by."""
         down = " DESC" if self.page.descending else ""
-        names = (self.name,) if self.page.sort == "id" else (self.key, self.name)
-        return ", ".join(name + down for name in names)
+        return f"n{down}" if self.page.sort == "id" else f"k{down}, n{down}"
 
-    def go_on(self, where: Condition) -> Condition:
-        """Only what comes after the page's cursor."""
+    def go_on(self, where: Condition, place: tuple[str, str]) -> tuple[str, list[object]]:
+        """The condition and parameters of rows after the page's cursor, by their key and name."""
         if self.page.after is None:
-            return where
-        later = replace(where, terms=[*where.terms], values=[*where.values])
+            return where.sql, where.values
         sign = "<" if self.page.descending else ">"
-        place = place_of(self.page.after, descending=self.page.descending)
-        if self.page.sort == "id" and not place[0]:
-            later.add(f"{self.name} {sign} ?", place[1])
-        else:
-            later.add(f"({self.key}, {self.name}) {sign} (?, ?)", *place)
-        return later
+        after = place_of(self.page.after, descending=self.page.descending)
+        if self.page.sort == "id" and not after[0]:
+            return f"{where.sql} AND {place[1]} {sign} ?", [*where.values, after[1]]
+        return f"{where.sql} AND ({', '.join(place)}) {sign} (?, ?)", [*where.values, *after]
 
 
 def _page(
@@ -327,14 +344,23 @@ def _page(
 ) -> tuple[list[Found], dict[str, Any]]:
     """The rows of a page, and the number of all that match with the cursor to go on after."""
     limit = min(limit, MAX_LIMIT)
-    count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
-    (num_matching,) = connection.execute(count, where.values).fetchone()
-    later = order.go_on(where)
-    rows = connection.execute(
-        f"SELECT i.row, i.aligned, {order.key}, {order.name} FROM {where.tables} WHERE {later.sql} "
-        f"ORDER BY {order.columns} LIMIT ? OFFSET ?",
-        [*later.values, limit + 1, min(order.page.offset, MAX_LIMIT)],
-    ).fetchall()
+    found = f"SELECT i.row, i.aligned, {order.key} AS k, {order.name} AS n FROM {where.tables}"
+    place = [limit + 1, min(order.page.offset, MAX_LIMIT)]
+    if not where.is_rare:
+        count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
+        if where.is_tallied:
+            count = f"SELECT coalesce(sum(num), 0) FROM tally i WHERE {where.sql}"
+        (num_matching,) = connection.execute(count, where.values).fetchone()
+        later, values = order.go_on(where, (order.key, order.name))
+        text = f"{found} WHERE {later} ORDER BY {order.columns} LIMIT ? OFFSET ?"
+        rows = connection.execute(text, [*values, *place]).fetchall()
+    else:
+        # One scan for both: finding the page takes all rows, too.
+        later, values = order.go_on(Condition(terms=["TRUE"]), ("k", "n"))
+        text = f"""WITH m AS MATERIALIZED ({found} WHERE {where.sql})
+          SELECT count(*), NULL, NULL, NULL FROM m UNION ALL SELECT * FROM (
+            SELECT * FROM m WHERE {later} ORDER BY {order.columns} LIMIT ? OFFSET ?)"""
+        (num_matching, *_), *rows = connection.execute(text, [*where.values, *values, *place])
     next_after = cursor_of(rows[limit - 1][2:]) if len(rows) > limit else None
     facts = {"num_matching": num_matching, "next_after": next_after}
     aligned = (lambda row: row[1]) if where.of_takes else (lambda _: None)

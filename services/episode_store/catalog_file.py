@@ -20,7 +20,7 @@ from services.episode_store.filters import NO_WEIGHT, SORT_COLUMNS
 logger = structlog.get_logger(__name__)
 
 # To be incremented with any change of the tables, or of what is read of an item.
-VERSION: Final = 2
+VERSION: Final = 3
 # How long a process waits for another one that writes: longer than linking 100,000 items takes.
 BUSY_S: Final = 30.0
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -35,6 +35,26 @@ _INDEXES: Final = "".join(
     f"CREATE INDEX take_{name} ON item({key}, name) WHERE is_take;"
     for name, key in ((name, column.format("")) for name, column in SORT_COLUMNS.items())
 )
+# What lists without other conditions are counted by, and hours are summed by.
+_TALLIED: Final = (
+    "kind", "is_take", "task", "operator", "station", "domain", "origin", "success", "recovered",
+    "verdict", "take_verdict",
+)  # fmt: skip
+
+
+def _tallied(row: str, sign: str) -> str:
+    """Statements of a trigger that add a row of `item` to its sums, or take it away."""
+    names = ", ".join(_TALLIED)
+    values = ", ".join(f"{row}.{name}" for name in _TALLIED)
+    same = " AND ".join(f"{name} IS {row}.{name}" for name in _TALLIED)
+    duration_ns = f"CAST(round({row}.duration_s * 1e9) AS INTEGER)"
+    return f"""INSERT INTO tally ({names}) SELECT {values}
+      WHERE NOT EXISTS (SELECT 1 FROM tally WHERE {same});
+    UPDATE tally SET num = num {sign} 1, duration_ns = duration_ns {sign} {duration_ns}
+      WHERE {same};
+    DELETE FROM tally WHERE {same} AND num = 0;"""
+
+
 # `result` has what edits made of an item, `stands` whether one of these is stored.
 # Columns after `is_dirty` are derived from other items (`catalog_rows.relink`). Triggers mark what
 # a change of an item alters elsewhere: its sources, what was made from it, and its group.
@@ -45,7 +65,8 @@ CREATE TABLE item (
   task TEXT NOT NULL, operator TEXT, station TEXT, domain TEXT NOT NULL, origin TEXT NOT NULL,
   success INTEGER, recovered INTEGER NOT NULL, trace_id TEXT, complete INTEGER NOT NULL,
   at_us INTEGER, at_key TEXT NOT NULL, duration_s REAL NOT NULL, duration_key TEXT NOT NULL,
-  num_bytes INTEGER, beyond_limit INTEGER NOT NULL, in_doubt INTEGER NOT NULL,
+  size INTEGER NOT NULL, num_bytes INTEGER,
+  beyond_limit INTEGER NOT NULL, in_doubt INTEGER NOT NULL,
   is_clickable INTEGER NOT NULL, own_verdict TEXT, earlier_verdict TEXT,
   is_superseded INTEGER NOT NULL, figures BLOB NOT NULL, grp INTEGER NOT NULL,
   text TEXT NOT NULL, is_dirty INTEGER NOT NULL DEFAULT 1,
@@ -69,6 +90,12 @@ CREATE TABLE grp (
   number INTEGER PRIMARY KEY, task TEXT, domain TEXT, origin TEXT, kind TEXT,
   is_stale INTEGER NOT NULL DEFAULT 1, num_items INTEGER NOT NULL DEFAULT 0, spread BLOB,
   UNIQUE (task, domain, origin, kind));
+CREATE TABLE tally (
+  kind TEXT NOT NULL, is_take INTEGER NOT NULL, task TEXT NOT NULL, operator TEXT, station TEXT,
+  domain TEXT NOT NULL, origin TEXT NOT NULL, success INTEGER, recovered INTEGER NOT NULL,
+  verdict TEXT, take_verdict TEXT,
+  num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
+CREATE INDEX tally_key ON tally({", ".join(_TALLIED)});
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
 CREATE INDEX result_id ON result(id);
@@ -91,12 +118,20 @@ CREATE TRIGGER item_gone AFTER DELETE ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM result WHERE id = old.id) AND kind = old.kind;
   UPDATE grp SET is_stale = 1 WHERE number = old.grp;
+  {_tallied("old", "-")}
   DELETE FROM body WHERE row = old.row;
   DELETE FROM result WHERE row = old.row;
   DELETE FROM lineage WHERE row = old.row;
   DELETE FROM figure WHERE row = old.row AND number IN (SELECT number FROM figure_name);
 END;
+CREATE TRIGGER item_judged AFTER UPDATE OF is_take, verdict, take_verdict ON item
+  WHEN (old.is_take, old.verdict, old.take_verdict)
+    IS NOT (new.is_take, new.verdict, new.take_verdict) BEGIN
+  {_tallied("old", "-")}
+  {_tallied("new", "+")}
+END;
 CREATE TRIGGER item_made AFTER INSERT ON item BEGIN
+  {_tallied("new", "+")}
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = new.id AND kind = new.kind);
   UPDATE item SET is_dirty = 1

@@ -118,6 +118,9 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
         "at_us": None if at is None else microseconds(at),
         "at_key": time_key(at),
         "duration_key": number_key(item.duration_s),
+        "size": summary.num_steps
+        if isinstance(summary, EpisodeSummary)
+        else sum(summary.num_samples.values()),
         "num_bytes": summary.num_bytes if isinstance(summary, RecordingSummary) else None,
         "beyond_limit": bool(item.findings),
         "in_doubt": bool(item.time_doubts),

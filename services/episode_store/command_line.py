@@ -48,24 +48,17 @@ from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
-    EpisodeList,
-    EpisodeSummary,
     RecordingAttributes,
-    RecordingList,
-    RecordingSummary,
     SceneObject,
     SceneObjects,
     json_ready,
     load_object_clicks,
 )
 from dextouch.serving import configure_logging, load_settings
-from services.episode_store.catalog import Catalog
+from services.episode_store.catalog import Catalog, ListedRow
 from services.episode_store.command_context import Context, Outcome
-from services.episode_store.deletions import deletion_statuses
-from services.episode_store.editing_commands import merge, note, relabel, trim
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
-from services.episode_store.settings import EpisodeStoreSettings
 
 EXIT_DAMAGED = 1
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
@@ -81,10 +74,26 @@ def main(argv: Sequence[str]) -> int:
     options = store_parser().parse_args(list(argv))
     # Items that the catalog leaves out are reported on stderr.
     configure_logging(service="episode_store", log_format="auto", level="warning")
-    url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options))
+    url = options.store or _configured_url()
+    run = _COMMANDS.get(options.command) or _editing_command(options.command)
+    result, status = run(Context(EpisodeStore(url), url, options))
     write_result(options.json, result)
     return status
+
+
+# Imported where they are needed: `list` should not wait for FastAPI and all that edits items.
+def _configured_url() -> str:
+    from services.episode_store.settings import EpisodeStoreSettings
+
+    return load_settings(EpisodeStoreSettings, []).store_url
+
+
+def _editing_command(name: str) -> Callable[[Context], Outcome]:
+    from services.episode_store import editing_commands
+
+    of_name = "restore_of_backup" if name == "restore-backup" else name
+    command: Callable[[Context], Outcome] = getattr(editing_commands, of_name)
+    return command
 
 
 def readable_size(num_bytes: int) -> str:
@@ -132,30 +141,19 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
     """List matching items of a kind; returns them and the number of all."""
     options = context.options
     query = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    if kind == "episode":
-        episodes = catalog.episodes(query, limit=sys.maxsize)
-        for row in episodes.episodes:
-            facts = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
-            say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {facts}")
-        return _result_of(context, episodes), catalog.index.num_items(kind)
-    recordings = catalog.recordings(query, limit=sys.maxsize)
-    for each in recordings.recordings:
-        facts = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
-        say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {facts}")
-    return _result_of(context, recordings), catalog.index.num_items(kind)
+    rows = catalog.rows(kind, query)
+    for row in rows:
+        is_episode = kind == "episode"
+        size = f"{row.origin}  {row.size} steps" if is_episode else f"{row.size} samples"
+        say(f"{row.id}  {kind}  {row.task}  {row.domain}  {size}  {_outcome(row)}")
+    result: dict[str, Any] = {"num_matching": len(rows)}
+    if context.options.json is not None:
+        read = catalog.episodes if kind == "episode" else catalog.recordings
+        result = json_ready(read(query, limit=sys.maxsize))
+    return result, catalog.index.num_items(kind)
 
 
-def _result_of(context: Context, found: EpisodeList | RecordingList) -> dict[str, Any]:
-    # Of many items it takes as long as listing them.
-    if context.options.json is None:
-        return {"num_matching": found.num_matching}
-    result: dict[str, Any] = json_ready(found)
-    return result
-
-
-def _outcome(
-    row: EpisodeSummary | RecordingSummary | EpisodeAttributes | RecordingAttributes,
-) -> str:
+def _outcome(row: ListedRow | EpisodeAttributes | RecordingAttributes) -> str:
     return _OUTCOMES[row.success] + "  recovered" * row.recovered
 
 
@@ -178,8 +176,10 @@ def show(context: Context) -> Outcome:
     reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
     contents = open_contents(files, kind)
-    streams = {}
-    rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
+    streams, total_per_hour = {}, 0
+    rows: list[tuple[str, ...]] = [
+        ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
+    ]
     for name, descriptor in reader.streams.items():
         entry = contents.entries[name]
         codec = entry.attributes.get("encoding", entry.codec)
@@ -189,7 +189,10 @@ def show(context: Context) -> Outcome:
         shards = [f"{one}/{shard_path(len(contents.entries[one].shape))}" for one in arrays]
         num_bytes = sum(files.source(shard).size() or 0 for shard in shards)
         num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
+        per_hour = round(3600 * rate_hz * num_bytes / max(1, num_samples))
+        total_per_hour += per_hour
         streams[name] = {
+            "bytes_per_hour": per_hour,
             "rate_hz": rate_hz,
             "num_samples": num_samples,
             "num_gaps": num_gaps,
@@ -197,8 +200,9 @@ def show(context: Context) -> Outcome:
             "codec": codec,
             "encoder": entry.encoder,
         }
-        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
-        rows.append((name, *numbers, codec, entry.encoder or ""))
+        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps))
+        sizes = (readable_size(num_bytes), readable_size(per_hour))
+        rows.append((name, *numbers, *sizes, codec, entry.encoder or ""))
     result = {
         "attributes": json_ready(reader.attributes),
         "num_samples": {name: reader.num_samples(name) for name in reader.streams},
@@ -212,6 +216,7 @@ def show(context: Context) -> Outcome:
         say(f"made from {source.kind} {source.id}  {source.operation}".rstrip())
     for line in table(rows):
         say(line)
+    say(f"{readable_size(total_per_hour)} per hour")
     say(f"content {reader.content_sha256}")
     return result, 0
 
@@ -404,6 +409,8 @@ def _outstanding_line(station: str, recordings: Sequence[str], *, has_answered: 
 
 def deletions(context: Context) -> Outcome:
     """List permanent deletions and what stations have yet to remove."""
+    from services.episode_store.deletions import deletion_statuses
+
     options, records = context.options, DeletionRecords(context.need_local_root())
     if options.readmit is not None:
         if not records.readmit(options.readmit):
@@ -497,8 +504,4 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "restore": restore,
     "purge": purge,
     "repair": repair,
-    "trim": trim,
-    "relabel": relabel,
-    "merge": merge,
-    "note": note,
 }

@@ -1,5 +1,6 @@
-"""Commands of `dextouch store` that edit items: trim, relabel, merge of stores, notes."""
+"""Commands of `dextouch store` that edit or copy items: trim, relabel, merge, backups, notes."""
 
+from collections import Counter
 from dataclasses import asdict
 from typing import Any
 
@@ -8,13 +9,16 @@ from pydantic import ValidationError
 from dextouch.command_line import say
 from dextouch.episodes import EpisodeStore, Kind
 from dextouch.episodes.editing import (
+    BackupReport,
     EditOptions,
     MergeOptions,
     MergeReport,
     add_note,
+    back_up,
     merge_stores,
     relabel_item,
     remove_note,
+    restore_backup,
     steps_between,
     trim_episode,
     trim_recording,
@@ -132,6 +136,35 @@ def merge(context: Context) -> Outcome:
     what = "would be copied" if options.dry_run else "copied"
     say(f"{counts['copied']} {what}, {counts['there']} there, {counts['refused']} refused")
     return {"items": [asdict(r) for r in reports], **counts}, int(counts["refused"] > 0)
+
+
+def backup(context: Context) -> Outcome:
+    """Bring a backup of the store up to date."""
+    options, target = context.options, EpisodeStore(context.options.target)
+    accept = options.accept_deletions
+    reports = back_up(context.store, target, accept_deletions=accept, on_item=_show_backed_up)
+    return _backup_outcome(reports, f"backup of {context.url} in {target.url}")
+
+
+def restore_of_backup(context: Context) -> Outcome:
+    """Restore the store from a backup, and verify it."""
+    source = EpisodeStore(context.options.source)
+    reports = restore_backup(source, context.store, on_item=_show_backed_up)
+    return _backup_outcome(reports, f"{context.url} restored from {source.url} and verified")
+
+
+def _show_backed_up(report: BackupReport) -> None:
+    if report.action != "there":
+        texts = (report.item_id, report.kind, report.action, report.reason)
+        say("  ".join(text for text in texts if text))
+
+
+def _backup_outcome(reports: list[BackupReport], what: str) -> Outcome:
+    counts = Counter[str](report.action for report in reports)
+    failed = counts["refused"] + counts["damaged"]
+    listed = ", ".join(f"{count} {action}" for action, count in sorted(counts.items()))
+    say(f"{what}: {listed or 'nothing to copy'}" + " - NOT COMPLETE" * bool(failed))
+    return {"items": [asdict(r) for r in reports], **counts}, int(failed > 0)
 
 
 def note(context: Context) -> Outcome:

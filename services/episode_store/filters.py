@@ -31,7 +31,7 @@ SORT_COLUMNS: Final = {
     "operator": "coalesce({}operator, '')", "station": "coalesce({}station, '')",
 }  # fmt: skip
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_FIGURE = "SELECT value FROM figure JOIN figure_name USING (number) WHERE name = ?"
+_FIGURE = "SELECT value FROM figure WHERE number = (SELECT number FROM figure_name WHERE name = ?)"
 EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
@@ -40,10 +40,13 @@ _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_
 class Condition:
     """An SQL condition on a row `i` of the catalog with its parameters.
 
-    In the list of takes (`of_takes`) a recording's last episode is the row `a`.
+    In the list of takes (`of_takes`) a recording's last episode is the row `a`. With `is_tallied`
+    its terms have only columns of `tally`; few rows match one that `is_rare`.
     """
 
     of_takes: bool = False
+    is_tallied: bool = True
+    is_rare: bool = False
     tables: str = "item i"
     terms: list[str] = field(default_factory=list)
     values: list[object] = field(default_factory=list)
@@ -52,8 +55,9 @@ class Condition:
         """Make the last episode of a take known to the terms."""
         self.tables = "item i LEFT JOIN item a ON a.row = i.aligned"
 
-    def add(self, term: str, *values: object) -> None:
+    def add(self, term: str, *values: object, is_tallied: bool = False) -> None:
         """A further term that must hold."""
+        self.is_tallied &= is_tallied
         self.terms.append(term)
         self.values += values
 
@@ -106,9 +110,9 @@ class CatalogFilter(FrozenModel):
         """Add what must hold of a matching row."""
         for name in _COMPARED:
             if (value := getattr(self, name, None)) is not None:
-                to.add(f"i.{name} = ?", value)
+                to.add(f"i.{name} = ?", value, is_tallied=name != "trace_id")
         if self.outcome is not None:
-            to.add("i.success IS ?", _SUCCESS[self.outcome])
+            to.add("i.success IS ?", _SUCCESS[self.outcome], is_tallied=True)
         if self.text:
             # `text` of a take is that of its recording and of its episode.
             column = "i.text"
@@ -116,6 +120,7 @@ class CatalogFilter(FrozenModel):
                 to.join_episode()
                 column = "i.text || coalesce(char(10) || a.text, '')"
             to.add(f"instr({column}, ?) > 0", self.text.casefold())
+            to.is_rare = True
         for name, least in map(quality_bound, self.min_quality):
             if least > -math.inf:
                 figure = f"({_FIGURE} AND row = i.row)"
@@ -159,7 +164,7 @@ class ItemFilter(CatalogFilter):
         prefix = "take_" if to.of_takes else ""
         if self.review is not None:
             verdict = None if self.review == "not_reviewed" else self.review
-            to.add(f"i.{prefix}verdict IS ?", verdict)
+            to.add(f"i.{prefix}verdict IS ?", verdict, is_tallied=True)
         if self.flagged is not None:
             to.add(f"i.{prefix}weight {'>' if self.flagged else '='} ?", NO_WEIGHT)
         if self.id:

@@ -208,8 +208,10 @@ class Enrolments:
         shown.sort(key=lambda one: one.requested_at, reverse=True)
         return StationEnrolments(enrolments=tuple(shown), needs_key=self._access.has_keys)
 
-    def issue(self, station: str, *, by: str) -> EnrolmentToken:
+    def issue(self, station: str, *, by: str, renew: bool = False) -> EnrolmentToken:
         """Issue a token for a station, in place of an earlier unused one.
+
+        With `renew` the key that the station has stays valid beside the new one.
 
         Raises:
             ConflictError: the store needs no keys, or has a key of this name.
@@ -220,10 +222,13 @@ class Enrolments:
                 "before enrolling stations (docs/access.md)"
             )
         with self._lock:
-            if station in self._access.names:
+            is_enrolled = any(
+                (one.station, one.state) == (station, "enrolled") for one in self._kept
+            )
+            if station in self._access.names and not (renew and is_enrolled):
                 raise ConflictError(
-                    f"station {station!r}: the store has a key of this name; revoke it, or choose "
-                    "another name",
+                    f"station {station!r}: the store has a key of this name; renew or revoke it, "
+                    "or choose another name",
                     station=station,
                 )
             token, now = secrets.token_urlsafe(NUM_SECRET_BYTES), datetime.now(UTC)
@@ -268,8 +273,10 @@ class Enrolments:
         logger.info("enrol_station", station=kept.station, client=client)
         return StationKey(station=kept.station, key=key)
 
-    def revoke(self, station: str, *, by: str) -> None:
-        """Refuse the key of a station from now on, or its unused token.
+    def revoke(self, station: str, *, by: str, former: bool = False) -> None:
+        """Refuse the keys of a station from now on, or its unused token.
+
+        With `former` its newest key stays valid.
 
         Raises:
             NotFoundError: the station has neither.
@@ -277,19 +284,17 @@ class Enrolments:
                 service; a repetition tries to save this again.
         """
         with self._lock:
-            num_unused = self._forget_unused(station)
+            num_unused = 0 if former else self._forget_unused(station)
+            valid = [o for o in self._kept if (o.station, o.state) == (station, "enrolled")]
+            ended = valid[:-1] if former else valid
+            end = {"state": "revoked", "revoked_at": datetime.now(UTC), "revoked_by": by}
             revoked = tuple(
-                one.model_copy(
-                    update={"state": "revoked", "revoked_at": datetime.now(UTC), "revoked_by": by}
-                )
-                if one.station == station and one.state == "enrolled"
-                else one
-                for one in self._kept
+                one.model_copy(update=end) if one in ended else one for one in self._kept
             )
             if revoked == self._kept and not num_unused and self._is_saved:
                 raise NotFoundError(
-                    f"station {station!r}: it has no enrolled key; keys of the setting api_keys "
-                    "are removed there",
+                    f"station {station!r}: it has no {'former ' * former}enrolled key; keys of the "
+                    "setting api_keys are removed there",
                     station=station,
                 )
             # Before the file, so that a full disk does not leave the key valid.
@@ -375,7 +380,7 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
     ) -> EnrolmentToken:
         """Issue a one-time token for a station, valid for 15 minutes."""
         response.headers["cache-control"] = "no-store"
-        return enrolments.issue(body.station, by=by)
+        return enrolments.issue(body.station, by=by, renew=body.renew)
 
     @router.post("/exchange", status_code=201)
     @takes({JSON: KIB}, needs_key=False)
@@ -392,9 +397,11 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
             raise
 
     @router.post("/{station}/revoke")
-    def revoke_enrolment(station: str, by: Annotated[str, MAY_ENROL]) -> StationEnrolments:
-        """Refuse the key of a station from now on, or its unused token."""
-        enrolments.revoke(station, by=by)
+    def revoke_enrolment(
+        station: str, by: Annotated[str, MAY_ENROL], *, former: bool = False
+    ) -> StationEnrolments:
+        """Refuse the keys of a station from now on, or its unused token; or its `former` keys."""
+        enrolments.revoke(station, by=by, former=former)
         return enrolments.listing()
 
     return router

@@ -73,6 +73,7 @@ def store_parser() -> argparse.ArgumentParser:
         "--from", dest="source", metavar="URL", help="intact copy of the store to repair from"
     )
     _add_edits(commands, kind)
+    _add_backups(commands, shared)
     does = "move items to the trash, or delete them permanently"
     _add_delete(_command(commands, kind, "delete", does, "take-7 take-8"))
     _add_deletions(_command(commands, shared, "deletions", _DELETIONS))
@@ -151,6 +152,22 @@ def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: Comm
     merge.add_argument(
         "--rename", action="store_true", help="give items a new id where it is taken"
     )
+
+
+def _add_backups(
+    commands: "argparse._SubParsersAction[CommandParser]", shared: CommandParser
+) -> None:
+    does = "bring a backup up to date, while the store is in use"
+    backup = _command(commands, shared, "backup", does, "/mnt/backup/store")
+    backup.add_argument("target", metavar="TO", help="folder on another disk, or s3://…")
+    backup.add_argument(
+        "--accept-deletions",
+        action="store_true",
+        help="also if more than half of the backup is gone from the store",
+    )
+    does = "restore a store from its backup, and verify it"
+    restoring = _command(commands, shared, "restore-backup", does, "/mnt/backup/store")
+    restoring.add_argument("source", metavar="FROM", help="the backup")
 
 
 def _add_dry_run(command: argparse.ArgumentParser) -> None:

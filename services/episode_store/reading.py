@@ -26,7 +26,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
-from dextouch.hands.actions import ACTION_DIM, poses_from_actions
+from dextouch.hands.actions import ACTION_DIM, action_names, poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.images import encode_jpeg
 from dextouch.schemas import (
@@ -243,13 +243,17 @@ def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
             f"{stream}: got values of shape {reader.streams[stream].shape}, "
             f"expected ({ACTION_DIM},)"
         )
-    if (about.domain, about.origin) == ("human", "twin"):
+    if _is_of_human_hand(reader):
         raise InvalidInputError(
             f"episode {about.episode_id!r}: the actions of a person in the twin hold the joint "
             "angles of the human hand, expected those of the robot hand; align its recording"
         )
     read = reader.read(stream, query.start_ns, query.stop_ns)
     return pack({"action_kind": query.action_kind}, _points(reader, read.t_ref_ns, read.values))
+
+
+def _is_of_human_hand(reader: EpisodeReader) -> bool:
+    return (reader.attributes.domain, reader.attributes.origin) == ("human", "twin")
 
 
 def _points(
@@ -371,6 +375,12 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     if stream.name in TOUCH_STREAMS:
         measured = measured_taxels(calibration, num_taxels)
         taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
+    is_action = stream.name in STREAMS.values() and stream.shape == (ACTION_DIM,)
+    components = (
+        action_names(has_robot_joints=not _is_of_human_hand(reader))
+        if is_action and isinstance(reader, EpisodeReader)
+        else ()
+    )
     return PlayedStream(
         name=stream.name,
         kind=stream.kind,
@@ -389,6 +399,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
+        components=tuple(components),
         layout=stream.layout,
     )
 

@@ -60,6 +60,11 @@ class EpisodeStoreSettings(ServiceSettings):
         ge=1,
         description="bytes of one station, unfinished and finished; more are refused with 507",
     )
+    keep_trash_days: float | None = Field(
+        default=None,
+        ge=0,
+        description="days until what is in the trash is permanently deleted; otherwise it stays",
+    )
     commit_in_process: bool = Field(
         default=True, description="commit finished recordings in a child process"
     )

@@ -260,7 +260,7 @@ def milestone_areas(
     """Area under the ROC curve of every task and milestone with both outcomes."""
     areas: dict[tuple[str, str], float] = {}
     for task, names in probe.shape.milestones.items():
-        mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
+        mine = [e for e in _seen(episodes, task) if e.event_times_s is not None]
         if not mine:
             continue
         odds = probe.log_odds([_as_seen(e.final) for e in mine])
@@ -325,9 +325,18 @@ def final_endings(
     episodes: Sequence[EndingEpisode], task: str, kind: str
 ) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
     """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
-    mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
+    mine = [e for e in _seen(episodes, task) if e.imagined == (kind == IMAGINED)]
     success = np.array([e.success for e in mine], dtype=bool)
     return [_as_seen(e.final) for e in mine], success
+
+
+def _seen(episodes: Sequence[EndingEpisode], task: str) -> list[EndingEpisode]:
+    """Those of a task whose final ending a probe can be given.
+
+    True endings are seen without poses of objects, so that nothing is left of those without images.
+    """
+    mine = [e for e in episodes if e.task == task]
+    return [e for e in mine if e.imagined or e.final.images is not None]
 
 
 def _as_seen(ending: Ending) -> Ending:

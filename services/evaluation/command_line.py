@@ -16,6 +16,7 @@ from dextouch.serving import load_settings
 from services.evaluation.bundled_policies import bundled_policy, training_starts_of
 from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
+from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
 from services.evaluation.policies.outside import load_policies
@@ -130,18 +131,18 @@ def run_evaluation(arguments: list[str]) -> int:
     )
     log = ResultLog(settings.results_path())
     with ExitStack() as connections:
+        real = opened(settings.real, connections)
+        imagined = {n: opened(world, connections) for n, world in settings.imagined.items()}
         report = evaluate(
-            real=opened(settings.real, connections),
-            imagined={n: opened(world, connections) for n, world in settings.imagined.items()},
-            policies=policies,
-            plan=plan,
-            probe=probe,
-            keep=log.keep,
+            real=real, imagined=imagined, policies=policies, plan=plan, probe=probe, keep=log.keep
         )
-    figures = report.to_report()
-    write_result(settings.json_path, figures, allow_nan=False)
-    if settings.html is not None:
-        write_report(figures, ReportPictures(), settings.html)
+        figures = report.to_report()
+        write_result(settings.json_path, figures, allow_nan=False)
+        if settings.html is not None:
+            moving = film(
+                report, real=real, imagined=imagined, policies=policies, plan=plan, probe=probe
+            )
+            write_report(figures, ReportPictures(moving=moving), settings.html)
     print_scores(figures)
     print_failures(figures, log.path)
     return EXIT_FAILED if report.failures else 0

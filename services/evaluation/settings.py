@@ -288,7 +288,8 @@ class RatingSettings(ServiceSettings):
 
     Every rater sees the rollouts in a different order, without policy, world or the marks of
     others, and some of them twice. With API keys, a rater is the name of a key with the scope
-    `rate`.
+    `rate`, or is invited by a link: `/lead`, for a key with the scope `rate_lead`, makes links and
+    shows how far raters agree.
 
     Example:
       dextouch rate serve --store-url runs/rollouts --marks runs/ratings.sqlite --port 8087
@@ -306,7 +307,7 @@ class RatingSettings(ServiceSettings):
     )
     study: str | None = Field(default=None, min_length=1, description=_STUDY)
     raters_per_rollout: int = Field(
-        default=5, ge=1, le=100, description="number of people who rate each rollout"
+        default=5, ge=1, le=100, description="people who rate each rollout, and one more if tied"
     )
     repeat_share: float = Field(
         default=0.08, ge=0, le=0.5, description="share of rollouts that a rater sees twice"

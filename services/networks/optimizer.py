@@ -1,8 +1,8 @@
-"""Optimizer loop: AdamW, a cosine schedule, clipped gradients, and limits of CPU time and steps."""
+"""Optimizer loop: AdamW, a cosine schedule, clipped gradients, and limits of time and steps."""
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -45,46 +45,67 @@ class OptimizerOptions:
 
 
 class Budget:
-    """Completed steps and CPU seconds of a run; it ends when either reaches its limit.
+    """Completed steps, CPU and wall seconds of a run; it ends when one of them reaches its limit.
 
     Args:
         max_cpu_s: limit of CPU seconds.
         max_steps: limit of steps; None for no limit.
+        max_wall_s: limit of wall seconds.
+        paced_by_steps: whether the schedule follows the steps alone, where these have a limit.
     """
 
-    def __init__(self, max_cpu_s: float = math.inf, max_steps: int | None = None) -> None:
-        self._max_cpu_s, self._max_steps = max_cpu_s, max_steps
+    def __init__(
+        self,
+        max_cpu_s: float = math.inf,
+        max_steps: int | None = None,
+        max_wall_s: float = math.inf,
+        *,
+        paced_by_steps: bool = False,
+    ) -> None:
+        self._max_cpu_s, self._max_steps, self._max_wall_s = max_cpu_s, max_steps, max_wall_s
+        self._paced_by_steps = paced_by_steps
         self.step = 0
-        self.cpu_s = 0.0
+        self.cpu_s = self.wall_s = 0.0
         self.start()
 
     def start(self) -> None:
-        """Count CPU seconds from now on, in addition to `cpu_s`."""
+        """Count seconds from now on, in addition to `cpu_s` and `wall_s`."""
         self._start_s = time.process_time() - self.cpu_s
+        self._start_wall_s = time.monotonic() - self.wall_s
 
     def advance(self) -> None:
         """Complete a step."""
         self.step += 1
         self.cpu_s = time.process_time() - self._start_s
+        self.wall_s = time.monotonic() - self._start_wall_s
 
     def share(self) -> float:
-        """Completed fraction of the run, by the tighter of the two limits."""
-        by_time = self.cpu_s / self._max_cpu_s
-        return by_time if self._max_steps is None else max(by_time, self.step / self._max_steps)
+        """Completed fraction of the run, by the tightest of the limits."""
+        by_time = max(self.cpu_s / self._max_cpu_s, self.wall_s / self._max_wall_s)
+        return max(by_time, self._share_of_steps())
+
+    def schedule_share(self) -> float:
+        """Completed fraction that the learning rate follows."""
+        is_by_steps = self._paced_by_steps and self._max_steps is not None
+        return self._share_of_steps() if is_by_steps else self.share()
+
+    def _share_of_steps(self) -> float:
+        return 0.0 if self._max_steps is None else self.step / self._max_steps
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Do not count the CPU seconds of the block."""
-        begin_s = time.process_time()
+        """Do not count the seconds of the block."""
+        begin_s, begin_wall_s = time.process_time(), time.monotonic()
         yield
         self._start_s += time.process_time() - begin_s
+        self._start_wall_s += time.monotonic() - begin_wall_s
 
 
 class OptimizerLoop:
     """Training of one network until its budget is used up.
 
     Args:
-        network: network whose weights are changed.
+        network: network whose weights are changed, but for those that need no gradient.
         options: learning rate, weight decay and so on.
         budget: limits of the run.
     """
@@ -93,7 +114,7 @@ class OptimizerLoop:
         self.options, self.budget = options, budget
         self._network = network
         self.optimizer = torch.optim.AdamW(
-            network.parameters(),
+            learned_weights(network).values(),
             lr=options.learning_rate,
             weight_decay=options.weight_decay,
             betas=options.betas,
@@ -109,27 +130,30 @@ class OptimizerLoop:
             self.budget.advance()
             yield value.item()
 
-    def learn(self, loss: Tensor, **parts: Tensor) -> None:
+    def learn(self, loss: Tensor) -> None:
         """Take one step down the gradient of a loss; the budget does not advance.
-
-        Args:
-            loss: scalar to reduce.
-            parts: losses that error messages name beside it.
 
         Raises:
             NonFiniteError: gradients that are NaN or infinite.
         """
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.options.rate(self.budget.step, self.budget.share())
         self.optimizer.zero_grad()
         torch.autograd.backward(loss)
+        self.step(loss=loss)
+
+    def step(self, **losses: Tensor) -> None:
+        """Take one step down the gradients that the weights have; as `learn`.
+
+        Args:
+            losses: what error messages say of the step.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.options.rate(self.budget.step, self.budget.schedule_share())
         if self.options.max_gradient_norm is not None:
             norm = nn.utils.clip_grad_norm_(
                 self._network.parameters(), self.options.max_gradient_norm
             )
             if not torch.isfinite(norm):
-                terms = {"loss": loss, **parts}
-                values = ", ".join(f"{name} {one.item():.3g}" for name, one in terms.items())
+                values = ", ".join(f"{name} {one.item():.3g}" for name, one in losses.items())
                 raise NonFiniteError(
                     f"training: gradients of step {self.budget.step} of "
                     f"{type(self._network).__name__} are NaN or infinite ({values}), expected "
@@ -139,21 +163,25 @@ class OptimizerLoop:
         self.optimizer.step()
 
 
+def learned_weights(network: nn.Module) -> dict[str, nn.Parameter]:
+    """The weights that need gradients, by name."""
+    return {name: weight for name, weight in network.named_parameters() if weight.requires_grad}
+
+
 @torch.no_grad()
 def update_average(
-    averaged: nn.Module, network: nn.Module, *, decay: float, num_updates: int
+    averaged: Iterable[Tensor], weights: Iterable[Tensor], *, decay: float, num_updates: int
 ) -> None:
     """Move averaged weights towards those of a network (exponential moving average).
 
-    Its memory is shorter at first, so that short runs do not keep the initial weights. Buffers stay
-    as they are.
+    Its memory is shorter at first, so that short runs do not keep the initial weights.
 
     Args:
-        averaged: a network of the same shape.
-        network: its weights are added.
+        averaged: averages, which are changed.
+        weights: weights of the same shapes, in the same order.
         decay: decay after many updates, such as 0.995.
         num_updates: number of updates before this one.
     """
     decay = min(decay, (1 + num_updates) / (10 + num_updates))
-    for mean, weight in zip(averaged.parameters(), network.parameters(), strict=True):
+    for mean, weight in zip(averaged, weights, strict=True):
         mean.lerp_(weight, 1.0 - decay)

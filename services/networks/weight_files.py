@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor, distribute_tensor
 
 from dextouch.errors import (
     CorruptDataError,
@@ -230,8 +231,28 @@ def on_device(network: Network, device: str) -> Network:
 
 
 def memory_of(tensors: Mapping[str, Tensor]) -> int:
-    """Bytes of tensors, which may be on the meta device."""
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+    """Bytes here of tensors, which may be on the meta device, or sharded over processes."""
+    here = (one.to_local() if isinstance(one, DTensor) else one for one in tensors.values())
+    return sum(tensor.numel() * tensor.element_size() for tensor in here)
+
+
+def allocate(network: nn.Module) -> None:
+    """Give parameters of the meta device memory, without values; sharded ones of their mesh."""
+    for module in network.modules():
+        for name, weight in list(module.named_parameters(recurse=False)):
+            if weight.is_meta:
+                place = weight.device_mesh.device_type if isinstance(weight, DTensor) else "cpu"
+                made = nn.Parameter(torch.empty_like(weight, device=place), weight.requires_grad)
+                setattr(module, name, made)
+
+
+@torch.no_grad()
+def fill(tensor: Tensor, whole: Tensor) -> None:
+    """Copy a whole tensor into one that may be sharded, and of another precision."""
+    if isinstance(tensor, DTensor):
+        mesh, placements = tensor.device_mesh, tensor.placements
+        whole = distribute_tensor(whole, mesh, placements, src_data_rank=None)
+    tensor.copy_(whole)
 
 
 def check_memory(num_bytes: int, *, where: str, max_bytes: int | None = None) -> None:

@@ -124,7 +124,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             prediction = measure_prediction(models.world_model, scenes, metrics=metrics)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
-            scores = scoring.judge(urls, policies, models, plan)
+            scores, moving = scoring.judge(urls, policies, models, plan)
     world = models.world_model.description
     form = "state model" if world.object_names else "paper's form"
     report = {
@@ -160,7 +160,8 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         **scores,
     }
     with stages.stage("report", "drawing the report"):
-        write_report(report, _pictures(takes, prediction.pictures), plan.output / "report.html")
+        pictures = replace(_pictures(takes, prediction.pictures), moving=moving)
+        write_report(report, pictures, plan.output / "report.html")
     return {**report, "stages": stages.rows()}
 
 

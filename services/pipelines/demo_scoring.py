@@ -11,8 +11,10 @@ from dextouch.worlds import BatchWorld
 from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.command_line import run_train_judge, run_train_policy
+from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.reporting import PredictionPicture
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
@@ -123,11 +125,12 @@ def _scripts(plan: DemoPlan) -> tuple[str, ...]:
 
 def judge(
     urls: Mapping[str, str], policies: Mapping[str, Policy], models: Models, plan: DemoPlan
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], tuple[PredictionPicture, ...]]:
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
     Returns:
-        `policies`, `agreement`, `mistakes` and other entries of `report.json`.
+        `policies`, `agreement`, `mistakes` and other entries of `report.json`, and a pair of
+        rollouts of every task to show.
     """
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
@@ -135,13 +138,9 @@ def judge(
         seeds=list(plan.seeds),
         trained_on={"the policy": models.policy.metadata.training_starts},
     )
-    report = evaluate(
-        real=WorldAddress(twin, "twin"),
-        imagined={name: WorldAddress(imagined, name) for name in (MODEL, BASELINE)},
-        policies=policies,
-        plan=tasks,
-        probe=models.probe,
-    )
+    real, probe = WorldAddress(twin, "twin"), models.probe
+    worlds = {name: WorldAddress(imagined, name) for name in (MODEL, BASELINE)}
+    report = evaluate(real=real, imagined=worlds, policies=policies, plan=tasks, probe=probe)
     if report.failures:
         first = report.failures[0]
         raise DexTouchError(
@@ -152,7 +151,9 @@ def judge(
     found["mistakes"] = mistake_rows(report.scores, plan)
     for task, comments in found["comments"].items():
         comments.append(mistake_comment(task, found["mistakes"]))
-    return found
+    return found, film(
+        report, real=real, imagined=worlds, policies=policies, plan=tasks, probe=probe
+    )
 
 
 def mistake_rows(scores: Iterable[RolloutScore], plan: DemoPlan) -> list[dict[str, Any]]:

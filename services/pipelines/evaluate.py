@@ -35,6 +35,7 @@ from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, 
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.imagined_data import WORLD, refuse_trained_episodes, served_world
 from services.pipelines.parsers import prediction_parser, recorded_parser
+from services.world_model.network.model import Sampling
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
@@ -57,7 +58,8 @@ def prediction_main(arguments: Sequence[str]) -> int:
         if unknown := sorted(set(names) - set(known)):
             raise UnknownNameError(kind, unknown[0], list(known))
     store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
-    world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
+    sampling = Sampling(options.sampling_steps)
+    world = open_world(path, sampling=sampling, needs_touch=False)
     tasks = options.tasks or world.description.tasks
     readers = select_episodes(
         [store], domain="robot", tasks=tasks, needs=(needs.EVERY_PART, needs.IMAGES)

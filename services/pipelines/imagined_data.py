@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 
 from dextouch.clients import RolloutClient
@@ -17,11 +16,16 @@ from dextouch.errors import ConflictError
 from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
-from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import World, WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
-from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
+from services.evaluation.reporting import (
+    MAX_MOVING,
+    PredictionPicture,
+    ReportPictures,
+    episode_pair,
+    write_report,
+)
 from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import generate_parser, imagined_parser
 from services.pipelines.servers import served
@@ -160,12 +164,14 @@ def generate_main(arguments: Sequence[str]) -> int:
         f"{len(made)} episodes imagined and verified, {num_bytes / 1e6:.1f} MB in {options.store}"
     )
     if options.strips is not None:
-        pictures = [
-            _picture(source, target.open(one)) for one in sorted(made)[: options.num_strips]
-        ]
+        shown = [target.open(one) for one in sorted(made)[: options.num_strips]]
+        pictures = ReportPictures(
+            predictions=tuple(_picture(source, one, _NUM_MOMENTS) for one in shown),
+            moving=tuple(_picture(source, one, None) for one in shown[:MAX_MOVING]),
+        )
         about = {"world model": options.checkpoint.name, "episodes": len(made)}
         page = {"title": "Recorded and imagined episodes", "about": about}
-        write_report(page, ReportPictures(predictions=tuple(pictures)), options.strips)
+        write_report(page, pictures, options.strips)
         print(f"recorded and imagined images: {options.strips}")
     write_result(options.json, {"episodes": sorted(made), "num_bytes": num_bytes})
     return 0
@@ -221,18 +227,10 @@ def refuse_trained_episodes(
         )
 
 
-def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture:
-    about = imagined.attributes
-    (true_id,) = {one.id for one in about.lineage if one.kind == "episode"}
-    truth, steps = source.open(true_id), imagined.num_steps
-    true = truth.window(0, steps, cameras=(HEAD_CAMERA,))
-    predicted = imagined.window(0, steps, cameras=(HEAD_CAMERA,))
-    shown = np.unique(np.linspace(0, steps - 1, _NUM_MOMENTS).round().astype(int))
-    return PredictionPicture(
-        f"{about.task}: {true_id}",
-        shown / about.model_rate_hz,
-        true.images[HEAD_CAMERA][shown],
-        predicted.images[HEAD_CAMERA][shown],
-        true.tactile_kpa[shown],
-        predicted.tactile_kpa[shown],
-    )
+def _picture(
+    source: EpisodeStore, imagined: EpisodeReader, num_moments: int | None
+) -> PredictionPicture:
+    """An episode beside its true one, as `episode_pair`."""
+    (true_id,) = {one.id for one in imagined.attributes.lineage if one.kind == "episode"}
+    title = f"{imagined.attributes.task}: {true_id}"
+    return episode_pair(title, source.open(true_id), imagined, num_moments)

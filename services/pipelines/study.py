@@ -32,6 +32,7 @@ from services.evaluation.studies.engine import (
     run_study,
 )
 from services.evaluation.studies.results import (
+    KEPT_FOLDER,
     PlannedRollout,
     StudyDefinition,
     StudyHeader,
@@ -41,6 +42,7 @@ from services.evaluation.studies.results import (
     read_definition,
 )
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
+from services.evaluation.studies.study_pictures import write_pictures
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
@@ -70,7 +72,7 @@ def _run(options: argparse.Namespace) -> int:
     definition = read_definition(options.study)
     folder = options.folder or options.study.with_suffix("")
     refuse_training_seeds(definition)
-    store_url = str(options.store or folder / "rollouts") if definition.keep_rollouts else None
+    store_url = str(options.store or folder / KEPT_FOLDER) if definition.keep_rollouts else None
     addresses = dict[str, ServedWorld]()
     parts, digests = _parts(definition, addresses, store_url)
     with served_worlds(definition) as served:
@@ -218,6 +220,7 @@ def _own_probes(
 
 def _finish(results: StudyResults, json_path: Path | None) -> int:
     figures = write_reports(results, json_path)
+    write_pictures(results)
     print_scores(figures)
     print_failures(figures, results.path)
     print(f"\nreport: {results.path.with_name(REPORT_FILE)}")

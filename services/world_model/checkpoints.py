@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
+from typing import Final
 
 from pydantic import Field, model_validator
 
@@ -45,6 +46,8 @@ _TOKENIZER_KEY = "dextouch_tactile_tokenizer"
 _TEXT, _DYNAMICS, _RENDERER = "text_features.", "dynamics.", "renderer."
 # Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
+# Of the twin's episodes, in files of older releases.
+HORIZON_LATENTS: Final = 20
 
 
 class TrainingSet(FrozenModel):
@@ -75,7 +78,9 @@ class CheckpointMetadata(FrozenModel):
     `initialized_from` is the digest of the checkpoint that the weights were initialized from, whose
     training episodes count here, too, and `tokenizer_digest` that of the pretrained tokenizer's
     file. None is not written, so that older releases can read the file. `sets` are the episodes by
-    domain, those of ancestors included; empty in files of older releases.
+    domain, those of ancestors included; empty in files of older releases. `horizon_latents` is the
+    length of the longest training episode. `text_dropout` and `action_dropout` are the shares of
+    windows without instruction and without actions, of this training or of an ancestor's.
     """
 
     format_version: int = 1
@@ -93,7 +98,15 @@ class CheckpointMetadata(FrozenModel):
     initialized_from: str | None = Field(default=None, exclude_if=not_)
     sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
     tokenizer_digest: str | None = Field(default=None, exclude_if=not_)
+    horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1, exclude_if=HORIZON_LATENTS.__eq__)
+    text_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
+    action_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
+
+    @property
+    def is_guidable(self) -> bool:
+        """Whether the model was trained on windows with neither instruction nor actions, too."""
+        return min(self.text_dropout, self.action_dropout) > 0.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +116,13 @@ class Checkpoint:
     model: JointWorldModel
     metadata: CheckpointMetadata
     digest: str
+
+
+def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> tuple[float, float]:
+    """Shares of windows for the metadata: a training's, or its ancestor's if it has none."""
+    if ancestor is not None and not (text or action):
+        return ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
+    return text, action
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
@@ -167,7 +187,7 @@ class StateBounds(FrozenModel):
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
     distance: float = Field(default=1.0, gt=0, allow_inf_nan=False)
-    horizon_latents: int = Field(default=20, ge=1)
+    horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1)
     of_chunks: bool = False
 
     @property

@@ -19,13 +19,14 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
     read_tokenizer,
 )
+from services.world_model.network.model import Sampling
 from services.world_model.paper_settings import (
     DistillCommand,
     TrainSettings,
     adapt_settings,
     train_settings,
 )
-from services.world_model.plan import plan_table
+from services.world_model.plan import plan_table, training_table
 from services.world_model.settings import (
     AdaptStateCommand,
     ShowCommand,
@@ -46,7 +47,9 @@ def run_train(arguments: list[str]) -> int:
     if isinstance(settings, TrainStateCommand):
         return _train_state(settings)
     if settings.plan:
+        settings = settings.model_copy(update={"network": settings.with_adapters().network})
         print(plan_table(settings.network))
+        print(training_table(settings, settings.plan_processes))
         return 0
     return _train(settings, settings.json_path)
 
@@ -74,11 +77,14 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
         losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
         lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
-    with joined_processes() as processes:
+    with joined_processes(settings.device, settings.replicas) as processes:
         report = train(settings, on_progress if processes.is_first else None, processes)
     if report is not None:
         counts = f"{report.num_train_episodes} episodes, {report.num_heldout_episodes} held out"
         _show(report, f"{report.steps} steps, {counts}", json_path)
+        limit = settings.step_limit
+        if limit is not None and report.steps < limit:
+            print(f"cut short at step {report.steps} of {limit}; --resume with a larger limit")
     return 0
 
 
@@ -120,22 +126,33 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     import torch
 
     torch.set_num_threads(settings.num_threads)
-    return {settings.world_name: _open(settings.checkpoint, settings)}
+    return {settings.world_name: open_model(settings.checkpoint, settings)}
 
 
 def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
-    """The world of the checkpoint with this digest beside the one that is served."""
+    """The world of the checkpoint with this digest beside the one that is served.
+
+    Of the options, it gets those that it can take.
+    """
     for path, found in list_checkpoints(settings.checkpoint.parent).items():
+        if found == digest and is_state_checkpoint(path):
+            return open_world(path)
         if found == digest:
-            return open_world(path) if is_state_checkpoint(path) else _open(path, settings)
+            metadata, placement = read_metadata(path), settings.placement
+            if metadata.network.wan is None:
+                whole = {"decode_window": None, "decode_tile_px": None}
+                placement = placement.model_copy(update=whole)
+            guidance = settings.guidance if metadata.is_guidable else 1.0
+            taken = {"placement": placement, "guidance": guidance}
+            return open_model(path, settings.model_copy(update=taken))
     return None
 
 
-def _open(path: Path, settings: WorldModelSettings) -> World[Any]:
+def open_model(path: Path, settings: WorldModelSettings) -> World[Any]:
+    """The world of a checkpoint, as the settings say."""
     return open_world(
         path,
-        sampling_steps=settings.sampling_steps,
-        sampler=settings.sampler,
+        sampling=Sampling(settings.sampling_steps, settings.sampler, guidance=settings.guidance),
         objects=settings.objects,
         placement=settings.placement,
     )

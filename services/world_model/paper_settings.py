@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
@@ -71,11 +71,35 @@ class WindowSettings(FrozenModel):
 
     short_fraction: Share = Field(default=0.25, description="share of short windows")
     context_noise: Share = Field(default=0.05, description="noise on the first latents")
+    text_dropout: Share = Field(
+        default=0.0, description="share of windows without instruction, for --guidance of serving"
+    )
+    action_dropout: Share = Field(
+        default=0.0, description="share of windows without actions, for --guidance of serving"
+    )
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
+class LoraSettings(FrozenModel):
+    """Low-rank adapters of the pretrained video expert, whose own weights are frozen."""
+
+    rank: int = Field(default=0, ge=0, le=1024, description="rank of the adapters; 0: none")
+    alpha: float | None = Field(
+        default=None, gt=0, description="adapters count alpha / rank times; default: once"
+    )
+    keep: CliImplicitFlag[bool] = Field(
+        default=False, description="store adapters beside the weights instead of merged into them"
+    )
+
+
 class RunSettings(DataSettings):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+    """One training run; the first limit that is reached ends it.
+
+    The learning rate follows `max_steps`, or the time where only that is limited. Without a limit,
+    there are `USUAL_STEPS`.
+    """
+
+    USUAL_STEPS: ClassVar[int] = 10_000
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
     output: Path = Field(
@@ -86,8 +110,17 @@ class RunSettings(DataSettings):
         default="tiny", description=f"named settings, flags override: {', '.join(PRESETS)}"
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    cpu_budget_s: CpuBudget = 1000.0
-    max_steps: MaxSteps = None
+    max_steps: int | None = Field(
+        default=None, ge=1, description="training steps; a usual number unless time is limited"
+    )
+    wall_budget_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="seconds after which training ends, in all: also before --resume",
+    )
+    cpu_budget_s: float | None = Field(
+        default=None, gt=0, description="CPU seconds of a process after which it ends, in all"
+    )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
     device: Device = "cpu"
     wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
@@ -106,11 +139,30 @@ class RunSettings(DataSettings):
     resume: CliImplicitFlag[bool] = Field(
         default=False, description="resume an interrupted run of this output, if there is one"
     )
-    state_every_cpu_s: float = Field(
-        default=60.0, ge=0, description="CPU seconds between states saved for --resume"
+    state_every_s: float = Field(
+        default=60.0, ge=0, description="seconds between states saved for --resume"
+    )
+    freeze_video: CliImplicitFlag[bool] = Field(
+        default=False, description="train touch and the effect of actions alone, not Wan2.2"
+    )
+    lora: LoraSettings = Field(default=LoraSettings(), description="adapters of Wan2.2")
+    recompute: CliImplicitFlag[bool] = Field(
+        default=False, description="compute activations twice instead of keeping them, by layer"
+    )
+    accumulate: int = Field(
+        default=1, ge=1, description="parts that a process computes its batch in, one by one"
+    )
+    replicas: int = Field(
+        default=1, ge=1, description="copies of the sharded model, such as one a machine"
     )
     optimizer: OptimizerSettings = Field(default=OptimizerSettings(), description="of training")
     windows: WindowSettings = Field(default=WindowSettings(), description="sampling of windows")
+
+    @property
+    def step_limit(self) -> int | None:
+        """Steps after which training ends, if it ends by steps."""
+        is_timed = self.wall_budget_s is not None or self.cpu_budget_s is not None
+        return self.USUAL_STEPS if self.max_steps is None and not is_timed else self.max_steps
 
 
 class TrainSettings(RunSettings):
@@ -127,11 +179,30 @@ class TrainSettings(RunSettings):
     )
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
 
+    def with_adapters(self) -> "TrainSettings":
+        """The settings with a network that has the adapters of `lora`.
+
+        Raises:
+            InvalidInputError: a network without a pretrained video expert to adapt or to freeze.
+        """
+        network, rank = self.network, self.lora.rank
+        if network.wan is None and (rank or self.freeze_video):
+            raise InvalidInputError(
+                f"training: got {f'--lora.rank {rank}' if rank else '--freeze-video'} with "
+                f"video_expert {network.video_expert}, which has no pretrained weights; leave "
+                "it out, or use --preset wan22-5b"
+            )
+        if not rank:
+            return self
+        scale = 1.0 if self.lora.alpha is None else self.lora.alpha / rank
+        return self.model_copy(update={"network": network.adapted(rank, scale)})
+
 
 def command_line(settings: TrainSettings) -> str:
     """Command that repeats a run, as its checkpoint records it."""
     places = ("episodes", "human", "heldout", "init", "tokenizer")
-    local = {"output", "json_path", "resume", "state_every_cpu_s", "device", "wan", "plan"}
+    local = {"output", "json_path", "resume", "state_every_s", "device", "wan", "plan"}
+    local |= {"plan_processes"}
     command = f"dextouch train world-model --preset={settings.preset}"
     return recorded_command(settings, command, places, {*local, "preset"})
 
@@ -139,8 +210,9 @@ def command_line(settings: TrainSettings) -> str:
 class FromCheckpointSettings(RunSettings):
     """Training of a checkpoint, whose network, codecs and normalizers are kept."""
 
+    USUAL_STEPS: ClassVar[int] = 3_000
+
     init: Path = Field(description="checkpoint to start from")
-    cpu_budget_s: CpuBudget = 300.0
     optimizer: AdaptOptimizerSettings = Field(
         default=AdaptOptimizerSettings(), description="of training"
     )
@@ -149,6 +221,7 @@ class FromCheckpointSettings(RunSettings):
         """The same run as training of a network from its checkpoint."""
         given = {name: getattr(self, name) for name in RunSettings.model_fields}
         given |= {"optimizer": OptimizerSettings(**self.optimizer.model_dump())}
+        given |= {"max_steps": self.step_limit}
         return TrainSettings(**given, init=self.init, network=network)
 
 
@@ -225,7 +298,11 @@ class TrainCommand(CommandSettings, TrainSettings):
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
     plan: CliImplicitFlag[bool] = Field(
-        default=False, description="print memory and FLOPs of the network, and do not train"
+        default=False,
+        description="print memory and FLOPs of a chunk and of this training, and what fits a card",
+    )
+    plan_processes: int = Field(
+        default=8, ge=1, description="processes that --plan shards the training over, too"
     )
 
     @classmethod

@@ -4,12 +4,15 @@ The network runs on torch's meta device, which has shapes but no numbers, so tha
 be planned on a laptop. FLOPs are those of matrix products, convolutions and attention (two per
 multiplication and addition); memory is the largest sum of tensors that are alive at one time.
 Attention counts its whole matrix, which fused kernels do not store; working memory of convolutions,
-which depends on the library, is not counted.
+which depends on the library, is not counted. Training is planned from a few layers, since memory
+grows with their number linearly; there activations count in float32, also where products are
+bfloat16.
 """
 
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
+from functools import cache
 from typing import Any, Final
 
 import torch
@@ -18,14 +21,23 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
+from services.networks.optimizer import learned_weights
 from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
+from services.world_model.paper_settings import LoraSettings, TrainSettings
+from services.world_model.pretrained_video import freeze_pretrained
 
 _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
+# A chunk needs one of the two.
+_DECODING: Final = ("decode all images", "decode the last image")
+# Cards that choices of a training are compared with, in 1e9 bytes as all of the plan.
+_CARDS_GB: Final = (24, 80, 141)
+# Layers that training is planned from.
+_FEW_LAYERS: Final = (3, 4)
 # Text encoder of the published model, UMT5-XXL.
 _TEXT_ENCODER: Final = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
@@ -57,8 +69,6 @@ class Plan:
     """What one action chunk of one rollout needs.
 
     `kept_bytes` is what the sampler's steps share: keys and values of clean tokens, and conditions.
-    `training_bytes` are weights, gradients, two moments of AdamW and the average of the weights;
-    activations come on top.
     """
 
     num_steps: int
@@ -67,13 +77,51 @@ class Plan:
     parts: tuple[Part, ...]
     work: tuple[Work, ...]
     kept_bytes: int
-    training_bytes: int
 
     @property
     def peak_bytes(self) -> int:
         """Weights, what is kept, and the most memory that a computation takes."""
         weight_bytes = sum(part.memory_bytes for part in self.parts)
         return weight_bytes + self.kept_bytes + max(work.memory_bytes for work in self.work)
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """Memory of a training's process while it takes a step, in bytes.
+
+    Attributes:
+        weights: all weights, of which codec and tokenizer are `whole` in every process.
+        learned: those with gradients; each has a gradient, two moments of AdamW (`copies` without
+            the gradient), and an average where one is kept.
+        layer: weights of a layer; `outer` those of neither layers nor codec and tokenizer.
+        step: most that forward and backward take beside the weights; of a training of one process
+            with gradients as they come, which at the end of a step are all there.
+        encoding: what the codec takes for the latents of a step's images, with gradients there.
+    """
+
+    weights: int
+    whole: int
+    learned: int
+    outer: int
+    layer: int
+    step: int
+    encoding: int
+    copies: int
+    shards: int
+
+    @property
+    def peak_bytes(self) -> int:
+        """The most memory, beside the library's own.
+
+        Sharded (FSDP2), a process has its share of weights, gradients and copies. Gathered are the
+        outer weights, and two layers with the gradient of one.
+        """
+        copies = self.copies * self.learned
+        if self.shards == 1:
+            return self.weights + copies + max(self.step, self.learned + self.encoding)
+        shared = self.weights - self.whole + copies + self.learned
+        gathered = self.outer + 3 * self.layer
+        return self.whole + shared // self.shards + gathered + max(self.step, self.encoding)
 
 
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -135,7 +183,14 @@ def plan_table(config: NetworkConfig) -> str:
         row(f"  {one.name}", times[i], (p.work[i].memory_bytes for p in columns))
         for i, one in enumerate(first.work)
     ]
-    flops = sum(one.times * one.flops for one in first.work)
+    totals = [
+        row(
+            f"all, and {name}",
+            f"{sum(w.times * w.flops for w in first.work if w.name != other) / 1e9:,.2f} GF",
+            (plan.peak_bytes for plan in columns),
+        )
+        for name, other in (_DECODING, _DECODING[::-1])
+    ]
     return "\n".join(
         [
             f"one action chunk of {first.num_steps} steps, {first.num_video_tokens} video and "
@@ -144,9 +199,8 @@ def plan_table(config: NetworkConfig) -> str:
             *weights,
             "work, with memory beside the weights",
             *work,
-            row("all", f"{flops / 1e9:,.2f} GF", (plan.peak_bytes for plan in columns)),
+            *totals,
             row("shared by sampler steps", "", (plan.kept_bytes for plan in columns)),
-            row("training, without activations", "", (plan.training_bytes for plan in columns)),
         ]
     )
 
@@ -157,7 +211,6 @@ def plan_of(config: NetworkConfig) -> Plan:
     with torch.device("meta"), torch.no_grad():
         model = JointWorldModel(config).eval()
         work, kept_bytes = _work(model, 1 + steps)
-        learned = {n: p for n, p in model.named_parameters() if p.requires_grad}
         return Plan(
             num_steps=steps,
             num_video_tokens=num_latents(1 + steps) * config.tokens_per_latent,
@@ -165,9 +218,134 @@ def plan_of(config: NetworkConfig) -> Plan:
             parts=_parts(model),
             work=work,
             kept_bytes=kept_bytes,
-            # Gradient and two moments of each learned weight; the average copies the whole model.
-            training_bytes=2 * memory_of(model.state_dict()) + 3 * memory_of(learned),
         )
+
+
+def training_table(settings: TrainSettings, num_processes: int) -> str:
+    """Memory of a training as it is set, and of leaner ones, and which cards have it."""
+    rows = [f"{'training, memory of a process':<56}{'one':>12}{f'of {num_processes}':>15}"]
+    lean = {}
+    for flags, changed in _choices(settings).items():
+        sizes = [training_plan(changed, count).peak_bytes / 1e9 for count in (1, num_processes)]
+        lean[flags] = sizes[0]
+        rows.append(f"  {flags:<54}" + "".join(f"{size:>12.3f} GB" for size in sizes))
+    for card_gb in _CARDS_GB:
+        # A tenth is left to the library and to the working memory of convolutions.
+        fitting = [flags for flags, size in lean.items() if size <= 0.9 * card_gb]
+        rows.append(
+            f"fits {card_gb} GB, in one process: {fitting[0] if fitting else 'none of them'}"
+        )
+    return "\n".join(rows)
+
+
+def _choices(settings: TrainSettings) -> dict[str, TrainSettings]:
+    """The training, and leaner ones with the flags that change it, from most to least learned."""
+    choices, changed, flags = {"as given": settings}, settings, ""
+    wan, batch = settings.network.wan, settings.optimizer.batch
+    if wan is None:
+        return choices
+    half = wan.model_copy(update={"precision": "bfloat16"})
+    network = settings.network.model_copy(update={"wan": half})
+    parts: dict[str, dict[str, object]] = {
+        f"--accumulate {batch}": {"accumulate": batch},
+        "--recompute": {"recompute": True},
+        "--network.wan.precision bfloat16": {"network": network},
+        "--lora.rank 32": {"lora": LoraSettings(rank=32)},
+    }
+    for flag, update in parts.items():
+        before, changed = changed, changed.model_copy(update=update)
+        if changed == before or (settings.lora.rank and "lora" in update):
+            changed = before
+            continue
+        flags = f"{flags} {flag}".strip()
+        choices[flags] = changed
+    return choices
+
+
+def training_plan(settings: TrainSettings, num_processes: int = 1) -> TrainingPlan:
+    """Plan of a training step with windows of the greatest length, in one process of several.
+
+    Raises:
+        InvalidInputError: as `TrainSettings.with_adapters`.
+    """
+    settings = settings.with_adapters()
+    depth = settings.network.num_layers
+    if depth <= _FEW_LAYERS[-1]:
+        return _training_plan(settings, num_processes, depth)
+    few, more = (asdict(_training_plan(settings, num_processes, n)) for n in _FEW_LAYERS)
+    further = depth - _FEW_LAYERS[-1]
+    return TrainingPlan(**{n: more[n] + further * (more[n] - few[n]) for n in more})
+
+
+def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> TrainingPlan:
+    config = settings.network.model_copy(update={"num_layers": depth})
+    shards = max(1, num_processes // settings.replicas)
+    windows = max(1, settings.optimizer.batch // (num_processes * settings.accumulate))
+    with torch.device("meta"):
+        model = JointWorldModel(config).train()
+        if settings.freeze_video or settings.lora.rank:
+            freeze_pretrained(model)
+        for layer in model.joint_layers():
+            layer.recompute = settings.recompute
+        whole = sum(memory_of(part.state_dict()) for part in (model.codec, model.tokenizer))
+        layers, weights = memory_of(model.layers.state_dict()), memory_of(model.state_dict())
+        return TrainingPlan(
+            weights=weights,
+            whole=whole,
+            learned=memory_of(learned_weights(model)),
+            outer=weights - whole - layers,
+            layer=memory_of(model.joint_layers()[0].state_dict()),
+            step=_step_bytes(model, windows, min(settings.accumulate, 2), is_sharded=shards > 1),
+            encoding=windows * _encoding_bytes(_of_codec(config)),
+            copies=2 + (settings.optimizer.ema_decay > 0.0),
+            shards=shards,
+        )
+
+
+def _of_codec(config: NetworkConfig) -> NetworkConfig:
+    """The smallest configuration with the same codec."""
+    wan = config.wan
+    if wan is not None:
+        same = {"precision": "float32", "lora_rank": 0, "lora_scale": 1.0}
+        wan = wan.model_copy(update=same)
+    return config.model_copy(update={"num_layers": 1, "wan": wan})
+
+
+@cache
+def _encoding_bytes(config: NetworkConfig) -> int:
+    """What the codec takes for the latents of one window."""
+    with torch.device("meta"), torch.no_grad():
+        codec = JointWorldModel(config).codec
+        images = torch.zeros(1, config.max_steps, config.image_px, config.image_px, 3)
+        with PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
+            codec.encode(images)
+    return memory.peak_bytes
+
+
+def _step_bytes(
+    model: JointWorldModel, num_windows: int, num_parts: int, *, is_sharded: bool
+) -> int:
+    """Peak of forward and backward of parts of a batch; without gradients if these are sharded."""
+    steps = model.config.max_steps
+    inputs = _inputs(model.config, steps, num_windows)
+    first, noisy = _latents(model, steps, num_windows)
+    if is_sharded:
+        num_parts = 1
+        for weight in learned_weights(model).values():
+            weight.register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
+                _drop_gradient
+            )
+    t = torch.ones(num_windows)
+    with PeakMemory((*model.parameters(), *model.buffers())) as memory:
+        for _ in range(num_parts):
+            guess = model(inputs, first, noisy, t)
+            torch.autograd.backward(guess.video.square().mean() + guess.tactile.square().mean())
+            del guess
+    return memory.peak_bytes
+
+
+def _drop_gradient(weight: Tensor) -> None:
+    weight.grad = None
 
 
 def _parts(model: JointWorldModel) -> tuple[Part, ...]:
@@ -196,28 +374,20 @@ def _parts(model: JointWorldModel) -> tuple[Part, ...]:
 
 def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
     """Computations of a chunk, and the memory that the sampler's steps share."""
-    config = model.config
-    inputs = _inputs(config, num_steps)
-    if model.text_features is not None and config.wan is not None:
-        model.text_features.learn({key_of(""): torch.zeros(1, config.wan.text_width)})
-    first = FirstLatents(
-        torch.zeros(1, config.tokens_per_latent, config.video_channels),
-        torch.zeros(1, 2, model.tokenizer.num_tokens, model.tokenizer.channels),
-    )
-    noisy = JointLatents(
-        first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
-        first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
-    )
+    config, inputs = model.config, _inputs(model.config, num_steps)
+    first, noisy = _latents(model, num_steps)
 
     def shared() -> Context:
-        return model.with_clean_tokens(model.context(inputs, first), noisy)
+        context = model.context(inputs, first)
+        return replace(context, clean=model.clean_tokens(context, noisy))
 
     context, steps = shared(), config.sampling_steps
     jobs: dict[str, tuple[int, Callable[[], Any]]] = {
         "encode the first image": (1, lambda: model.first_latents(inputs)),
         "what sampler steps share": (1, shared),
         "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
-        "decode all images": (1, lambda: model.decode(first, noisy)),
+        _DECODING[0]: (1, lambda: model.decode(first, noisy)),
+        _DECODING[1]: (1, lambda: model.decode(first, noisy, all_images=False)),
     }
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
     work = []
@@ -241,17 +411,35 @@ def _tensors_of(kept: object) -> list[Tensor]:
     return []
 
 
-def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
-    cells = config.raster_cells
+def _latents(
+    model: JointWorldModel, num_steps: int, num_windows: int = 1
+) -> tuple[FirstLatents, JointLatents]:
+    """Latents of windows, whose text the model knows from now on."""
+    config = model.config
+    if model.text_features is not None and config.wan is not None:
+        model.text_features.learn({key_of(""): torch.zeros(1, config.wan.text_width)})
+    first = FirstLatents(
+        torch.zeros(num_windows, config.tokens_per_latent, config.video_channels),
+        torch.zeros(num_windows, 2, model.tokenizer.num_tokens, model.tokenizer.channels),
+    )
+    return first, JointLatents(
+        first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
+        first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
+    )
+
+
+def _inputs(config: NetworkConfig, num_steps: int, num_windows: int = 1) -> ModelInputs:
+    cells, num = config.raster_cells, num_windows
     return ModelInputs(
-        first_image=torch.zeros(1, config.image_px, config.image_px, 3, dtype=torch.uint8),
-        first_tactile_kpa=torch.zeros(1, 2, config.tactile_layout.num_taxels),
-        hands=torch.zeros(1, num_steps, 2, HAND_DIM),
-        camera=torch.zeros(1, num_steps, 2, CAMERA_DIM),
-        layout=torch.zeros(1, 2, CAMERA_DIM),
-        raster=torch.zeros(1, num_steps, 2, cells, cells),
-        geometry=torch.zeros(1, num_steps, 2, GEOMETRY_SIZE * config.use_contact_geometry),
-        commanded=torch.zeros(1),
-        words=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
-        instructions=("",),
+        first_image=torch.zeros(num, config.image_px, config.image_px, 3, dtype=torch.uint8),
+        first_tactile_kpa=torch.zeros(num, 2, config.tactile_layout.num_taxels),
+        hands=torch.zeros(num, num_steps, 2, HAND_DIM),
+        camera=torch.zeros(num, num_steps, 2, CAMERA_DIM),
+        layout=torch.zeros(num, 2, CAMERA_DIM),
+        raster=torch.zeros(num, num_steps, 2, cells, cells),
+        geometry=torch.zeros(num, num_steps, 2, GEOMETRY_SIZE * config.use_contact_geometry),
+        commanded=torch.zeros(num),
+        acting=torch.ones(num),
+        words=torch.zeros(num, MAX_WORDS, dtype=torch.int64),
+        instructions=("",) * num,
     )

@@ -5,16 +5,27 @@ are checked from the files' headers before any weight is read. Nothing is ever d
 """
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.networks.weight_files import check_memory, memory_of, refuse_non_finite
+from services.networks.weight_files import (
+    allocate,
+    available_memory,
+    check_memory,
+    fill,
+    memory_of,
+    refuse_non_finite,
+)
 from services.world_model.network.configuration import NetworkConfig, WanFiles
+from services.world_model.network.low_rank import is_adapter
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.video import (
     WanBlock,
@@ -25,28 +36,34 @@ from services.world_model.network.video import (
 
 # As diffusers names the weight files of a network.
 _STEM: Final = "diffusion_pytorch_model"
+_PRETRAINED: Final = ("codec.", "video.", "video_condition.embedder.")
 
 
 def initial_model(
-    config: NetworkConfig, files: WanFiles, *, filled_later: bool = False
+    config: NetworkConfig,
+    files: WanFiles,
+    *,
+    filled_later: bool = False,
+    prepare: Callable[[JointWorldModel], None] | None = None,
 ) -> JointWorldModel:
     """A new model; that of the full size begins with the pretrained weights of its files.
 
-    With `filled_later`, a checkpoint replaces all weights, so that files are not needed.
+    With `filled_later`, a checkpoint replaces all weights, so that files are not needed. `prepare`
+    is called before the pretrained weights have memory, such as to shard them.
 
     Raises:
         InvalidInputError: the full size without a folder.
         NotFoundError, CorruptDataError, LimitExceededError, NonFiniteError: as `load_weights`.
     """
     model = JointWorldModel(config)
+    if prepare is not None:
+        prepare(model)
     if model.text_features is None:
         return model
     if files.folder is not None:
         load_pretrained(model, files.folder, max_bytes=files.max_bytes)
     elif filled_later:
-        for module in model.modules():
-            if any(tensor.is_meta for tensor in module.parameters(recurse=False)):
-                module.to_empty(device="cpu", recurse=False)
+        allocate(model)
     else:
         raise InvalidInputError(
             "pretrained video expert: got no folder; give the local folder of Wan2.2-TI2V-5B "
@@ -54,6 +71,18 @@ def initial_model(
         )
     model.text_features.use(files.folder, files.text_cache)
     return model
+
+
+def freeze_pretrained(model: JointWorldModel) -> None:
+    """Train neither the transformer nor the autoencoder of Wan2.2, but adapters."""
+    for name, weight in model.named_parameters():
+        if is_pretrained(name):
+            weight.requires_grad = is_adapter(name)
+
+
+def is_pretrained(name: str) -> bool:
+    """Whether a weight of a model of the full size is one of Wan2.2, or of its adapters."""
+    return name.startswith(_PRETRAINED) or ".video.block." in name
 
 
 def share_texts(source: JointWorldModel, target: JointWorldModel) -> None:
@@ -112,9 +141,10 @@ class _Transformer(nn.Module):
 def load_weights(
     network: nn.Module, folder: Path, *, where: str, max_bytes: int | None = None
 ) -> None:
-    """Load a network in place, in the precision of its parameters; it may be on the meta device.
+    """Load a network in place, in the precision of its parameters.
 
-    Non-persistent buffers stay as they are.
+    It may be on the meta device, or sharded over processes, of which each reads all and keeps its
+    shares. Adapters and non-persistent buffers stay as they are.
 
     Args:
         network: network to load.
@@ -129,7 +159,7 @@ def load_weights(
         LimitExceededError: the network needs more memory.
         NonFiniteError: weights that are NaN or infinite.
     """
-    expected = network.state_dict()
+    expected = {n: one for n, one in network.state_dict().items() if not is_adapter(n)}
     files = [folder / name for name in _file_names(folder, where)]
     shapes: dict[str, tuple[int, ...]] = {}
     for file in files:
@@ -156,15 +186,26 @@ def load_weights(
                 f"{where}: {name} has shape {shape}, expected {tuple(expected[name].shape)}; the "
                 "folder holds a model of another size"
             )
-    check_memory(memory_of(expected), where=where, max_bytes=max_bytes)
-    tensors: dict[str, Tensor] = {}
+    limit = _available(expected) if max_bytes is None else max_bytes
+    check_memory(memory_of(expected), where=where, max_bytes=limit)
+    allocate(network)
+    expected = network.state_dict()
     for file in files:
         with safe_open(file, framework="pt") as opened:
             for name in opened.keys():  # noqa: SIM118
                 tensor = opened.get_tensor(name)
                 refuse_non_finite({name: tensor}, where)
-                tensors[name] = tensor.to(expected[name].dtype)
-    network.load_state_dict(tensors, assign=True)
+                fill(expected[name], tensor)
+
+
+def _available(weights: Mapping[str, Tensor]) -> int | None:
+    """Memory for this process's weights: that of its GPU, or its part of the machine's."""
+    meshes = [one.device_mesh for one in weights.values() if isinstance(one, DTensor)]
+    if meshes and meshes[0].device_type == "cuda":
+        return torch.cuda.mem_get_info()[0]
+    free = available_memory()
+    # torchrun's number of processes on this machine, each with weights of its own.
+    return None if free is None else free // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 def _file_names(folder: Path, where: str) -> Sequence[str]:

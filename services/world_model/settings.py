@@ -15,7 +15,6 @@ from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     AverageDecay,
     Batch,
-    Device,
     ImagePx,
     LearningRate,
     NonNegative,
@@ -26,7 +25,12 @@ from services.networks.training_settings import (
     Tasks,
     WeightDecay,
 )
-from services.world_model.network.configuration import Precision, Sampler, WanFiles
+from services.world_model.network.configuration import (
+    SPATIAL_FACTOR,
+    Precision,
+    Sampler,
+    WanFiles,
+)
 from services.world_model.presets import PRESETS
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
@@ -233,7 +237,11 @@ class AdaptStateCommand(CommandSettings, StateAdaptSettings):
 class Placement(FrozenModel):
     """Where a flow-matching model computes, and in which precision."""
 
-    device: Device = "cpu"
+    device: str = Field(
+        default="cpu",
+        description="device of the weights, such as cpu or cuda; several, as in cuda:0,cuda:1, are "
+        "shared out to --workers",
+    )
     precision: Precision = Field(
         default="float32", description="of the experts' weights; codecs and norms keep theirs"
     )
@@ -243,6 +251,23 @@ class Placement(FrozenModel):
     )
     max_file_gb: float | None = Field(
         default=None, gt=0, description="largest checkpoint; default: 64 MiB, at full size memory"
+    )
+    decode_window: int | None = Field(
+        default=None,
+        ge=2,
+        description="at full size, latents that an image is decoded from; default: all, exactly",
+    )
+    decode_tile_px: int | None = Field(
+        default=None,
+        ge=64,
+        multiple_of=SPATIAL_FACTOR,
+        description="at full size, side of the tiles that images are decoded in; default: whole",
+    )
+    kept_contexts: int = Field(
+        default=4,
+        ge=0,
+        le=1024,
+        description="instructions and observed steps whose keys and values later chunks use, too",
     )
 
 
@@ -283,6 +308,13 @@ class WorldModelSettings(WorldServiceSettings):
     )
     sampler: Sampler | None = Field(
         default=None, description="solver of a flow-matching model (default: the checkpoint's)"
+    )
+    guidance: float = Field(
+        default=1.0,
+        ge=0,
+        le=100,
+        description="scale of classifier-free guidance of a flow-matching model trained with "
+        "--windows.text-dropout and --windows.action-dropout; 1: none",
     )
     objects: Path | None = Field(
         default=None,

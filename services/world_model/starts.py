@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from torch import Tensor
 
 from dextouch.errors import (
+    EndedError,
     InvalidInputError,
     NonFiniteError,
     ShapeError,
@@ -22,13 +23,21 @@ from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutSta
 from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.checkpoints import StateCheckpoint
-from services.world_model.dynamics.features import BOX_AXES, hand_motion, poses_from_objects
+from services.world_model.dynamics.features import (
+    BOX_AXES,
+    STEPS_PER_LATENT,
+    hand_motion,
+    poses_from_objects,
+)
 from services.world_model.dynamics.model import first_steps, mean_poses
 from services.world_model.dynamics.trees import stacked
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
+# A rollout ends once its hands have moved four times the length of a training episode, since no
+# longer ones were trained on, and errors of chunk after chunk add up.
+LAST_HORIZONS = 4
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,22 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
             f"start: K_head has focal lengths {focal_px.tolist()} and centre "
             f"{K_head[:2, 2].tolist()} px, expected 1 … {MAX_CAMERA_PX:.0f} px"
         )
+
+
+def refuse_ended(num_moving: int, horizon_latents: int, world: WorldDescription) -> None:
+    """Refuse chunks after `num_moving` latent steps with motion; episodes have `horizon_latents`.
+
+    Raises:
+        EndedError: the hands have moved four times as long as any episode of training.
+    """
+    limit = LAST_HORIZONS * horizon_latents
+    if num_moving >= limit:
+        seconds = limit * STEPS_PER_LATENT / world.model_rate_hz
+        reason = (
+            f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
+            "was trained on"
+        )
+        raise EndedError(f"world {world.name}: {reason}", reason=reason)
 
 
 def checked_selectors(

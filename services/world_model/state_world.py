@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 from torch.nn import functional
 
-from dextouch.errors import EndedError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas import (
+    BOUND_SHARE,
     ActionKind,
     Observation,
     ReturnSelector,
@@ -56,9 +57,8 @@ MAX_SNAPSHOT_BYTES = 2**20
 MAX_CHUNK_STEPS = 64
 # Pose reported for objects believed absent: below the table, where no task places one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
-# A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
-# at four times that length, since no longer ones were trained on.
-UNRELIABLE_HORIZONS, LAST_HORIZONS = 1.5, 4.0
+# A rollout is flagged once its hands have moved 1.5 times the length of a training episode.
+UNRELIABLE_HORIZONS = 1.5
 # Cosine of the same words in another order or with other punctuation.
 _SAME_INSTRUCTION = 0.999
 
@@ -205,7 +205,8 @@ class StateWorld(BatchWorld[StateRollout]):
         """
         requested = starts.checked_selectors(states, actions, seeds, selectors)
         for state in states:
-            self._refuse_ended(state)
+            horizon = self._metadata.bounds.horizon_latents
+            starts.refuse_ended(state.num_moving, horizon, self._description)
         chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         for chunk in chunks:
             check_reach(chunk)
@@ -246,16 +247,6 @@ class StateWorld(BatchWorld[StateRollout]):
             for stepped, drawing in answers
         ]
 
-    def _refuse_ended(self, state: StateRollout) -> None:
-        limit = LAST_HORIZONS * self._metadata.bounds.horizon_latents
-        if state.num_moving >= limit:
-            seconds = limit * STEPS_PER_LATENT / self._metadata.model_rate_hz
-            reason = (
-                f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
-                "was trained on"
-            )
-            raise EndedError(f"world {self._metadata.name}: {reason}", reason=reason)
-
     def _answer(
         self,
         state: StateRollout,
@@ -279,7 +270,19 @@ class StateWorld(BatchWorld[StateRollout]):
         if selector.wants(HEAD_CAMERA):
             shown = slice(len(chunk) - len(observation), None)
             drawing = self._drawing(state, chunk[shown], poses[shown])
-        return SteppedRollout(state, observation), drawing
+        info = {BOUND_SHARE: self._bound_share(state, steps, index)}
+        return SteppedRollout(state, observation, info), drawing
+
+    def _bound_share(self, state: StateRollout, steps: ImaginedSteps, index: int) -> float:
+        """The largest figure of `_uncertainty` as a share of its bound; above 1 it is outside."""
+        bounds = self._metadata.bounds
+        disagreement_m = float(steps.disagreement_m[index].max())
+        shares = (
+            state.num_moving / (UNRELIABLE_HORIZONS * bounds.horizon_latents),
+            disagreement_m / max(bounds.disagreement_m, 1e-9),
+            float(steps.distance[index].max()) / bounds.latent_distance,
+        )
+        return max(shares)
 
     def _drawing(
         self, state: StateRollout, actions: np.ndarray, poses: Float32[np.ndarray, "n objects 7"]

@@ -48,6 +48,8 @@ def printable(text: str, *, lines: bool = False) -> str:
 
     With `lines`, tabs and newlines stay.
     """
+    if text.isascii() and text.isprintable():
+        return text
     unsafe = _UNSAFE_IN_LINES if lines else _UNSAFE_IN_A_LINE
     return unsafe.sub(lambda found: json.dumps(found[0])[1:-1], text)
 

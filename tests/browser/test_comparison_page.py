@@ -1,5 +1,7 @@
 """An operator replays an episode in a real and an imagined world, and sees how far they part."""
 
+import json
+import re
 from dataclasses import replace
 
 import httpx
@@ -10,12 +12,15 @@ from playwright.sync_api import expect
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import EndedError
 from dextouch.schemas import EVERYTHING, RolloutStart, Uncertainty
+from dextouch.streams import unpack
 from dextouch.worlds import SteppedRollout, WorldServiceSettings, create_world_app
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
-from tests.unit.evaluation import toy
+from services.evaluation.settings import StudyServiceSettings
+from services.evaluation.studies.app import create_app as create_studies
+from tests.unit.evaluation import study_rows, toy
 from tests.unit.evaluation.toy_store import write
 
 SEED = 3
@@ -39,8 +44,9 @@ class DoubtfulWorld(toy.ToyWorld):
         uncertainty = Uncertainty(
             disagreement=0.02, distance=0.5, outside=outside, reason=UNRELIABLE if outside else None
         )
+        info = {"uncertainty/bound_share": 1.4 if outside else 0.5}
         return SteppedRollout(
-            stepped.state, replace(stepped.observation, uncertainty=uncertainty), stepped.info
+            stepped.state, replace(stepped.observation, uncertainty=uncertainty), info
         )
 
 
@@ -48,8 +54,8 @@ def steps_of(world, item, start):
     """Images and touch of every step of a replay, by the world alone."""
     begun = world.reset(start)
     state, seen = begun.state, [begun.observation]
-    for first in range(1, toy.STEPS, 16):
-        stepped = world.step(state, item.commanded[first : first + 16], seed=0)
+    for first in range(1, toy.STEPS, 4):
+        stepped = world.step(state, item.commanded[first : first + 4], seed=0)
         state = stepped.state
         seen.append(stepped.observation)
     images = np.concatenate([one.images["camera_head"] for one in seen])
@@ -81,16 +87,17 @@ def serve_dashboard(serve, tmp_path, item):
         create_world_app({"twin": toy.ToyWorld("twin", judge=True)}, WorldServiceSettings())
     )
 
-    def start(**options):
+    def start(*, studies_url=None, **options):
         model = serve(create_world_app({"dream": DoubtfulWorld(**options)}, WorldServiceSettings()))
         urls = {"twin_url": twin, "world_model_url": model, "episode_store_url": store_url}
+        urls |= {"studies_url": studies_url} if studies_url else {}
         return serve(create_app(DashboardSettings(**urls))), twin, model
 
     return start
 
 
 def replay(page, episode_id):
-    page.get_by_label("Episode").fill(episode_id)
+    page.get_by_label("Episode").select_option(episode_id)
     page.get_by_role("button", name="Replay").click()
 
 
@@ -128,7 +135,7 @@ def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item,
     pixels, pressures, f1 = loops(*expected)
     assert max(pixels) > 1
     assert max(pressures) > 0.01
-    for step in (0, 20, 40, 80):
+    for step in (0, 20, 36, 80):
         page.get_by_label("step of the comparison").fill(str(step))
         expect(page.locator("#compared")).to_have_attribute("data-step", str(step))
         assert np.array_equal(shown(page, "real_image"), images[step])
@@ -144,14 +151,176 @@ def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item,
             said = f"{count} taxels in contact, peak {kpa.max():.0f} kPa" if count else "no contact"
             expect(page.locator(f"#imagined_{side}_text")).to_have_text(said)
         uncertainty = page.locator("#imagined_uncertainty")
-        said = {0: "given", 20: "within", 40: f"unreliable: {UNRELIABLE}"}
-        later = f"unreliable since step 48: {UNRELIABLE}"
+        said = {0: "given", 20: "within", 36: f"unreliable: {UNRELIABLE}"}
+        later = f"unreliable since step 36: {UNRELIABLE}"
         expect(uncertainty).to_contain_text(said.get(step, later))
     assert page.locator("#charts canvas").count() == 3
     # Nothing is left behind in the worlds.
     for url in (twin, model):
         assert httpx.get(f"{url}/v1/watch").json()["num_open"] == 0
     assert problems == []
+
+
+def strip_colour(page, step):
+    """Colour of the chart below the videos at a step, above its curve."""
+    return page.evaluate(
+        """step => {
+          const canvas = document.querySelector("#uncertainty_strip canvas");
+          const over = document.querySelector("#uncertainty_strip .u-over");
+          const scale = canvas.width / canvas.clientWidth;
+          const x = over.offsetLeft + over.clientWidth * step / 80;
+          const place = [Math.round(scale * x), Math.round(scale * (over.offsetTop + 4))];
+          return [...canvas.getContext("2d").getImageData(...place, 1, 1).data];
+        }""",
+        step,
+    )
+
+
+@pytest.mark.slow
+def test_a_policy_author_sees_where_imagination_left_the_truth(
+    page, serve, serve_dashboard, tmp_path, item, monkeypatch
+):
+    rows = {"policy": {"real": "SF", "model": "FF", "blurred": "SF"}}
+    monkeypatch.setattr(study_rows, "ROWS", {"reach": rows})
+    changes = {"tasks": ["reach"], "num_starts": 2, "policies": {"policy": {"script": "hold"}}}
+    for name, value in changes.items():
+        monkeypatch.setitem(study_rows.DEFINITION, name, value)
+    study_rows.write_study(tmp_path / "studies" / "touch")
+    studies = serve(create_studies(StudyServiceSettings(studies=tmp_path / "studies")))
+    found = httpx.get(f"{studies}/v1/studies/touch/rollouts").json()["rollouts"]
+    assert found[0]["disagrees"]
+    kept = replace(item, episode_id=found[0]["real_episode_id"])
+    write(EpisodeStore(str(tmp_path / "store")), kept)
+
+    address, *_ = serve_dashboard(studies_url=studies)
+    page.goto(f"{address}/studies")
+    page.get_by_role("link", name="touch and sight").click()
+    # It opens on what differs, and on the picture of all policies.
+    expect(page.locator("#rollouts tbody tr")).to_have_count(1)
+    expect(page.locator("#picture svg text", has_text="real success")).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="LaTeX").click()
+    assert "addlegendentry{policy}" in download.value.path().read_text()
+    page.get_by_role("link", name="Compare").click()
+    expect(page.get_by_label("Episode")).to_have_value(kept.episode_id)
+    page.get_by_role("button", name="Replay").click()
+    expect(page.locator("#outcomes")).to_contain_text("Real: success.")
+    moment = page.locator("#moment")
+    expect(moment).to_contain_text(f"Leaves what it knows at 2.2 s (step 33): {UNRELIABLE}")
+    page.get_by_role("button", name="Go there").click()
+    expect(page.locator("#compared")).to_have_attribute("data-step", "33")
+    figure = page.locator("figure", has=page.locator("#imagined_image"))
+    expect(figure).to_have_attribute("data-outside", "true")
+    before, after = (strip_colour(page, step) for step in (22, 62))
+    assert before != after
+    page.get_by_label("step of the comparison").fill("32")
+    expect(figure).to_have_attribute("data-outside", "false")
+    # Both rollouts are over, and stay with what came of them.
+    expect(page.locator("tr[data-over]")).to_have_count(2)
+    expect(page.locator("tr[data-over]", has_text="twin").locator(".outcome")).to_have_text(
+        "success"
+    )
+
+
+@pytest.mark.slow
+def test_hands_are_moved_by_the_keyboard_while_their_field_has_the_focus(page, serve_dashboard):
+    address, twin, _ = serve_dashboard()
+    page.goto(f"{address}/rollouts")
+    page.get_by_role("button", name="Move hands").click()
+    pad = page.locator("#drive_pad")
+    expect(pad).to_be_focused()
+    # The toy's hand is the left one.
+    page.locator("#drive_sides").select_option("left")
+    pad.focus()
+    page.keyboard.down("d")
+    expect(page.locator("#comparison_step")).to_have_attribute("max", re.compile("^[1-9][0-9]$"))
+    page.keyboard.up("d")
+    # The newest response of the twin has the hand to the right of where it began.
+    (rollout,) = httpx.get(f"{twin}/v1/watch").json()["rollouts"]
+    newest = httpx.get(f"{twin}/v1/watch/{rollout['watch_id']}").content
+    fields, arrays = unpack(newest, max_bytes=10**7)
+    reached = arrays["action_reached"]
+    last_step = fields["observation"]["first_step"] + len(reached) - 1
+    # Hands go no further than half a metre.
+    assert reached[-1][0] == pytest.approx(min(last_step / 15 * 0.25, 0.5))
+    page.get_by_role("button", name="Stop").click()
+    expect(page.locator("#comparison_state")).to_contain_text("stopped")
+    expect(pad).to_be_hidden()
+
+
+@pytest.fixture
+def tell(page):
+    """Changes what the live link says about a topic, now and from now on."""
+    changes, newest, sockets = {}, {}, []
+
+    def send(topic):
+        data = newest.get(topic, {}) | changes.get(topic, {})
+        sockets[-1].send(json.dumps({"topic": topic, "data": data}))
+
+    def connect(socket):
+        sockets.append(socket)
+
+        def pass_on(text):
+            if isinstance(text, bytes):
+                socket.send(text)
+                return
+            message = json.loads(text)
+            newest[message["topic"]] = message["data"]
+            send(message["topic"])
+
+        socket.connect_to_server().on_message(pass_on)
+
+    def change(topic, **fields):
+        changes[topic] = fields
+        send(topic)
+
+    page.route_web_socket("**/v1/live", connect)
+    return change
+
+
+@pytest.mark.slow
+def test_a_chosen_episode_stays_chosen(page, serve_dashboard, tmp_path, item, tell):
+    store = EpisodeStore(str(tmp_path / "store"))
+    write(store, toy.demonstration("reach", 5))
+    episodes = "**/v1/episode_store/episodes?*"
+    problem = {"detail": "the store starts"}
+    page.route(episodes, lambda route: route.fulfill(status=503, json=problem))
+    page.goto(f"{serve_dashboard()[0]}/rollouts")
+    note = page.locator("#offer_note")
+    expect(note).to_have_text("Episodes cannot be listed: the store starts")
+    page.unroute(episodes)
+    expect(note).to_have_text("")
+    chosen = page.get_by_label("Episode")
+    expect(chosen.locator("option")).to_have_count(2)
+    for episode_id in ("reach-5-0", item.episode_id):
+        chosen.select_option(episode_id)
+        tell("rollouts", worlds=[])
+        expect(page.locator("#drive")).to_be_hidden()
+        tell("rollouts")
+        expect(page.locator("#drive")).to_be_visible()
+        expect(chosen).to_have_value(episode_id)
+    write(store, toy.demonstration("reach", 6))
+    page.get_by_role("button", name="Replay").focus()
+    chosen.focus()
+    expect(chosen.locator("option")).to_have_count(3)
+    expect(chosen).to_have_value(item.episode_id)
+
+
+@pytest.mark.slow
+def test_what_is_shown_stays_while_a_world_or_the_dashboard_is_away(page, serve_dashboard, tell):
+    page.goto(f"{serve_dashboard()[0]}/rollouts")
+    page.get_by_role("button", name="Move hands").click()
+    expect(page.locator("#drive_pad")).to_be_focused()
+    page.get_by_role("button", name="Watch").first.click()
+    about = page.locator("#watched_about")
+    expect(page.locator("#step_text")).to_contain_text("step 0")
+    tell("rollouts", rollouts=[])
+    expect(page.locator("tr[data-watch]")).to_have_count(0)
+    expect(about).to_contain_text("running")
+    tell("comparison", state="none")
+    expect(page.locator("#comparison_state")).to_contain_text("stopped")
+    expect(page.locator("#drive_pad")).to_be_hidden()
+    expect(page.locator("#replay_stop")).to_be_hidden()
 
 
 @pytest.mark.slow
@@ -166,12 +335,12 @@ def test_a_world_that_ends_its_rollout_says_why(page, serve_dashboard, item):
 
 @pytest.mark.parametrize(
     ("episode_id", "says"),
-    [("recorded-by-hand", "expected a robot episode with a seed"), ("nothing", "nothing")],
+    [("recorded-by-hand", "expected robot"), ("nothing", "nothing")],
 )
 @pytest.mark.slow
 def test_episodes_that_cannot_be_replayed_are_refused(page, serve_dashboard, episode_id, says):
     address, *_ = serve_dashboard()
-    page.goto(f"{address}/rollouts")
-    replay(page, episode_id)
+    page.goto(f"{address}/rollouts?replay={episode_id}")
+    page.get_by_role("button", name="Replay").click()
     expect(page.locator("#comparison_note")).to_contain_text(says)
     expect(page.locator("#compared")).to_be_hidden()

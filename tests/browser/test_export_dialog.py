@@ -1,15 +1,18 @@
 """Export from the list and the player: the command runs, the download is whole, limits are told."""
 
 import io
+import json
 import shlex
 import threading
 import zipfile
 from datetime import timedelta
 
 import pytest
+from mcap.reader import make_reader
 from playwright.sync_api import expect
 
 from dextouch.episodes import EpisodeStore
+from dextouch.schemas import Review
 from services.cli.main import main
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
@@ -42,6 +45,11 @@ def connect(serve, store):
         return serve(create_dashboard(DashboardSettings(episode_store_url=url)))
 
     return make
+
+
+def review(verdict):
+    reason = "interrupted or disturbed" if verdict == "rejected" else ""
+    return Review(verdict=verdict, reviewed_at=NOON, reviewer="kim", reason=reason)
 
 
 def open_export(page, address, query=""):
@@ -83,6 +91,35 @@ def test_what_is_filtered_is_exported_by_the_command_and_by_the_download(
     expect(dialog.locator(".download .note")).to_contain_text("take-1-aligned.mcap, ")
     audit = page.request.get(f"{address}/v1/audit?action=download").json()["entries"]
     assert [entry["target"] for entry in audit] == ["take-1-aligned"]
+
+
+@pytest.mark.slow
+def test_a_lab_lead_exports_mondays_accepted_takes(page, connect, store, tmp_path):
+    """From the start page by what is seen: days, verdict, export, and what is in the file."""
+    store.set_review("take-1-aligned", review("accepted"))
+    store.set_review("take-2-aligned", review("rejected"))
+    write_take(store, "tuesday", started_at=NOON + timedelta(days=1))
+    store.set_review("tuesday-aligned", review("accepted"))
+    page.goto(connect())
+    page.get_by_role("navigation", name="screens").get_by_role("link", name="Episodes").click()
+    # Before its scripts are there, the page does not listen to its fields.
+    expect(names(page)).to_have_count(5)
+    page.get_by_label("From", exact=True).fill("2026-05-04")
+    page.get_by_label("To", exact=True).fill("2026-05-04")
+    page.get_by_label("Review").select_option("accepted")
+    expect(names(page)).to_have_text(["take-1"])
+    expect(page.locator("#rows tr")).to_contain_text("4 May 2026")
+    page.get_by_role("button", name="Export …").click()
+    dialog = page.get_by_role("dialog", name="Export for other tools")
+    expect(dialog.locator("[data-count]")).to_have_text("1 episode")
+    command = dialog.locator("code").inner_text()
+    assert run(command, store, tmp_path / "monday") == ["take-1-aligned.mcap"]
+    with page.expect_download() as monday:
+        dialog.get_by_role("button", name="Download MCAP").click()
+    with monday.value.path().open("rb") as file:
+        attached = {one.name: one.data for one in make_reader(file).iter_attachments()}
+    attributes = json.loads(attached["attributes.json"])
+    assert (attributes["episode_id"], attributes["success"]) == ("take-1-aligned", True)
 
 
 @pytest.mark.slow

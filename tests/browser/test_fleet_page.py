@@ -15,7 +15,7 @@ WATCH = """() => {
   const page = document.documentElement;
   delete page.dataset.staleAt;
   const look = () => {
-    const tile = document.querySelector("[data-station=desk_2]");
+    const tile = document.querySelector("li[data-station=desk_2]");
     const stale = tile.dataset.level === "STALE" && !tile.querySelector("img");
     if (stale) page.dataset.staleAt = Date.now();
     else requestAnimationFrame(look);
@@ -45,7 +45,7 @@ def names(page):
 
 def test_a_station_that_stops_is_stale_and_first(wall, stations):
     delays_s = []
-    tile = wall.locator("[data-station=desk_2]")
+    tile = wall.locator("li[data-station=desk_2]")
     for _ in range(NUM_ROUNDS):
         expect(tile).not_to_have_attribute("data-level", "STALE")
         expect(tile.locator("img")).to_have_count(1)
@@ -62,7 +62,7 @@ def test_a_station_that_stops_is_stale_and_first(wall, stations):
     sys.stdout.write(f"STALE {shown} s after SIGSTOP\n")
     assert min(delays_s) < 1.0, delays_s
     # The other one may be in trouble of its own on a machine under load.
-    if wall.locator("[data-station=desk_1]").get_attribute("data-level") != "ERROR":
+    if wall.locator("li[data-station=desk_1]").get_attribute("data-level") != "ERROR":
         assert names(wall)[0] == "desk_2"
     stations["desk_2"].go_on()
     expect(tile).not_to_have_attribute("data-level", "STALE")
@@ -70,7 +70,7 @@ def test_a_station_that_stops_is_stale_and_first(wall, stations):
 
 @pytest.mark.slow
 def test_a_tile_opens_its_station(wall):
-    wall.locator("[data-station=desk_2] a").click()
+    wall.locator("li[data-station=desk_2] a").click()
     expect(wall.locator("h1")).to_contain_text("desk_2")
     expect(wall.locator("#recorder_state")).to_have_text("idle")
     expect(wall.locator("#hand_left_text")).to_contain_text("contact")
@@ -82,10 +82,10 @@ def test_a_tile_opens_its_station(wall):
 
 @pytest.mark.slow
 def test_an_action_reaches_the_station_of_the_page(wall, stations):
-    wall.locator("[data-station=desk_2] a").click()
+    wall.locator("li[data-station=desk_2] a").click()
     expect(wall.locator("#recorder_state")).to_have_text("idle")
     wall.keyboard.press("a")
     expect(wall.locator("#recorder_state")).to_have_text("armed")
     wall.get_by_role("link", name="Fleet").click()
-    expect(wall.locator("[data-station=desk_2] .task")).not_to_have_text("no task")
-    expect(wall.locator("[data-station=desk_1] .task")).to_have_text("no task")
+    expect(wall.locator("li[data-station=desk_2] .task")).not_to_have_text("no task")
+    expect(wall.locator("li[data-station=desk_1] .task")).to_have_text("no task")

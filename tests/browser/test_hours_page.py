@@ -50,7 +50,7 @@ def test_hours_and_goals(page, serve, tmp_path):
     )
     expect(page.locator("#operator_rows tr")).to_have_text(["mika0.1 min0.3 min0.1 min0.5 min4"])
     expect(page.locator("#station_rows tr")).to_contain_text(["not known"])
-    expect(page.locator("#day_rows tr")).to_contain_text(["2026-05-04"])
+    expect(page.locator("#day_rows tr")).to_contain_text(["4 May 2026"])
     widths = (
         rows.filter(has_text="fold")
         .locator(".bar_part")

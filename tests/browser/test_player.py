@@ -288,7 +288,12 @@ def test_a_link_shows_the_same_elsewhere(watched, open_page, address, played):
     check(there, streams)
     for one in (page, other):
         names = one.locator(".plot .name").all_text_contents()
-        assert names == ["tactile_left", "action.0", "action.9", "wrist_left.0"]
+        assert names == [
+            "tactile_left",
+            "action: wrist left x",
+            "action: wrist right x",
+            "wrist_left: x",
+        ]
         expect(one.locator("#raw_note")).to_contain_text("take-1")
         expect(one.locator(".plot[data-signal=tactile_left]")).to_contain_text("raw counts")
         expect(one.locator(".plot[data-signal='wrist_left.0']")).to_contain_text(

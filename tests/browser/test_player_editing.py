@@ -62,6 +62,69 @@ def test_a_selection_is_trimmed_after_a_preview(page, address, store):
 
 
 @pytest.mark.slow
+def test_an_answer_to_an_earlier_dialog_is_not_written_into_the_next(page, address):
+    held = []
+
+    def hold(route):
+        held.append(route)
+
+    page.route("**/catalog/relabel", hold)
+    opened(page, address, "episode/take")
+    page.locator("#open_relabel").click()
+    dialog = page.locator("#edit_dialog")
+    dialog.get_by_role("button", name="Cancel").click()
+    seek(page, 1)
+    page.keyboard.press("]")
+    page.locator("#open_trim").click()
+    preview = dialog.locator(".preview")
+    expect(preview).to_contain_text("its end is cut off")
+    becomes = {"id": "other", "source_is": "kept", "messages": []}
+    with page.expect_response("**/catalog/relabel"):
+        held[0].fulfill(json={"edited": [becomes], "refused": []})
+    page.wait_for_timeout(100)
+    expect(preview).to_contain_text("its end is cut off")
+    expect(dialog.get_by_role("button", name="Trim to selection")).to_be_disabled()
+
+
+@pytest.mark.slow
+def test_space_presses_the_button_that_has_the_focus(page, address):
+    opened(page, address, "episode/take")
+    # Beside the slider, which can have no controls in it.
+    expect(page.locator("[role=slider] button")).to_have_count(0)
+    streams = page.get_by_role("button", name="Streams")
+    was_open = streams.get_attribute("aria-expanded") == "true"
+    streams.focus()
+    page.keyboard.press("Space")
+    expect(streams).to_have_attribute("aria-expanded", str(not was_open).lower())
+    expect(page.locator("#play_text")).to_have_text("Play")
+
+
+@pytest.mark.slow
+def test_a_browser_that_keeps_nothing_shows_the_pages(page, address):
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.add_init_script(
+        "Storage.prototype.getItem = Storage.prototype.setItem = () => { throw new Error('none') }"
+    )
+    opened(page, address, "episode/take")
+    streams = page.get_by_role("button", name="Streams")
+    was_open = streams.get_attribute("aria-expanded") == "true"
+    streams.click()
+    expect(streams).to_have_attribute("aria-expanded", str(not was_open).lower())
+    page.locator("#theme").click()
+    expect(page.locator("#theme_name")).to_have_text("light")
+    page.get_by_role("region", name="Action").hover()
+    page.get_by_role("button", name="Hide Action").click()
+    expect(page.get_by_role("region", name="Action")).to_be_hidden()
+    page.goto(address)
+    expect(page.locator("#prompt")).to_be_visible()
+    page.locator("#theme").click()
+    page.locator("#sounds").click()
+    expect(page.locator("#sounds")).to_have_text("Sounds: on")
+    assert problems == []
+
+
+@pytest.mark.slow
 def test_an_end_that_is_cut_off_needs_an_outcome(page, address, store):
     opened(page, address, "episode/take")
     seek(page, 1)
@@ -113,7 +176,7 @@ def test_a_relabel_changes_what_was_typed_and_nothing_else(page, address, store)
     dialog.locator("[name=instruction]").fill("it's up")
     dialog.locator("[name=instruction]").blur()
     expect(dialog.locator("code")).to_have_text(
-        """dextouch store relabel take --instruction 'it'"'"'s up'"""
+        r"""dextouch store relabel take --instruction 'it'\''s up'"""
     )
     dialog.get_by_role("button", name="Relabel").click()
     expect(dialog.locator("a.result")).to_have_text("take-relabelled-1")

@@ -83,3 +83,64 @@ def test_a_wrong_key_is_said_and_the_right_one_opens_the_page(serve, page, setti
     page.locator("body").press("c")
     expect(page.locator("#progress")).to_have_text("ada: 1 rated, 2 to go")
     assert MarkLog(settings.marks).history()[0].mark.cannot_judge
+
+
+@pytest.mark.slow
+def test_an_invited_rater_opens_a_link_and_keeps_keys_of_their_own(serve, page, settings):
+    key = {"name": "lead", "key": "the-lead's-own-key-4711", "scopes": ("rate_lead",)}
+    url = serve(create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)})))
+    page.goto(f"{url}/lead")
+    page.get_by_label("Key").fill(key["key"])
+    page.get_by_role("button", name="Show").click()
+    expect(page.get_by_role("table", name="agreement")).to_contain_text("0 of 3")
+    page.get_by_label("Name").fill("p07")
+    page.get_by_role("button", name="Make a link").click()
+    expect(page.get_by_role("table", name="raters")).to_contain_text("valid, until")
+    link = page.get_by_label("Link, shown only now").input_value()
+
+    page.goto(link)
+    expect(page.locator("#progress")).to_have_text("p07: 0 rated, 3 to go")
+    page.get_by_text("Keys", exact=True).click()
+    # The first criterion by "c", which was another action's: that one gets its key.
+    page.get_by_role("button", name="Criterion 1: 1").click()
+    page.locator("body").press("c")
+    expect(page.get_by_role("button", name="Cannot judge: 1")).to_be_visible()
+    expect(page.get_by_role("button", name="Criterion 1: C")).to_be_focused()
+    page.reload()
+    expect(page.locator(".criterion kbd").first).to_have_text("C")
+    for pressed in ("c", "2", "Enter"):
+        page.locator("body").press(pressed)
+    expect(page.locator("#progress")).to_have_text("p07: 1 rated, 2 to go")
+    page.locator("body").press("1")
+    expect(page.locator("#progress")).to_have_text("p07: 2 rated, 1 to go")
+    first, second = (stored.mark for stored in MarkLog(settings.marks).history())
+    assert first.holds == {"touched": True, "stayed": True}
+    assert second.cannot_judge
+
+    page.goto(f"{url}/lead")
+    page.get_by_label("Key").fill(key["key"])
+    page.get_by_role("button", name="Show").click()
+    expect(page.get_by_role("table", name="agreement")).to_contain_text("1 of 3")
+    page.get_by_role("button", name="Revoke the link of p07").click()
+    expect(page.get_by_role("table", name="raters")).to_contain_text("revoked")
+    page.goto(link)
+    expect(page.get_by_role("alert")).to_contain_text("was revoked or replaced")
+
+
+@pytest.mark.slow
+def test_a_refresh_keeps_what_was_said_and_says_when_it_fails(serve, page, settings):
+    key = {"name": "lead", "key": "the-lead's-own-key-4711", "scopes": ("rate_lead",)}
+    url = serve(create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)})))
+    page.clock.install()
+    page.goto(f"{url}/lead")
+    page.get_by_label("Key").fill(key["key"])
+    page.get_by_role("button", name="Show").click()
+    page.get_by_label("Name").fill("lead")
+    page.get_by_role("button", name="Make a link").click()
+    expect(page.get_by_role("alert")).to_contain_text("a key has this name")
+    with page.expect_response("**/invitations"):
+        page.clock.fast_forward(15_000)
+    expect(page.get_by_role("alert")).to_contain_text("a key has this name")
+    page.route("**/agreement", lambda route: route.abort())
+    page.clock.fast_forward(15_000)
+    expect(page.get_by_role("status")).to_contain_text("; not refreshed: ")

@@ -120,7 +120,7 @@ def test_another_operator_is_asked_for_consent(page, address):
     fill(page, operator="p8")
     expect(consent).not_to_be_checked()
     # What is armed is still p7: nothing is recorded under the wrong name.
-    expect(page.get_by_role("button", name="Record")).to_be_disabled()
+    expect(page.get_by_role("button", name="Record R", exact=True)).to_be_disabled()
     page.keyboard.press("Escape")
     page.keyboard.press("r")
     expect(message(page)).to_contain_text("arm again")
@@ -174,7 +174,7 @@ def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
     expect(page.locator("#instruction")).to_have_value("Stack the bowls")
     expect(page.get_by_label("Operator")).to_have_value("p7")
     expect(page.get_by_label("Consent given")).not_to_be_checked()
-    expect(page.get_by_role("button", name="Record")).to_be_enabled()
+    expect(page.get_by_role("button", name="Record R", exact=True)).to_be_enabled()
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_a_refused_take_is_shown_and_sent_again(page, serve, serve_station, spoo
     expect(waiting).to_contain_text("unknown task, said 6 times")
     assert (spool / take / "recording.json").exists()
     last = page.locator("#last_take")
-    expect(last).to_contain_text(f"{take} · refused by the store")
+    expect(last).to_contain_text(f"{take} refused by the store")
     expect(last).to_contain_text("unknown task, said 6 times")
 
 

@@ -29,6 +29,11 @@ WIDTHS_PX = {1366: 768, 1920: 1080}
 TALL_PX = 1700
 SCHEMES = ("light", "dark")
 CHECK = Path(__file__).with_name("read_screen.js").read_text()
+# File of axe-core, if it is to judge the pages.
+AXE = os.environ.get("DEXTOUCH_AXE")
+AXE_RUN = """async () => (await axe.run({ resultTypes: ["violations"] })).violations
+  .filter(({ impact }) => ["serious", "critical"].includes(impact))
+  .map(({ id, nodes }) => `axe ${id}: ${nodes.map(({ target }) => target).join(" | ")}`)"""
 # Folder that pictures are saved in, if any.
 PICTURES = os.environ.get("DEXTOUCH_SCREENS")
 # Two frames after the last change, the page shows it.
@@ -72,6 +77,9 @@ class Screens:
                 self.page.emulate_media(color_scheme=scheme)
                 self.page.evaluate(DRAWN)
                 found = self.page.evaluate(CHECK)
+                if AXE:
+                    self.page.evaluate(Path(AXE).read_text())
+                    found += self.page.evaluate(AXE_RUN)
                 self.faults += [f"{name}, {width_px} px, {scheme}: {one}" for one in found]
                 if PICTURES:
                     path = Path(PICTURES) / f"{name}_{width_px}_{scheme}.png"

@@ -110,6 +110,33 @@ def test_what_cannot_be_trusted_is_said_beside_the_number(opened, root):
 
 
 @pytest.mark.slow
+def test_the_picture_is_that_of_the_last_choice(opened, root):
+    finish(root)
+    opened.get_by_role("link", name="touch and sight").click()
+    picture, task = opened.locator("#picture"), opened.locator("#picture_task")
+    expect(picture).to_contain_text("all tasks")
+    late = []
+
+    def hold(route):
+        late.append(route)
+
+    opened.route("**/picture?*task=stand_bottle*", hold)
+    with opened.expect_request("**/picture?*task=stand_bottle*"):
+        task.select_option("stand_bottle")
+    task.select_option("open_drawer")
+    expect(picture).to_contain_text("open drawer")
+    with opened.expect_response("**/picture?*task=stand_bottle*"):
+        late[0].continue_()
+    opened.evaluate("new Promise(requestAnimationFrame)")
+    expect(picture).to_contain_text("open drawer")
+    opened.unroute("**/picture?*task=stand_bottle*")
+    problem = {"detail": "the study was moved"}
+    opened.route("**/picture?*", lambda route: route.fulfill(status=404, json=problem))
+    task.select_option("stand_bottle")
+    expect(picture).to_have_text("the study was moved")
+
+
+@pytest.mark.slow
 def test_rates_are_sorted_by_any_column(opened, root):
     finish(root)
     opened.get_by_role("link", name="touch and sight").click()

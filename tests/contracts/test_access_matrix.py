@@ -26,6 +26,7 @@ SCOPES = (
     "watch",
     "study_read",
     "rate",
+    "rate_lead",
     "teleop",
     "operate",
     "enrol",
@@ -60,6 +61,7 @@ TABLE = {
         "GET /v1/uploads": "station",
         "GET /v1/uploads/{recording_id}": "station",
         "POST /v1/uploads/{recording_id}/retry": "station",
+        "POST /v1/faults/{fault}": "station",
         "GET /v1/practice": "station",
         "POST /v1/practice/start": "station",
         "POST /v1/practice/stop": "station",
@@ -142,22 +144,28 @@ TABLE = {
         "GET /v1/studies": "study_read",
         "GET /v1/studies/{name}": "study_read",
         "GET /v1/studies/{name}/rollouts": "study_read",
+        "GET /v1/studies/{name}/picture": "study_read",
     },
     "rating": {
         "GET /v1/rating/next": "rate",
         "GET /v1/rating/rollouts/{token}/steps/{step}.jpg": "rate",
         "POST /v1/rating/marks": "rate",
+        "GET /v1/rating/agreement": "rate_lead",
+        "GET /v1/rating/invitations": "rate_lead",
+        "POST /v1/rating/invitations": "rate_lead",
+        "POST /v1/rating/invitations/{rater}/revoke": "rate_lead",
     },
     "teleoperation": {
         "WEBSOCKET /v1/teleop/{side}": "teleop",
         "POST /v1/teleop/{side}/stop": "teleop",
     },
 }
-# The page where raters enter their key, and its files.
-RATING_PAGE = {"GET /", "GET /rate.js", "GET /rate.css", "GET /rate.svg"}
+# The pages where raters, and whoever leads them, enter their key, and their files.
+RATING_FILES = ("rate.js", "rate.css", "rate.svg", "lead", "lead.js", "keys.js", "request.js")
+RATING_PAGE = {"GET /"} | {f"GET /{name}" for name in RATING_FILES}
 SIGN_IN = {"POST /sign_in", "POST /sign_out"}
 PATH_VALUES = {"number": "0", "chunk": "0", "step": "0", "token": "0" * 20, "watch_id": "0" * 32}
-PATH_VALUES |= {"side": "right"}
+PATH_VALUES |= {"side": "right", "rater": "bob"}
 WRONG_KEY = "wrong-key-of-some-length"
 
 

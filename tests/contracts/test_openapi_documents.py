@@ -17,7 +17,8 @@ OPERATIONS = {
         get_recorder arm_recorder start_recording stop_recording save_take discard_take
         rerecord_take begin_session get_station_health list_health_events get_health_history
         list_uploads get_upload retry_upload get_live_overview get_live_taxels get_live_poses
-        list_cameras get_camera_image get_practice start_practice stop_practice""",
+        list_cameras get_camera_image get_practice start_practice stop_practice
+        set_fault""",
     "alignment": """
         start_alignments list_alignments get_alignment cancel_alignment get_calibration
         start_practice stop_practice start_calibration_run get_calibration_run
@@ -25,7 +26,8 @@ OPERATIONS = {
         drop_calibration_place finish_calibration_run cancel_calibration_run""",
     "dashboard": """
         get_heatmap_layout get_overview operate_recorder retry_upload get_camera_image
-        start_comparison stop_comparison get_comparison_chunk get_system list_audit_entries""",
+        start_comparison move_hands stop_comparison get_comparison_chunk get_system
+        list_audit_entries""",
     "episode_store": """
         create_recording upload_batch finish_recording get_recording list_uploads expire_uploads
         list_recordings list_episodes get_hours get_hours_by_field list_items
@@ -37,8 +39,10 @@ OPERATIONS = {
         check_takes confirm_deletions list_enrolments issue_enrolment exchange_enrolment
         revoke_enrolment trim_episode_steps relabel_items list_notes save_note delete_note
         download_items""",
-    "rating": "get_next_rollout get_step_image submit_mark",
-    "studies": "list_studies get_study list_study_rollouts",
+    "rating": """
+        get_next_rollout get_step_image submit_mark get_agreement list_invitations invite_rater
+        revoke_rater""",
+    "studies": "list_studies get_study get_study_picture list_study_rollouts",
     "teleoperation": "stop_hand",
     "worlds": """
         list_worlds start_rollout get_rollout delete_rollout send_chunk fork_rollout

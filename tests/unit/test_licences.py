@@ -11,6 +11,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NAMED = {
     "Apache-2.0": r"Apache license 2|Apache License\s+Version 2\.0",
     "BSD-3-Clause": r"BSD-3-Clause",
+    "ISC": r"and/or distribute this software for any\s+purpose with or without\s+fee",
     "MIT": r"\bMIT\b",
     "MPL-2.0": r"Mozilla Public License,? (Version )?2\.0",
     "others": r"\bBSD-2|\bISC\b|\bL?GPL|General Public|Zlib|Unlicense|CC0|Creative Commons",

@@ -156,7 +156,9 @@ def _shared(
         explained = left.take(streams, lambda f, gone=is_gone: gone or f.code in LINK_CODES)  # type: ignore[misc]
         what = "nothing comes from" if is_gone else "data is lost or late of"
         text = f"{CAUSES[kind].title} {name}: {what} {', '.join(members)}"
-        yield _cause(kind, name, text, explained)
+        is_simulated = all(known[member].simulated for member in members)
+        advice = SIMULATED_ADVICE if is_simulated else ""
+        yield _cause(kind, name, text, explained, advice=advice)
 
 
 def _gone(left: _Unexplained, known: Mapping[str, DeviceHealth]) -> Iterator[HealthCause]:

@@ -54,9 +54,10 @@ NUMBERS = {
 SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 
 Edit = Callable[[bytes], bytes]
-Pinned = Literal["stuck", "saturated"]
+Pinned = Literal["dead", "stuck", "saturated"]
 WINDOWS = ("stalls_s", "unplugged_s", "occluded_s", "not_running_s", "jumped_s")
 FORMAT = "dextouch mock ledger 1"
+DRIFT_SHARE = 0.005
 # A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40.
 _numbers = partial(array, "q")
 
@@ -253,7 +254,7 @@ class PacketEdits(ABC):
     marks_nan = False
 
     def __init__(self, pinned: Mapping[Pinned, float] | None = None) -> None:
-        self._pinned = pinned or {}
+        self._pinned: Mapping[Pinned, float] = {"dead": 0.0, **pinned} if pinned else {}
 
     @abstractmethod
     def fields(self, data: bytes) -> PacketFields:
@@ -272,12 +273,25 @@ class PacketEdits(ABC):
         """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
         return self.marks_nan
 
+    def pins(self, how: Pinned) -> bool:
+        """Whether raw cells can be pinned so."""
+        return how in self._pinned
+
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Raw cells of a glove that show the same whatever presses them."""
         fields = self.fields(data)
-        if fields.numbers is None or how not in self._pinned:
+        if fields.numbers is None or not self.pins(how):
             raise _cannot("a taxel that is pinned")
         fields.numbers[list(cells)] = self._pinned[how]
+        return self.packed(data, fields)
+
+    def move_zero(self, data: bytes) -> bytes:
+        """A glove whose zero has moved, by 0.5 % of full scale."""
+        fields = self.fields(data)
+        if fields.numbers is None or not self.pins("saturated"):
+            raise _cannot("readings of a glove")
+        full_scale = self._pinned["saturated"]
+        fields.numbers[:] = np.minimum(fields.numbers + DRIFT_SHARE * full_scale, full_scale)
         return self.packed(data, fields)
 
     def put_nan(self, data: bytes) -> bytes:

@@ -319,17 +319,18 @@ class SocketPort(MockPort):
     def unplug(self) -> None:
         """Close the connection and refuse new ones."""
         self._plugged = False
-        if self._device_end is not None:
-            self._device_end.close()
-            self._device_end = None
+        end, self._device_end = self._device_end, None
+        if end is not None:
+            end.close()
 
     def send(self, unit: bytes) -> bool:
         """Send all; a host that takes nothing for a second loses it."""
-        if self._device_end is None:
+        end = self._device_end
+        if end is None:
             return False
         self.link.add_sent(len(unit))
         try:
-            self._device_end.sendall(unit)
+            end.sendall(unit)
         except OSError:
             self.link.add_sent(-len(unit))
             return False
@@ -338,9 +339,10 @@ class SocketPort(MockPort):
     def _connect(self) -> socket.socket:
         if not self._plugged:
             raise ConnectionRefusedError(errno.ECONNREFUSED, "the mock device is unplugged")
-        if self._device_end is not None:
+        before, (end, host_end) = self._device_end, socket.socketpair()
+        if before is not None:
             with contextlib.suppress(OSError):
-                self._device_end.close()
-        self._device_end, host_end = socket.socketpair()
-        self._device_end.settimeout(SEND_TIMEOUT_S)
+                before.close()
+        end.settimeout(SEND_TIMEOUT_S)
+        self._device_end = end
         return host_end

@@ -145,6 +145,11 @@ class MockDevice:
         self._taxel_edits: list[Edit] = [
             partial(self._edits.pin, cells=cells, how=how) for how, cells in pinned.items() if cells
         ]
+        # Of one who shows a fault on request.
+        self.extra_edits: tuple[Edit, ...] = ()
+        # Who holds it unplugged: the script of faults, and one who shows a fault.
+        self._unplugged_by: set[str] = set()
+        self._plugging = threading.Lock()
         self._next_sequence = faults.first_sequence
         # The device numbers all that it sends, in the order in which it sends it.
         self._numbering = threading.Lock()
@@ -174,10 +179,8 @@ class MockDevice:
             if event.sample_index is not None:
                 with self._numbering:
                     self._send(event.sample_index, schedule)
-            elif event.plug:
-                self.port.plug()
             else:
-                self.port.unplug()
+                self.set_plugged("script", is_plugged=event.plug)
             if lockstep and (event.plug or event.sample_index is not None):
                 self.port.link.wait_consumed()
             elif lockstep:
@@ -199,6 +202,14 @@ class MockDevice:
             if start_ns <= t_ns <= end_ns
         )
         return heapq.merge(packets, edges, key=attrgetter("t_ns"))
+
+    def set_plugged(self, by: str, *, is_plugged: bool) -> None:
+        """Plug in or pull out on behalf of somebody; it is plugged while nobody holds it out."""
+        with self._plugging:
+            was_out = bool(self._unplugged_by)
+            (self._unplugged_by.discard if is_plugged else self._unplugged_by.add)(by)
+            if was_out != bool(self._unplugged_by):
+                (self.port.unplug if self._unplugged_by else self.port.plug)()
 
     def send_aside(self, make: Callable[[int], bytes]) -> None:
         """Send what is made of the next sequence number; it has no ledger entry."""
@@ -269,7 +280,7 @@ class MockDevice:
     def _edit(self, units: list[bytes], t_true_ns: int, fate: Fate) -> tuple[list[bytes], Fate]:
         """What the device says instead, with what is wrong in itself."""
         faults = self.faults
-        edits = list(self._taxel_edits)
+        edits = [*self._taxel_edits, *self.extra_edits]
         for from_s, edit in (
             (faults.version_from_s, self._edits.other_version),
             (faults.wrong_side_from_s, self._edits.other_side),

@@ -3,38 +3,27 @@
 import {
   ageWords, capital, countWords, delayRows, isOfCamera, LEVELS, nextWords, placesWords, polygon, progressOf, runLevel, runTitle, secondsLeft, signsOf,
 } from "./calibration_words.js";
-import { element, levelBadge, setText, showChildren } from "./dom.js";
+import * as api from "./catalog/api.js";
+import { element, find, levelBadge, setText, showChildren, why } from "./dom.js";
+import { keep, kept } from "./kept.js";
 import { ask } from "./session.js";
-import { startTheme } from "./theme.js";
 
 const PERIOD_MS = 300;
 const API = "/v1/alignment/calibration";
 const SVG = "http://www.w3.org/2000/svg";
 const ENDED = ["done", "failed", "cancelled"];
-const find = (id) => document.getElementById(id);
 
 let chosen = null;
 let isPractised = false;
-let closed = sessionStorage.getItem("closed_run");
+let closed = kept("closed_run", "sessionStorage");
 let shown = { run_id: "", state: "", image_index: -1 };
 const PRACTICE_WORDS = {
   off: "Nothing has to be calibrated. To practise, start simulated devices: a board moves before the head camera, trackers move with it, gloves lie untouched.",
   on: "You practise with simulated devices; their calibration is kept apart from that of real ones. The board is chessboard:9x6:25mm.",
 };
 
-async function get(path) {
-  const answer = await ask(`${API}${path}`);
-  const data = await answer.json();
-  if (!answer.ok) throw new Error(data.detail ?? `refused (${answer.status})`);
-  return data;
-}
-
-async function post(path, body) {
-  const answer = await ask(`${API}${path}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body ?? {}) });
-  const data = await answer.json();
-  if (!answer.ok) throw new Error(data.detail ?? `refused (${answer.status})`);
-  return data;
-}
+const get = (path) => api.get(`${API}${path}`);
+const post = (path, body = {}) => api.post(`${API}${path}`, body);
 
 function regions(item) {
   if (item.views_by_region.length === 0) return "";
@@ -45,14 +34,12 @@ function regions(item) {
 function row(item) {
   const begin = item.run === null ? null : element("button", { type: "button" }, "Guided run");
   begin?.addEventListener("click", () => choose(item));
-  const badge = levelBadge(LEVELS[item.state]);
-  badge.textContent = item.state;
   return element("tr", { "data-name": item.name },
-    element("td", {}, badge),
-    element("td", { class: "name" }, item.title, element("span", { class: "why" }, item.name)),
+    element("td", {}, levelBadge(LEVELS[item.state], item.state)),
+    element("td", { class: "name" }, item.title, why(item.name)),
     element("td", { class: "number" }, ageWords(item.age_days)),
     element("td", {}, item.sigma),
-    element("td", { class: "free" }, item.residual, item.meaning ? element("span", { class: "why" }, item.meaning) : null),
+    element("td", { class: "free" }, item.residual, why(item.meaning)),
     element("td", {}, regions(item)),
     element("td", { class: "free step" }, element("span", {}, ...item.reasons.map((reason) => element("strong", { class: "why" }, reason)), item.step)),
     element("td", {}, begin));
@@ -99,12 +86,12 @@ function choose(item) {
   const hasBoard = isOfCamera({ request: item.run });
   setText(find("begin_title"), runTitle(item.run));
   setText(find("begin_step"), item.step);
-  find("board").value = isPractised ? "chessboard:9x6:25mm" : localStorage.getItem("board") ?? "charuco:5x7:30mm:22mm";
+  find("board").value = isPractised ? "chessboard:9x6:25mm" : kept("board") ?? "charuco:5x7:30mm:22mm";
   for (const id of ["board_field", "board_help"]) find(id).hidden = !hasBoard;
-  const kept = item.num_kept_places;
-  find("resume_field").hidden = kept === 0;
+  const numKept = item.num_kept_places;
+  find("resume_field").hidden = numKept === 0;
   find("resume").checked = true;
-  setText(find("resume_words"), `Go on with the ${kept} ${kept > 1 ? "places" : "place"} of the run that was ended`);
+  setText(find("resume_words"), `Go on with the ${numKept} ${numKept > 1 ? "places" : "place"} of the run that was ended`);
   find("begin").hidden = false;
   find("begin").scrollIntoView({ block: "nearest" });
   (hasBoard ? find("board") : find("begin_form").querySelector("button")).focus();
@@ -113,7 +100,7 @@ function choose(item) {
 async function begin(event) {
   event.preventDefault();
   const board = isOfCamera({ request: chosen.run }) ? find("board").value.trim() : "";
-  if (board && !isPractised) localStorage.setItem("board", board);
+  if (board && !isPractised) keep("board", board);
   const isResumed = chosen.num_kept_places > 0 && find("resume").checked;
   await act(async () => {
     const run = await post("/runs", { ...chosen.run, board, is_resumed: isResumed });
@@ -283,22 +270,18 @@ find("answer_form").addEventListener("submit", (event) => {
   event.preventDefault();
   reply(find("answer").value);
 });
-find("practice_start").addEventListener("click", ({ target }) => switchPractice("start", target));
-find("practice_stop").addEventListener("click", ({ target }) => switchPractice("stop", target));
-for (const order of ["take", "drop"]) find(`run_${order}`).addEventListener("click", () => act(async () => showRun(await post(`/run/${order}`))));
+for (const way of ["start", "stop"]) find(`practice_${way}`).addEventListener("click", ({ target }) => switchPractice(way, target));
+for (const order of ["take", "drop", "finish", "cancel"]) find(`run_${order}`).addEventListener("click", () => act(async () => showRun(await post(`/run/${order}`))));
 addEventListener("keydown", (event) => {
   const id = { t: "run_take", d: "run_drop" }[event.key.toLowerCase()];
   if (!id || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, select") || find("run").hidden || find(id).hidden) return;
   event.preventDefault();
   find(id).click();
 });
-find("run_finish").addEventListener("click", () => act(async () => showRun(await post("/run/finish"))));
-find("run_cancel").addEventListener("click", () => act(async () => showRun(await post("/run/cancel"))));
 find("run_close").addEventListener("click", () => {
   closed = shown.run_id;
-  sessionStorage.setItem("closed_run", closed);
+  keep("closed_run", closed, "sessionStorage");
   find("run").hidden = true;
 });
-startTheme(find("theme"), () => {});
 await showItems();
 poll();

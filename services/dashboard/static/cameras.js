@@ -21,7 +21,8 @@ export class CameraPanel {
   }
 
   show(cameras) {
-    this.section.hidden = cameras.length === 0;
+    // Once there, the panel stays, so that nothing moves when images are late.
+    if (cameras.length > 0) this.section.hidden = false;
     const gone = new Set(this.figures.keys());
     for (const camera of cameras) {
       gone.delete(camera.name);

@@ -1,17 +1,26 @@
-// Real against imagined: starts a replay, follows it as its chunks arrive, and goes back to any step.
+// Real against imagined: replays an episode or moves hands, follows the chunks as they arrive, and goes back to any step.
 
+import { get, post } from "./catalog/api.js";
 import { chunkOf, difference, uncertaintyAt, firstUnreliable, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
 import { ComparisonCharts } from "./comparison_charts.js";
-import { element, setText } from "./dom.js";
+import { element, find, levelBadge, say, setText, showChildren } from "./dom.js";
 import { number } from "./format.js";
+import { HandDriving } from "./hand_driving.js";
 import { HandCanvas } from "./hands.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, uncertaintyOf } from "./rollout_rows.js";
+import { uncertaintyOf } from "./rollout_rows.js";
 import { ask } from "./session.js";
 import { StepPlayer } from "./step_player.js";
 
+const OUTCOMES = { true: "success", false: "failure", null: "outcome unknown" };
+const RETRY_MS = 2000;
 const LEVELS = { running: "OK", finished: "OK", stopped: "STALE", failed: "ERROR" };
-const find = (id) => document.getElementById(id);
+
+// Values of a list with their words; what was chosen stays chosen.
+function fill(list, choices, chosen = list.value) {
+  showChildren(list, choices.map(([value, text]) => element("option", { value }, text)));
+  if (choices.some(([value]) => value === chosen)) list.value = chosen;
+}
 
 export class ComparisonPanel {
   constructor(heatmap) {
@@ -20,45 +29,83 @@ export class ComparisonPanel {
     this.loading = false;
     this.hands = Object.fromEntries(SIDES.map((world) => [world, Object.fromEntries(["left", "right"].map((side) =>
       [side, new HandCanvas(find(`${world}_${side}`), { summary: find(`${world}_${side}_text`) }, side, heatmap)]))]));
-    this.charts = new ComparisonCharts(find("charts"), (step) => this.goTo(step));
+    this.charts = new ComparisonCharts(find("charts"), find("uncertainty_strip"), (step) => this.goTo(step));
     this.player = new StepPlayer({ show: (step) => this.showStep(step) });
+    this.driving = new HandDriving(find("drive_pad"), find("drive_sides"), async (moves) => this.show(await post(`/v1/comparisons/${this.view.id}/moves`, moves)));
     find("replay").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.start(find("replay_episode").value.trim());
+      this.start({ episode_id: find("replay_episode").value });
     });
-    find("replay_stop").addEventListener("click", () => this.post("/v1/comparisons/stop"));
+    find("drive").addEventListener("submit", async (event) => {
+      event.preventDefault();
+      if (await this.start({ task: find("drive_task").value, seed: Number(find("drive_seed").value) })) find("drive_pad").focus();
+    });
+    find("replay_stop").addEventListener("click", () => post("/v1/comparisons/stop").catch((error) => this.say(error.message, "ERROR")));
+    for (const one of [window, find("replay_episode")]) one.addEventListener("focus", () => this.offerAgain());
     find("comparison_step").addEventListener("input", (event) => this.goTo(Number(event.target.value)));
     find("comparison_pause").addEventListener("click", () => this.pause(!this.player.paused));
-    find("replay_episode").addEventListener("focus", () => this.suggest(), { once: true });
-    const wanted = new URLSearchParams(location.search).get("replay");
-    if (wanted) find("replay_episode").value = wanted;
+    find("go_to_moment").addEventListener("click", () => this.goTo(this.charts.left));
   }
 
-  async post(path, body) {
-    const options = { method: "POST" };
-    if (body) Object.assign(options, { headers: { "content-type": "application/json" }, body: JSON.stringify(body) });
-    const answer = await ask(path, options);
-    if (!answer.ok) this.note((await answer.json()).detail ?? `refused (${answer.status})`, "ERROR");
-    return answer.ok;
+  say(text, level) {
+    say(find("comparison_note"), text, level);
   }
 
-  async start(episode_id) {
-    this.note("Starting.");
-    if (await this.post("/v1/comparisons", { episode_id })) this.note("");
+  async start(asked) {
+    this.say("Starting.");
+    try {
+      const view = await post("/v1/comparisons", asked);
+      this.say("");
+      this.show(view);
+      return true;
+    } catch (error) {
+      this.say(error.message, "ERROR");
+      return false;
+    }
   }
 
-  async suggest() {
-    const answer = await ask("/v1/episode_store/episodes?domain=robot&limit=50").catch(() => null);
-    if (!answer?.ok) return;
-    const { episodes } = await answer.json();
+  // Robot episodes of tasks that the world model knows, with one that the address names, and tasks to move hands in.
+  async offer(listed) {
+    this.listed = listed;
+    const tasksOf = (kind) => listed.worlds.find((one) => one.kind === kind)?.tasks ?? [];
+    const [real, imagined] = [tasksOf("twin"), tasksOf("model")];
+    const key = JSON.stringify([real, imagined, listed.has_episodes]);
+    if (key === this.offered) return;
+    this.offered = key;
+    clearTimeout(this.retry);
+    const both = real.filter((task) => imagined.includes(task));
+    fill(find("drive_task"), both.map((task) => [task, task]));
+    find("drive").hidden = both.length === 0;
+    let found = [];
+    let problem = "";
+    try {
+      if (listed.has_episodes) found = (await get("/v1/episode_store/episodes?domain=robot&limit=100")).episodes;
+    } catch (error) {
+      problem = `Episodes cannot be listed: ${error.message}`;
+    }
+    if (this.offered !== key) return;
+    // The episodes of before stay.
+    if (problem) this.retry = setTimeout(() => this.offerAgain(), RETRY_MS);
+    else this.fillEpisodes(found, real, imagined);
+    const none = find("replay_episode").value ? "" : !listed.has_episodes ? "Replays need an episode store: this dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL."
+      : "No robot episode of a task that the world model knows yet: dextouch demo records one, dextouch twin record as many as you want.";
+    setText(find("offer_note"), problem || (imagined.length ? none : "Replays need a world model: dextouch up serves one."));
+  }
+
+  offerAgain() {
+    this.offered = null;
+    if (this.listed) this.offer(this.listed);
+  }
+
+  fillEpisodes(found, real, imagined) {
     // Those of a station have no seed, by which the twin places its objects.
-    const seeded = episodes.filter((one) => one.origin !== "recorded");
-    find("episodes").replaceChildren(...seeded.map((one) => element("option", { value: one.episode_id }, one.task)));
-  }
-
-  note(text, level = "") {
-    find("comparison_note").dataset.level = level;
-    setText(find("comparison_note"), text);
+    const suitable = found.filter(({ task, origin }) => imagined.includes(task) && (origin === "recorded" || real.includes(task)));
+    const list = find("replay_episode");
+    const wanted = list.value || new URLSearchParams(location.search).get("replay");
+    const named = wanted && !suitable.some((one) => one.episode_id === wanted) ? [[wanted, wanted]] : [];
+    fill(list, [...named, ...suitable.map((one) => [one.episode_id,
+      `${one.task}: ${one.episode_id}, ${one.duration_s.toFixed(1)} s, ${OUTCOMES[one.success]}, against ${one.origin === "recorded" ? "its recording" : "the twin"}`])], wanted);
+    find("replay_button").disabled = !list.value;
   }
 
   pause(paused) {
@@ -72,7 +119,11 @@ export class ComparisonPanel {
   }
 
   show(view) {
-    if (view.state === "none") return;
+    if (view.state === "none") {
+      // The dashboard was started again since; what has arrived stays.
+      if (this.view?.state === "running") this.show({ ...this.view, state: "stopped", num_chunks: this.chunks.length });
+      return;
+    }
     const isNew = this.view?.id !== view.id;
     this.view = view;
     if (isNew) {
@@ -80,14 +131,31 @@ export class ComparisonPanel {
       this.player.load(0);
       this.pause(false);
     }
-    find("comparison_state").replaceChildren(badge({ level: LEVELS[view.state], word: view.state }),
-      element("span", {}, `${view.task}, ${view.episode_id}`),
+    find("comparison_state").replaceChildren(levelBadge(LEVELS[view.state], view.state),
+      element("span", {}, `${view.task}, ${view.episode_id || `hands moved by you, seed ${view.seed}`}`),
       element("span", { class: "quiet" }, `step ${Math.max(0, view.pixel_error.length - 1)} of ${view.num_steps}`));
     find("replay_stop").hidden = view.state !== "running";
-    if (view.note) this.note(view.note, view.state === "failed" ? "ERROR" : "WARN");
+    find("drive_pad").hidden = view.state !== "running" || view.episode_id !== "";
+    for (const name of document.querySelectorAll(".real_name")) setText(name, view.worlds.real === "recording" ? "Recording" : "Twin");
+    if (view.note) this.say(view.note, view.state === "failed" ? "ERROR" : "WARN");
     find("compared").hidden = view.pixel_error.length === 0;
     this.charts.show(view);
+    this.showMoment();
     this.load();
+  }
+
+  // When the imagination left what its model knows, in words, and what both worlds say about the outcome.
+  showMoment() {
+    const { uncertainties, rate_hz, real_success, num_steps } = this.view;
+    const first = uncertainties.find((one) => one.uncertainty?.outside);
+    const shares = uncertainties.map((one) => one.bound_share).filter((share) => share !== null);
+    const within = shares.length ? `Within what it knows so far: at most ${number(100 * Math.max(...shares), 0)} % of its bound.` : "This world model reports no share of a bound.";
+    setText(find("moment"), first ? `Leaves what it knows at ${(first.first_step / rate_hz).toFixed(1)} s (step ${first.first_step}): ${first.uncertainty.reason}. What follows is unreliable.` : within);
+    find("moment").dataset.level = first ? "WARN" : "";
+    find("go_to_moment").hidden = !first;
+    const imagined = uncertainties.at(-1)?.uncertainty?.success_probability ?? null;
+    const isWhole = this.view.pixel_error.length > num_steps;
+    setText(find("outcomes"), isWhole && (real_success !== null || imagined !== null) ? `Real: ${OUTCOMES[real_success]}. Imagined: ${imagined === null ? "no estimate" : `success with ${(100 * imagined).toFixed(0)} %`}.` : "");
   }
 
   // Chunks are fetched one after the other, in order, and played as they come.
@@ -97,8 +165,8 @@ export class ComparisonPanel {
     try {
       while (this.view && this.chunks.length < this.view.num_chunks) {
         const { id, rate_hz } = this.view;
-        const answer = await ask(`/v1/comparisons/${id}/chunks/${this.chunks.length}`);
-        if (!answer.ok || this.view.id !== id) break;
+        const answer = await ask(`/v1/comparisons/${id}/chunks/${this.chunks.length}`).catch(() => null);
+        if (!answer?.ok || this.view.id !== id) break;
         const chunk = readChunk(await answer.arrayBuffer());
         this.chunks.push(chunk);
         const count = chunk.first_step + chunk.num_steps;
@@ -122,7 +190,7 @@ export class ComparisonPanel {
     const said = uncertaintyAt(this.view.uncertainties, step);
     const earlier = firstUnreliable(this.view.uncertainties, step);
     const uncertainty = said ? uncertaintyOf({ doubt: said.uncertainty, rollout_doubt: earlier, kind: "model", next_chunk: 1 }) : { text: "given, not imagined", reason: "" };
-    find("imagined_uncertainty").dataset.outside = Boolean(earlier);
+    find("imagined_uncertainty").closest("figure").dataset.outside = Boolean(earlier);
     const words = said?.uncertainty?.outside ? `unreliable: ${uncertainty.reason}` : earlier ? uncertainty.reason : said ? `uncertainty ${uncertainty.text}` : uncertainty.text;
     setText(find("imagined_uncertainty"), words);
     const { pixel_error, pressure_error_kpa, contact_f1, in_contact } = this.view;

@@ -1,11 +1,9 @@
 // Devices panel: the computer, then one line a root cause, then one row a stream, grouped by device.
 
+import { post } from "./catalog/api.js";
 import { element, levelBadge, setText, showChildren } from "./dom.js";
 import { age, count, number } from "./format.js";
 import { sparkline } from "./sparkline.js";
-
-// Further causes are folded, so that the rows stay in view.
-const UNFOLDED = 2;
 
 function duration(value_s) {
   if (value_s === null || value_s < 120) return age(value_s);
@@ -32,20 +30,34 @@ export class DevicesPanel {
     this.host = find("host");
     this.note = find("devices_note");
     this.causes = find("causes");
+    this.faults = document.getElementById("faults");
+    this.faults.addEventListener("click", ({ target }) => target.name && this.setFault(target));
     this.body = find("device_rows");
     this.trends = {};
-    // Causes that the operator unfolded, by key; "" is the fold of further causes.
+    // Causes that the operator unfolded, by key.
     this.open = new Set();
     this.streams = [];
+    // Numbers of the causes that explain a stream, widest first.
+    this.causesOf = new Map();
+  }
+
+  async setFault(button) {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    const said = await post(`/v1/acquisition/faults/${button.name}`, { on }).then(() => "", (error) => error.message);
+    setText(this.faults.querySelector("[role=alert]"), said);
   }
 
   show(station) {
+    this.faults.hidden = !station.faults;
+    for (const button of this.faults.querySelectorAll("button")) button.setAttribute("aria-pressed", String(station.faults?.includes(button.name)));
+    this.causesOf.clear();
+    station.causes.forEach(({ streams }, index) => streams.forEach((name) => this.causesOf.set(name, [...(this.causesOf.get(name) ?? []), index + 1])));
     this.note.hidden = station.note === "";
     this.note.dataset.level = station.note_level;
     setText(this.note, station.note);
     this.host.hidden = station.host === null;
     if (station.host) showChildren(this.host, [levelBadge(station.host.level), element("span", { class: "quiet" }, hostText(station.host))]);
-    this.showCauses(station.causes);
+    showChildren(this.causes, station.causes.map((cause, index) => this.cause(cause, index + 1)));
     this.streams = station.streams;
     this.showRows();
   }
@@ -55,35 +67,21 @@ export class DevicesPanel {
     this.showRows();
   }
 
-  showCauses(causes) {
-    const nodes = causes.slice(0, UNFOLDED).map((cause) => this.cause(cause));
-    const rest = causes.slice(UNFOLDED);
-    if (rest.length) {
-      const text = rest.length === 1 ? `1 more cause: ${rest[0].message}` : `${rest.length} more causes`;
-      nodes.push(this.fold("", element("summary", { class: "quiet" }, text), rest.map((cause) => this.cause(cause))));
-    }
-    showChildren(this.causes, nodes);
-  }
-
-  cause(cause) {
+  cause(cause, number) {
     const lasted = cause.lasted_s === null ? "" : ` · for ${duration(cause.lasted_s)}`;
-    const streams = cause.num_streams > 1 ? ` · ${cause.num_streams} streams` : "";
+    const streams = cause.streams.length > 1 ? ` · ${cause.streams.length} streams` : "";
     const line = [
-      levelBadge(cause.level),
+      levelBadge(cause.level, `${number} ${cause.level}`),
       element("span", { class: "cause_text" },
         element("strong", {}, cause.message), element("span", { class: "quiet" }, lasted + streams),
         cause.advice ? element("span", { class: "to_do" }, cause.advice) : null),
     ];
-    const attributes = { class: "cause", "data-level": cause.level };
+    const attributes = { class: "cause", "data-level": cause.level, id: `cause_${number}` };
     if (!cause.findings.length) return element("div", attributes, ...line);
     const list = element("ul", {}, ...cause.findings.map((text) => element("li", {}, text)));
-    return this.fold(cause.key, element("summary", {}, ...line), [list], attributes);
-  }
-
-  fold(key, summary, children, attributes = {}) {
-    const details = element("details", { ...attributes, "data-key": key }, summary, ...children);
-    details.open = this.open.has(key);
-    details.addEventListener("toggle", () => (details.open ? this.open.add(key) : this.open.delete(key)));
+    const details = element("details", { ...attributes, "data-key": cause.key }, element("summary", {}, ...line), list);
+    details.open = this.open.has(cause.key);
+    details.addEventListener("toggle", () => (details.open ? this.open.add(cause.key) : this.open.delete(cause.key)));
     return details;
   }
 
@@ -106,8 +104,11 @@ export class DevicesPanel {
 
   row(stream, device) {
     const about = [device, stream.note].filter((text) => text && text !== stream.name).join(" · ");
-    return element("tr", { "data-level": stream.level },
-      element("td", {}, levelBadge(stream.level)),
+    const causes = this.causesOf.get(stream.name);
+    // What a cause says is not said again in every row.
+    return element("tr", { "data-level": stream.level, class: causes ? "explained" : null },
+      element("td", {}, causes ? element("a", { class: "level", "data-level": stream.level, href: `#cause_${causes[0]}`, title: stream.level }, `cause ${causes.join(", ")}`)
+        : levelBadge(stream.level)),
       element("td", { class: "name" }, element("span", { class: "name_text", title: about || null }, stream.name,
         about ? element("span", { class: "quiet" }, ` ${about}`) : null)),
       element("td", { class: "trend", "data-level": stream.level }, sparkline(this.trends[stream.name] ?? [])),

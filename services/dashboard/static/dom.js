@@ -9,12 +9,39 @@ export function element(tag, attributes = {}, ...children) {
   return node;
 }
 
-export function levelBadge(level) {
-  return element("span", { class: "level", "data-level": level }, level);
+export const find = (id) => document.getElementById(id);
+
+export function levelBadge(level, text = level) {
+  return element("span", { class: "level", "data-level": level }, text);
+}
+
+// Words beneath the value of a cell, if there are some.
+export function why(text) {
+  return text ? element("span", { class: "why" }, text) : null;
 }
 
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
+}
+
+// A note in the colour of its level, if it has one.
+export function say(node, text, level = null) {
+  if (level) node.dataset.level = level;
+  else delete node.dataset.level;
+  setText(node, text);
+}
+
+// Work now, and again and again while somebody looks at the page.
+export function repeat(work, period_ms) {
+  let timer = null;
+  const tick = async () => {
+    clearTimeout(timer);
+    if (!document.hidden) await work();
+    clearTimeout(timer);
+    timer = setTimeout(tick, period_ms);
+  };
+  document.addEventListener("visibilitychange", () => { if (!document.hidden) tick(); });
+  return tick();
 }
 
 function isSame(old, fresh) {

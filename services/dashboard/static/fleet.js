@@ -1,28 +1,23 @@
 // Wall of stations: a tile each, trouble first; a tile opens its station's page.
 
 import { showImage } from "./cameras.js";
-import { element, levelBadge, setText } from "./dom.js";
-import { number, plural, stopwatch } from "./format.js";
+import { element, find, levelBadge, setText } from "./dom.js";
+import { age, number, plural, stopwatch } from "./format.js";
 import { Freshness } from "./freshness.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { ask, stationPath } from "./session.js";
-import { startTheme } from "./theme.js";
+import { onTheme } from "./theme.js";
 
 const STALE_MS = 800;
 const IMAGE_PERIOD_MS = 1000;
 const SIDES = ["left", "right"];
 const NOTHING = new Float32Array(0);
-const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
-
-function hoursLeft(seconds) {
-  return seconds < 3600 ? `${number(seconds / 60, 0)} min` : `${number(seconds / 3600, 0)} h`;
-}
 
 function diskText({ disk_left_s, disk_free_bytes }) {
   const free = disk_free_bytes === null ? "–" : `${number(disk_free_bytes / 1e9, 0)} GB`;
-  return disk_left_s === null ? free : `${free}, ${hoursLeft(disk_left_s)} of recording`;
+  return disk_left_s === null ? free : `${free}, ${age(disk_left_s)} of recording`;
 }
 
 class StationTile {
@@ -116,7 +111,6 @@ const link = new LiveLink({
     if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4), view.getUint16(2, true));
   },
   onState: (connected) => {
-    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
       fresh.stop();
       clearAll("No link to the dashboard.");
@@ -124,5 +118,4 @@ const link = new LiveLink({
   },
 });
 link.show("fleet", true);
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => tiles.forEach((tile) => Object.values(tile.hands).forEach((hand) => hand.request())));
+onTheme(() => tiles.forEach((tile) => Object.values(tile.hands).forEach((hand) => hand.request())));

@@ -1,6 +1,7 @@
 // Whether the robot's hand can follow each tracked one: a line on the hand's card, and one short sound while recording.
 
 import { setText } from "./dom.js";
+import { keep, kept } from "./kept.js";
 
 // Shorter ones an operator cannot react to.
 const LASTS_S = 0.3;
@@ -14,8 +15,8 @@ export class FollowLines {
     this.wasLost = false;
     this.played_ms = -Infinity;
     this.box = find("follow_sound");
-    this.box.checked = localStorage.getItem("follow_sound") !== "no";
-    this.box.addEventListener("change", () => localStorage.setItem("follow_sound", this.box.checked ? "yes" : "no"));
+    this.box.checked = kept("follow_sound") !== "no";
+    this.box.addEventListener("change", () => keep("follow_sound", this.box.checked ? "yes" : "no"));
   }
 
   // `following` by side as the station says it; a hand that is not tracked has none.

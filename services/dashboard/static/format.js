@@ -24,6 +24,16 @@ export function age(value_s) {
   return value_s < 48 * 3600 ? `${Math.round(value_s / 3600)} h` : `${Math.round(value_s / 86400)} days`;
 }
 
+const UNITS = ["B", "kB", "MB", "GB", "TB", "PB"];
+
+export function bytes(value) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
+  // As it is rounded: 999.6 MB is 1.0 GB.
+  const unit = UNITS.findIndex((_, power) => power === UNITS.length - 1 || Math.round(Math.abs(value) / 1000 ** power) < 1000);
+  const shown = value / 1000 ** unit;
+  return `${shown.toFixed(unit < 2 || shown >= 100 ? 0 : 1)} ${UNITS[unit]}`;
+}
+
 export function stopwatch(value_s) {
   const seconds = Math.max(0, value_s ?? 0);
   const minutes = Math.floor(seconds / 60);

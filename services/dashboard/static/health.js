@@ -1,18 +1,20 @@
 // Page of the history of a station's health: strips of all streams, plots of one, events; the view is in the URL.
 
-import { element, levelBadge, setText } from "./dom.js";
-import { clockTime, firstKnown, History, queryOf, runs, scaled, viewOf } from "./history.js";
+import { date } from "./dates.js";
+import { element, find, levelBadge, repeat, setText } from "./dom.js";
+import { firstKnown, History, queryOf, runs, scaled, viewOf } from "./history.js";
 import { unpack } from "./packed.js";
 import { LinePlot, StripPlot } from "./plots.js";
-import { ask, pagePath } from "./session.js";
-import { startTheme } from "./theme.js";
+import { ask, checked, pagePath } from "./session.js";
+import { onTheme } from "./theme.js";
 
 const PERIOD_MS = 1000;
 const MAX_EVENTS = 2000;
 const SHOWN_EVENTS = 200;
+// A plot of fewer rows would show single samples.
+const LEAST_RANGE_S = 30;
 const LEVELS = ["OK", "WARN", "ERROR", "STALE"];
 const STATION = "station";
-const find = (id) => document.getElementById(id);
 
 const history = new History();
 let events = [];
@@ -60,7 +62,10 @@ function go(change) {
 
 function range() {
   const end_s = view.end_s ?? history.times_s.at(-1) ?? Date.now() / 1000;
-  return [end_s - view.range_s, end_s];
+  const start_s = end_s - view.range_s;
+  // What is live begins with its first row: a station that just started fills the plots.
+  const first_s = view.end_s === null ? history.times_s[0] ?? start_s : start_s;
+  return [Math.min(Math.max(start_s, first_s), end_s - Math.min(LEAST_RANGE_S, view.range_s)), end_s];
 }
 
 function data(name) {
@@ -105,7 +110,7 @@ function showControls() {
     button.setAttribute("aria-pressed", String(view.end_s === null && Number(button.dataset.range) === view.range_s));
   }
   const [from_s, to_s] = range();
-  setText(find("span"), view.end_s === null ? "live" : `${clockTime(from_s)} – ${clockTime(to_s)}`);
+  setText(find("span"), view.end_s === null ? "live" : `${date(from_s)} – ${date(to_s, "time")}`);
 }
 
 function showEvents([from_s, to_s]) {
@@ -116,14 +121,12 @@ function showEvents([from_s, to_s]) {
   if (find("events").dataset.key === key) return;
   find("events").dataset.key = key;
   find("events").replaceChildren(...newest.map((event) => element("tr", {},
-    element("td", {}, clockTime(event.t_s)), element("td", { class: "name" }, event.stream), element("td", {}, event.code),
+    element("td", {}, date(event.t_s, "time")), element("td", { class: "name" }, event.stream), element("td", {}, event.code),
     element("td", {}, event.level === 0 ? element("span", { class: "quiet" }, "ended") : levelBadge(LEVELS[event.level])))));
 }
 
 async function read(path) {
-  const answer = await ask(path, { signal: AbortSignal.timeout(10_000) });
-  if (!answer.ok) throw new Error((await answer.json()).detail ?? `refused (${answer.status})`);
-  return answer;
+  return checked(await ask(path, { signal: AbortSignal.timeout(10_000) }));
 }
 
 async function update() {
@@ -142,17 +145,14 @@ async function update() {
   events = events.slice(-MAX_EVENTS);
 }
 
-async function poll() {
-  if (!document.hidden) {
-    try {
-      await update();
-      setText(find("link"), "");
-      draw();
-    } catch (error) {
-      setText(find("link"), `No answer, trying again: ${error.message}`);
-    }
+async function refresh() {
+  try {
+    await update();
+    setText(find("link"), "");
+    draw();
+  } catch (error) {
+    setText(find("link"), `No answer, trying again: ${error.message}`);
   }
-  setTimeout(poll, PERIOD_MS);
 }
 
 for (const button of document.querySelectorAll("[data-range]")) {
@@ -164,5 +164,5 @@ window.addEventListener("resize", () => {
   cancelAnimationFrame(resizing);
   resizing = requestAnimationFrame(() => [overview, ...Object.values(plots)].forEach((plot) => plot.resize()));
 });
-startTheme(find("theme"), draw);
-poll();
+onTheme(draw);
+repeat(refresh, PERIOD_MS);

@@ -102,9 +102,3 @@ export function queryOf({ stream, range_s, end_s }) {
   if (end_s !== null) parameters.set("end", end_s.toFixed(0));
   return `?${parameters}`;
 }
-
-export function clockTime(unix_s, { seconds = true } = {}) {
-  const date = new Date(1000 * unix_s);
-  const parts = [date.getHours(), date.getMinutes(), ...(seconds ? [date.getSeconds()] : [])];
-  return parts.map((part) => String(part).padStart(2, "0")).join(":");
-}

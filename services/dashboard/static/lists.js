@@ -1,6 +1,6 @@
 // Services and newest takes → short lists.
 
-import { element, levelBadge, showChildren } from "./dom.js";
+import { element, levelBadge, showChildren, why } from "./dom.js";
 import { ask, pagePath } from "./session.js";
 
 export function showServices(list, services) {
@@ -10,10 +10,6 @@ export function showServices(list, services) {
 }
 
 const CONSENT = new Map([[true, "consent given"], [false, "no consent"]]);
-
-function why(text) {
-  return text ? element("span", { class: "why" }, text) : null;
-}
 
 function takeRow(take) {
   return element("tr", {},

@@ -1,15 +1,20 @@
-// The one websocket: tells the server what is in view, hands out what comes back, reconnects by itself.
+// The one websocket: tells the server what is in view, hands out what comes back, reconnects by itself, and says so in #link.
 
+import { setText } from "./dom.js";
 import { ask, stationPath } from "./session.js";
 
 const FIRST_RETRY_MS = 500;
 const LONGEST_RETRY_MS = 8000;
 
 export class LiveLink {
-  constructor({ onTopic, onBinary, onState }) {
+  constructor({ onTopic, onBinary = () => {}, onState = () => {} }) {
     this.onTopic = onTopic;
     this.onBinary = onBinary;
-    this.onState = onState;
+    this.onState = (connected) => {
+      setText(document.getElementById("link"), connected ? "live" : "dashboard not reachable: what you see is old");
+      onState(connected);
+    };
+    document.addEventListener("visibilitychange", () => this.sendView());
     this.view = new Set();
     this.retry_ms = FIRST_RETRY_MS;
     this.socket = null;

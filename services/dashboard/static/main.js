@@ -3,7 +3,7 @@
 import { CameraPanel } from "./cameras.js";
 import { css } from "./canvas.js";
 import { DevicesPanel } from "./devices.js";
-import { element, setText } from "./dom.js";
+import { element, find, setText } from "./dom.js";
 import { age } from "./format.js";
 import { FollowLines } from "./following.js";
 import { Freshness } from "./freshness.js";
@@ -16,9 +16,8 @@ import { RecorderPanel } from "./recorder.js";
 import { ask } from "./session.js";
 import { showLegend } from "./taxel_marks.js";
 import { PADS } from "./taxels.js";
-import { startTheme } from "./theme.js";
+import { onTheme } from "./theme.js";
 
-const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = {
   left: new HandCanvas(find("hand_left"), textsOf("left"), "left", heatmap),
@@ -116,7 +115,6 @@ const link = new LiveLink({
     }
   },
   onState: (connected) => {
-    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
       fresh.station.stop();
       showNoStation("No link to the dashboard: what you see is old.");
@@ -138,5 +136,4 @@ const observer = new IntersectionObserver((entries) => {
 for (const section of document.querySelectorAll("[data-view]")) {
   if (!["station", "cameras"].includes(section.dataset.view)) observer.observe(section);
 }
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => [...Object.values(hands), poses].forEach((picture) => picture.request()));
+onTheme(() => [...Object.values(hands), poses].forEach((picture) => picture.request()));

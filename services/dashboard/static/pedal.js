@@ -1,5 +1,7 @@
 // A foot pedal that sends one key, learnt by pressing it and kept in this browser.
 
+import { keep, kept } from "./kept.js";
+
 const NOT_FOR_PEDALS = new Set(["escape", "tab", "shift", "control", "alt", "meta", "capslock", "arrowup", "arrowdown", "arrowleft", "arrowright"]);
 
 export class Pedal {
@@ -8,7 +10,7 @@ export class Pedal {
     this.taken = taken;
     this.say = say;
     this.isLearning = false;
-    this.key = localStorage.getItem("pedal");
+    this.key = kept("pedal");
     button.addEventListener("click", () => this.learn());
     this.show();
   }
@@ -29,9 +31,10 @@ export class Pedal {
       return;
     }
     this.isLearning = false;
-    if (key === "delete") localStorage.removeItem("pedal");
-    else if (key !== "escape") localStorage.setItem("pedal", key);
-    this.key = localStorage.getItem("pedal");
+    if (key !== "escape") {
+      this.key = key === "delete" ? null : key;
+      keep("pedal", this.key);
+    }
     this.say(this.key && key !== "escape" ? `Pedal: ${name(this.key)}. Each press is the next step: arm, record, stop, save.` : "", "OK");
     this.show();
   }

@@ -1,7 +1,7 @@
 // Plots over time with one cursor: lines of a stream with its gaps, events and takes, and the strips of all streams.
 
 import { css } from "./canvas.js";
-import { clockTime } from "./history.js";
+import { date } from "./dates.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 
 const SYNC = uPlot.sync("health");
@@ -17,7 +17,7 @@ export function levelColour(level) {
 
 function timeAxis() {
   return { stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", size: 24, gap: 3, space: 80,
-    values: (_, splits, __, ___, step_s) => splits.map((t_s) => clockTime(t_s, { seconds: step_s < 60 })) };
+    values: (_, splits, __, ___, step_s) => splits.map((t_s) => date(t_s, step_s < 60 ? "time" : "minute")) };
 }
 
 function valueAxis(label, scale, side) {
@@ -107,7 +107,7 @@ export class LinePlot {
       axes: [timeAxis(), ...scales.map((scale, index) => valueAxis(scale, scale, index === 0 ? 3 : 1))],
       // All plots of a column begin and end at the same place.
       padding: [6, scales.length > 1 ? 0 : AXIS_WIDTH, 0, 0],
-      series: [{ label: "Time", value: (_, t_s) => (t_s === null ? "–" : clockTime(t_s)) }, ...lines],
+      series: [{ label: "Time", value: (_, t_s) => (t_s === null ? "–" : date(t_s, "time")) }, ...lines],
     }, [[], ...lines.map(() => [])], root);
     root.plot = this.plot;
   }

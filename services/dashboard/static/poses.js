@@ -3,6 +3,8 @@
 import { apply } from "./projection.js";
 
 export const NUM_KEYPOINTS = 25;
+// Keypoints that are fingertips, from the thumb on.
+export const TIPS = [4, 9, 14, 19, 24];
 // Where a hand is shown whose wrist is not tracked: palm down at the world's origin, 40 cm from the other one.
 const UNPLACED = {
   left: [1, 0, 0, -0.2, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],

@@ -18,6 +18,21 @@ export function apply(T, point) {
   return [0, 4, 8].map((row) => T[row] * point[0] + T[row + 1] * point[1] + T[row + 2] * point[2] + T[row + 3]);
 }
 
+export const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+
+// T_world_body of a pose x y z w qx qy qz; null for one that was lost (NaN or a quaternion of zeros).
+export function matrixOfPose(pose) {
+  const [tx, ty, tz, ...q] = pose;
+  const norm = Math.hypot(...q);
+  if (!Number.isFinite(tx + ty + tz) || !(norm > 1e-9)) return null;
+  const [w, x, y, z] = q.map((value) => value / norm);
+  return [
+    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx,
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty,
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz, 0, 0, 0, 1,
+  ];
+}
+
 // T_camera_world of a camera (x right, y down, z forward) that looks at `target_m`; azimuth 0 is on the world's x axis.
 export function orbitCamera({ target_m, distance_m, azimuth_rad, elevation_rad }) {
   const outward = [Math.cos(elevation_rad) * Math.cos(azimuth_rad), Math.cos(elevation_rad) * Math.sin(azimuth_rad), Math.sin(elevation_rad)];

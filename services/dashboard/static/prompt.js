@@ -1,6 +1,7 @@
 // Fields of the next take: task and instruction from the list or as free text, domain, operator, consent.
 
 import { element } from "./dom.js";
+import { keep, kept } from "./kept.js";
 
 const OTHER = "";
 const KEPT = "prompt";
@@ -50,14 +51,14 @@ export class PromptForm {
     this.find("operator").addEventListener("input", () => { this.find("consent").checked = false; });
     this.listInstructions();
     this.task.show();
-    const kept = sessionStorage.getItem(KEPT);
-    if (kept) this.write(JSON.parse(kept));
+    const before = kept(KEPT, "sessionStorage");
+    if (before) this.write(JSON.parse(before));
     for (const kind of ["input", "change"]) form.addEventListener(kind, () => this.keep());
   }
 
   // For this tab, so that a page that is loaded anew asks for nothing twice.
   keep() {
-    sessionStorage.setItem(KEPT, JSON.stringify(this.read()));
+    keep(KEPT, JSON.stringify(this.read()), "sessionStorage");
   }
 
   // The chosen task's option; that of "other" has no instructions.
@@ -93,6 +94,11 @@ export class PromptForm {
     this.find("operator").value = prompt.operator ?? "";
     this.find("consent").checked = prompt.consent;
     this.keep();
+  }
+
+  // Who is recorded is asked once a session.
+  forget() {
+    this.write({ ...this.read(), operator: null, consent: false });
   }
 
   differs(prompt) {

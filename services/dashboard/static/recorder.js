@@ -1,12 +1,15 @@
 // Recorder panel: buttons, one-key shortcuts and a pedal → POST /v1/recorder/ACTION; what is allowed follows the state.
 
-import { element, setText } from "./dom.js";
+import { post } from "./catalog/api.js";
+import { date } from "./dates.js";
+import { element, setText, showChildren } from "./dom.js";
 import { stopwatch } from "./format.js";
+import { keep, kept } from "./kept.js";
 import { Pedal } from "./pedal.js";
 import { PromptForm } from "./prompt.js";
-import { clockTime, keyOf, lastTakeWords, nextStep, numSaved, verdict } from "./recorder_logic.js";
+import { keyOf, lastTakeWords, nextStep, numSaved, verdict } from "./recorder_logic.js";
 import { ResetTimer } from "./reset_timer.js";
-import { ask } from "./session.js";
+import { pagePath } from "./session.js";
 import { Sounds } from "./sounds.js";
 
 const CONFIRM_MS = 3000;
@@ -35,7 +38,10 @@ export class RecorderPanel {
     this.sounds = new Sounds(this.find("sounds"));
     this.reset = new ResetTimer(() => { if (this.find("arm_again").checked) this.act("arm"); });
     this.pedal = new Pedal(this.find("pedal"), { taken: (key) => this.hotkeys.has(key), say: (text, level) => this.say(text, level) });
+    // Letters go to a field, and press a button.
+    const others = [...root.querySelectorAll("[data-key]:not([data-action], [name=outcome])")];
     this.hotkeys = new Map([
+      ...others.map((one) => [one.dataset.key, () => (one.type === "button" ? one.closest("[hidden]") || one.click() : one.focus())]),
       ...this.buttons.map((button) => [button.dataset.key, () => this.act(button.dataset.action)]),
       ...this.outcomes.map((outcome) => [outcome.dataset.key, () => this.choose(outcome)]),
       ["k", () => this.reset.end()],
@@ -52,8 +58,8 @@ export class RecorderPanel {
     for (const outcome of this.outcomes) outcome.addEventListener("change", () => this.judge());
     this.find("skip_reset").addEventListener("click", () => this.reset.end());
     this.find("show_keys").addEventListener("click", () => this.help());
-    this.find("arm_again").checked = localStorage.getItem("arm_again") === "yes";
-    this.find("arm_again").addEventListener("change", (event) => localStorage.setItem("arm_again", event.target.checked ? "yes" : "no"));
+    this.find("arm_again").checked = kept("arm_again") === "yes";
+    this.find("arm_again").addEventListener("change", (event) => keep("arm_again", event.target.checked ? "yes" : "no"));
     document.addEventListener("keydown", (event) => this.onKey(event));
     const form = this.find("prompt");
     form.addEventListener("submit", (event) => {
@@ -176,19 +182,13 @@ export class RecorderPanel {
     // Keys work at once after arming from a field.
     if (action === "arm") document.activeElement?.blur();
     try {
-      const answer = await ask(`/v1/recorder/${action}`, {
-        method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
-      });
-      const data = await answer.json();
-      if (answer.ok) {
-        this.say("", "OK");
-        this.show(data, this.level);
-        if (action === "save") this.reset.start(data.recording_id, this.prompt.reset_s);
-      } else {
-        this.fail(data.detail ?? data.title ?? `refused (${answer.status})`);
-      }
+      const data = await post(`/v1/recorder/${action}`, body);
+      this.say("", "OK");
+      this.show(data, this.level);
+      if (action === "session") this.prompt.forget();
+      if (action === "save") this.reset.start(data.recording_id, this.prompt.reset_s);
     } catch (error) {
-      this.fail(`The dashboard did not answer: ${error.message}`);
+      this.fail(error.cause ? error.message : `The dashboard did not answer: ${error.message}`);
     }
     this.reset.tick();
   }
@@ -209,7 +209,7 @@ export class RecorderPanel {
     const pedal = this.pedal.key === null ? "" : " or pedal";
     if (this.changed()) return `The fields changed since this take was armed: arm again (A${pedal}).`;
     const state = this.recorder?.state;
-    if (state === "checking" && this.outcome() === undefined) return "How did this take end? Success: Y, failure: N, not judged: U";
+    if (state === "checking" && this.outcome() === undefined) return "How did this take end? Y, N or U";
     if (this.reset.running) return "Reset the scene.";
     const next = { unknown: "No connection to this station: see Devices, below.", idle: "Choose a task, then arm: A", armed: "Record: R", recording: "Stop: S", checking: "Save: V", saved: "Next take, arm: A", discarded: "Next take, arm: A" };
     return next[state] ? next[state] + (state === "unknown" ? "" : pedal) : "";
@@ -223,6 +223,7 @@ export class RecorderPanel {
     this.received_ms = performance.now();
     for (const id of ["recorder_state", "stage"]) this.find(id).dataset.state = recorder.state;
     setText(this.find("recorder_state"), recorder.state === "unknown" ? "no station" : recorder.state);
+    for (const field of ["operator", "consent"]) this.find(field).required = recorder.needs_consent ?? false;
     this.reset.keep(recorder);
     this.forgetOutcome(recorder);
     this.takePrompt(recorder);
@@ -249,6 +250,10 @@ export class RecorderPanel {
     line.hidden = !take;
     line.dataset.level = take?.level ?? "OK";
     line.dataset.stage = take?.stage ?? "";
+    const link = this.find("last_take_link");
+    setText(link, take?.recording_id ?? "");
+    if (take?.player) link.href = pagePath(`/episodes/${take.player}`);
+    else link.removeAttribute("href");
     setText(this.find("last_take_text"), lastTakeWords(take));
   }
 
@@ -278,15 +283,14 @@ export class RecorderPanel {
     setText(this.find("recorder_note"), note);
     const list = this.find("recorder_problem_list");
     this.find("recorder_problems").classList.toggle("plain", recorder.problems.length === 0);
-    if ([...list.children].map((item) => item.textContent).join("\n") === recorder.problems.join("\n")) return;
-    list.replaceChildren(...recorder.problems.map((problem) => element("li", {}, problem)));
-    this.find("recorder_problems").open = false;
+    if (recorder.recording_id !== this.verdict_id) this.find("recorder_problems").open = false;
+    this.verdict_id = recorder.recording_id;
+    showChildren(list, recorder.problems.map((problem) => element("li", {}, problem)));
   }
 
   enable() {
-    for (const button of this.buttons) button.disabled = !this.allows(button.dataset.action);
     const blocked = { record: this.changed(), save: this.outcome() === undefined };
-    for (const button of this.buttons) button.disabled ||= blocked[button.dataset.action] ?? false;
+    for (const button of this.buttons) button.disabled = !this.allows(button.dataset.action) || (blocked[button.dataset.action] ?? false);
     const state = this.recorder?.state;
     this.find("outcome").disabled = state !== "checking";
     this.prompt.enable(!["recording", "checking"].includes(state));
@@ -294,14 +298,14 @@ export class RecorderPanel {
   }
 
   showCount() {
-    const { task, operator } = this.prompt.read();
+    const { task, operator, consent } = this.prompt.read();
     const saved = numSaved(this.recorder?.session, task, operator);
     const { goal } = this.prompt;
     const box = this.find("count");
     box.dataset.level = goal > 0 && saved >= goal ? "OK" : "";
     setText(this.find("num_saved"), goal > 0 ? `${saved} / ${goal}` : String(saved));
     const reached = box.dataset.level === "OK" ? "goal reached" : "saved";
-    setText(this.find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"} · since ${clockTime(this.recorder?.session?.started_at)}`);
+    setText(this.find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"}${consent ? ", consent given" : ""} · since ${date(this.recorder?.session?.started_at, "minute")}`);
   }
 
   tick() {

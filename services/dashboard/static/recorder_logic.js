@@ -21,7 +21,7 @@ export function numSaved(session, task, operator) {
 }
 
 export function verdict(recorder) {
-  const counted = recorder.problems?.length ?? 0;
+  const counted = recorder.num_findings ?? 0;
   const word = !recorder.complete ? "Incomplete" : counted ? "Complete, with warnings" : "Complete";
   const note = [recorder.recording_id, counted === 1 ? "1 finding" : `${counted || "no"} findings`].filter(Boolean).join(" · ");
   return { word, note, cause: recorder.cause ?? "", advice: recorder.advice ?? "" };
@@ -33,9 +33,5 @@ const STAGES = {
 };
 
 export function lastTakeWords(take) {
-  return take ? [take.recording_id, STAGES[take.stage] ?? take.stage, take.reason].filter(Boolean).join(" · ") : "";
-}
-
-export function clockTime(iso) {
-  return iso ? new Date(iso).toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" }) : "–";
+  return take ? [STAGES[take.stage] ?? take.stage, take.reason].filter(Boolean).join(" · ") : "";
 }

@@ -1,22 +1,24 @@
 // Countdown for resetting the scene after a saved take; it goes on when the page is loaded anew.
 
+import { keep, kept } from "./kept.js";
+
 const KEPT = "reset_timer";
 
 export class ResetTimer {
   constructor(onEnd) {
     this.onEnd = onEnd;
-    this.running = JSON.parse(sessionStorage.getItem(KEPT) ?? "null");
+    this.running = JSON.parse(kept(KEPT, "sessionStorage"));
   }
 
   start(recording_id, length_s) {
     this.running = { recording_id, ends_ms: Date.now() + 1000 * length_s };
-    sessionStorage.setItem(KEPT, JSON.stringify(this.running));
+    keep(KEPT, JSON.stringify(this.running), "sessionStorage");
     this.tick();
   }
 
   cancel() {
     this.running = null;
-    sessionStorage.removeItem(KEPT);
+    keep(KEPT, null, "sessionStorage");
   }
 
   end() {

@@ -1,6 +1,6 @@
-// Open rollouts → rows of the table, and the words for their state and uncertainty.
+// Open rollouts and those that ended last → rows of the table, and the words for their state, uncertainty and outcome.
 
-import { element, showChildren } from "./dom.js";
+import { element, levelBadge, showChildren } from "./dom.js";
 import { age } from "./format.js";
 
 const IDLE_S = 30;
@@ -9,6 +9,7 @@ const WITHOUT_KEYS = "loopback";
 const KINDS = { twin: "physics twin", model: "imagined", baseline: "baseline", robot: "robot" };
 
 export function stateOf(rollout) {
+  if (rollout.isOver) return { level: "STALE", word: "over" };
   if (rollout.ended) return { level: "ERROR", word: "ended" };
   if (rollout.rollout_doubt?.reason) return { level: "WARN", word: "unreliable" };
   if (rollout.idle_s > IDLE_S) return { level: "STALE", word: "waiting" };
@@ -30,21 +31,25 @@ export function uncertaintyOf(rollout) {
   return { text: "–", reason: "" };
 }
 
+// What is known of the outcome so far: from the world itself, or by the estimate of one that imagines.
+export function outcomeOf({ success, rollout_doubt: whole }) {
+  if (success !== null && success !== undefined) return success ? "success" : "no success";
+  const estimate = whole?.success_probability ?? null;
+  return estimate === null ? "–" : `success with ${(100 * estimate).toFixed(0)} %, imagined`;
+}
+
 function why(text) {
   return text ? element("span", { class: "why" }, text) : null;
 }
 
-export function badge({ level, word }) {
-  return element("span", { class: "level", "data-level": level }, word);
-}
-
-export function rolloutRow(rollout, isWatched, watch) {
+function rolloutRow(rollout, isWatched, watch) {
   const state = stateOf(rollout);
   const uncertainty = uncertaintyOf(rollout);
-  const button = element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
-  button.addEventListener("click", () => watch(rollout));
-  return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id, "data-key": rollout.watch_id },
-    element("td", {}, badge(state), why(rollout.ended)),
+  const button = rollout.isOver ? "" : element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
+  if (button) button.addEventListener("click", () => watch(rollout));
+  return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.isOver ? null : rollout.watch_id,
+    "data-over": rollout.isOver ? rollout.watch_id : null, "data-key": `${rollout.watch_id}${Boolean(rollout.isOver)}` },
+    element("td", {}, levelBadge(state.level, state.word), why(rollout.ended)),
     element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
     element("td", {}, rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")),
     element("td", { class: "task" }, rollout.task, why(rollout.instruction)),
@@ -53,12 +58,13 @@ export function rolloutRow(rollout, isWatched, watch) {
     element("td", { class: "number" }, age(rollout.age_s)),
     element("td", { class: "number" }, age(rollout.idle_s)),
     element("td", { class: "uncertainty" }, uncertainty.text, why(uncertainty.reason)),
+    element("td", { class: "outcome" }, outcomeOf(rollout), why(rollout.isOver && rollout.rollout_doubt?.reason ? "unreliable" : "")),
     element("td", {}, button));
 }
 
-export function showRollouts(body, rollouts, watched, watch) {
-  const rows = rollouts.map((one) => rolloutRow(one, one.watch_id === watched, watch));
-  const empty = element("tr", {}, element("td", { colspan: 10, class: "free" },
-    "No open rollouts. A policy that is evaluated in one of the worlds appears here."));
-  showChildren(body, rows.length ? rows : [empty]);
+export function showRollouts(body, { rollouts, over = [] }, watched, watch) {
+  const rows = [...rollouts, ...over.map((one) => ({ ...one, isOver: true }))].map((one) => rolloutRow(one, one.watch_id === watched, watch));
+  const empty = element("tr", {}, element("td", { colspan: 11, class: "free" },
+    "No open rollouts. A policy that is evaluated in one of the worlds appears here; the last ten stay with their outcome."));
+  showChildren(body, rollouts.length ? rows : [empty, ...rows]);
 }

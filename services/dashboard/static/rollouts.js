@@ -1,22 +1,21 @@
 // The rollouts screen: open rollouts of all worlds, and the newest steps of the one that is watched.
 
 import { ComparisonPanel } from "./comparison.js";
-import { element, setText } from "./dom.js";
+import { element, find, levelBadge, say, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
+import { outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
 import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
-import { startTheme } from "./theme.js";
+import { onTheme } from "./theme.js";
 
-const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = Object.fromEntries(["left", "right"].map((side) =>
   [side, new HandCanvas(find(`hand_${side}`), { summary: find(`hand_${side}_text`) }, side, heatmap)]));
 
-let listed = { worlds: [], rollouts: [], problems: [], num_open: 0 };
+let listed = { worlds: [], rollouts: [], over: [], problems: [], num_open: 0 };
 let watched = null; // { topic, rollout } of the rollout that is shown
 let steps = null;
 
@@ -49,33 +48,37 @@ function watch(rollout) {
   showTable();
 }
 
-function note(text, level = "") {
-  const node = find("watched_note");
-  node.dataset.level = level;
-  setText(node, text);
-}
+const note = (text, level) => say(find("watched_note"), text, level);
 
 function about(rollout) {
-  find("watched_about").replaceChildren(badge(stateOf(rollout)),
+  const { level, word } = stateOf(rollout);
+  find("watched_about").replaceChildren(levelBadge(level, word),
     element("strong", {}, `${rollout.world}: ${rollout.task}`),
     element("span", { class: "quiet" }, rollout.instruction),
+    rollout.isOver ? element("strong", {}, outcomeOf(rollout)) : "",
     element("span", { class: "quiet" }, `policy ${rollout.client || "not named"}, seed ${rollout.seed}`));
 }
 
 function showTable() {
-  showRollouts(find("rollout_rows"), listed.rollouts, watched?.rollout.watch_id, watch);
+  showRollouts(find("rollout_rows"), listed, watched?.rollout.watch_id, watch);
 }
 
 function showListed(view) {
   listed = view;
+  comparison.offer(view);
   setText(find("summary"), `${view.num_open} open`);
   find("world_list").replaceChildren(...view.worlds.map((world) => element("li", { title: world.tasks.join(", ") },
     element("strong", {}, world.name), element("span", { class: "quiet" }, `${world.kind}, ${world.tasks.length} tasks`))));
   find("problems").replaceChildren(...view.problems.map((text) => element("p", { class: "note", "data-level": "WARN" }, text)));
-  const now = view.rollouts.find((one) => watched && topicOf(one) === watched.topic);
+  const isWatched = (one) => topicOf(one) === watched?.topic;
+  const now = view.rollouts.find(isWatched);
+  const over = view.over.find(isWatched);
   if (now) {
     watched.rollout = now;
     about(now);
+  } else if (over) {
+    // What was shown last stays, with what came of it; so it does while a world does not answer.
+    about({ ...over, isOver: true });
   } else if (!watched) {
     const wanted = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
     if (wanted) {
@@ -127,21 +130,22 @@ const link = new LiveLink({
   onTopic: (topic, data) => {
     if (topic === "rollouts") showListed(data);
     else if (topic === "comparison") comparison.show(data);
-    else if (topic === watched?.topic) note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+    else if (topic === watched?.topic) {
+      note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+      if (data.gone && !listed.over.some((one) => topicOf(one) === topic)) about({ ...watched.rollout, isOver: true });
+    }
   },
   onBinary: (buffer) => {
     const message = readSteps(buffer);
     if (message) showSteps(message);
   },
   onState: (connected) => {
-    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) showListed({ ...listed, problems: ["No link to the dashboard: what you see is old."] });
   },
 });
 
 link.show("rollouts", true);
 link.show("comparison", true);
-document.addEventListener("visibilitychange", () => link.sendView());
 new IntersectionObserver((entries) => {
   for (const entry of entries) if (watched) link.show(watched.topic, entry.isIntersecting);
 }).observe(find("watched"));
@@ -158,10 +162,11 @@ find("step").addEventListener("input", (event) => {
 const draw = () => {
   player.tick();
   comparison.player.tick();
+  comparison.driving.tick();
   requestAnimationFrame(draw);
 };
 requestAnimationFrame(draw);
-startTheme(find("theme"), () => {
+onTheme(() => {
   for (const hand of Object.values(hands)) hand.request();
   comparison.redraw();
 });

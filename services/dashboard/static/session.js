@@ -21,3 +21,10 @@ export async function ask(path, options) {
   if (answer.status === 401) location.reload();
   return answer;
 }
+
+// An answer that is no refusal; refusals become errors with their reason.
+export async function checked(answer) {
+  if (answer.ok) return answer;
+  const problem = await answer.json().catch(() => ({}));
+  throw new Error(problem.detail ?? `The dashboard answered ${answer.status}.`, { cause: answer.status });
+}

@@ -1,5 +1,7 @@
 // Sounds of the recorder, made by oscillators; off until the operator switches them on in this browser.
 
+import { keep, kept } from "./kept.js";
+
 // Frequency in Hz, start and length in s, and the form of the wave.
 const TONES = {
   start: [[660, 0, 0.11, "sine"], [990, 0.12, 0.2, "sine"]],
@@ -14,7 +16,7 @@ const RAMP_S = 0.012;
 export class Sounds {
   constructor(button) {
     this.button = button;
-    this.isOn = localStorage.getItem("sounds") === "on";
+    this.isOn = kept("sounds") === "on";
     this.context = null;
     button.addEventListener("click", () => this.toggle());
     // Browsers stay silent until the page was used once.
@@ -24,7 +26,7 @@ export class Sounds {
 
   toggle() {
     this.isOn = !this.isOn;
-    localStorage.setItem("sounds", this.isOn ? "on" : "off");
+    keep("sounds", this.isOn ? "on" : "off");
     this.show();
     this.wake();
     this.play("saved");

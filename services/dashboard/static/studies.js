@@ -1,25 +1,23 @@
 // The list of studies, with the progress of those that run.
 
-import { element, setText, showChildren } from "./dom.js";
+import { date } from "./dates.js";
+import { element, find, setText, showChildren } from "./dom.js";
 import { LiveLink } from "./live.js";
 import { pagePath } from "./session.js";
-import { badge, progress, stateOf, why } from "./study_parts.js";
-import { startTheme } from "./theme.js";
-
-const find = (id) => document.getElementById(id);
+import { progress, stateBadge, why } from "./study_parts.js";
 
 function row(study) {
   const title = study.problem ? element("strong", {}, study.name)
     : element("a", { href: pagePath(`/studies/${encodeURIComponent(study.name)}`) }, study.title || study.name);
   return element("tr", { "data-level": study.problem ? "ERROR" : null },
-    element("td", {}, badge(stateOf(study))),
+    element("td", {}, stateBadge(study)),
     element("td", { class: "name" }, title, study.title && study.title !== study.name ? why(study.name) : null, why(study.problem)),
     element("td", {}, study.problem ? "–" : progress(study)),
     element("td", { class: "number" }, study.problem ? "–" : String(study.num_failed)),
     element("td", { class: "free" }, study.tasks.join(", ")),
     element("td", { class: "free" }, study.worlds.join(", ")),
     element("td", { class: "free" }, study.policies.join(", ")),
-    element("td", {}, new Date(study.changed_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" })));
+    element("td", {}, date(study.changed_at)));
 }
 
 function show({ studies, note }) {
@@ -32,9 +30,5 @@ function show({ studies, note }) {
 
 const link = new LiveLink({
   onTopic: (topic, data) => { if (topic === "studies") show(data); },
-  onBinary: () => {},
-  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
 });
 link.show("studies", true);
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => {});

@@ -1,18 +1,19 @@
 // Pieces of the study pages: progress, rates with their intervals, figures of agreement.
 
-import { element } from "./dom.js";
+import { element, levelBadge } from "./dom.js";
 
 const MISSING = "–";
 
-export function stateOf(study) {
+function stateOf(study) {
   if (study.problem) return { level: "ERROR", word: "unreadable" };
   if (study.is_running) return { level: "OK", word: "running" };
   if (study.num_done >= study.num_rollouts) return { level: "OK", word: "complete" };
   return { level: "STALE", word: "incomplete" };
 }
 
-export function badge({ level, word }) {
-  return element("span", { class: "level", "data-level": level }, word);
+export function stateBadge(study) {
+  const { level, word } = stateOf(study);
+  return levelBadge(level, word);
 }
 
 export function progress(study) {

@@ -1,8 +1,8 @@
 // Tables of one study: rates by policy, task and world, agreement, and rollouts.
 
-import { element } from "./dom.js";
+import { element, levelBadge } from "./dom.js";
 import { pagePath } from "./session.js";
-import { badge, cautions, figure, interval, rateBar, why } from "./study_parts.js";
+import { cautions, figure, interval, rateBar, why } from "./study_parts.js";
 
 // One row per task and policy, with its rates by world.
 export function rateRows(rates) {
@@ -50,7 +50,7 @@ export function agreementRow(one) {
     element("td", { class: "free" }, comments));
 }
 
-export function outcome(success) {
+function outcome(success) {
   if (success === null || success === undefined) return "–";
   return success ? "success" : "failure";
 }
@@ -60,9 +60,11 @@ export function rolloutRow(rollout, playable) {
   const play = (id, label) => (id && playable.has(id)
     ? element("a", { href: pagePath(`/episodes/episode/${encodeURIComponent(id)}`) }, label) : null);
   const links = [play(rollout.episode_id, rollout.world === "real" ? "Play" : `Play ${rollout.world}`),
-    rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real")].filter(Boolean);
+    rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real"),
+    rollout.real_episode_id && playable.has(rollout.real_episode_id)
+      ? element("a", { href: pagePath(`/rollouts?replay=${encodeURIComponent(rollout.real_episode_id)}`), title: "Replay in the twin and in the world model, side by side" }, "Compare") : null].filter(Boolean);
   return element("tr", {},
-    element("td", {}, rollout.disagrees ? badge({ level: "WARN", word: "differs" }) : ""),
+    element("td", {}, rollout.disagrees ? levelBadge("WARN", "differs") : ""),
     element("td", {}, rollout.world), element("td", {}, rollout.task), element("td", {}, rollout.policy),
     element("td", { class: "number" }, String(rollout.seed), why(rollout.repeat ? `repeat ${rollout.repeat}` : "")),
     element("td", {}, rollout.error ? "failed to run" : outcome(rollout.success), why(rollout.error)),

@@ -1,20 +1,29 @@
-// Theme button: system → light → dark, kept in this browser.
+// The theme of every page, kept in this browser: auto (as the system says), light or dark.
 
-const ORDER = ["system", "light", "dark"];
+import { keep, kept } from "./kept.js";
 
-export function startTheme(button, onChange) {
-  let theme = localStorage.getItem("theme") ?? "system";
-  const apply = () => {
-    if (theme === "system") delete document.documentElement.dataset.theme;
-    else document.documentElement.dataset.theme = theme;
-    button.querySelector("#theme_name").textContent = theme;
-    onChange();
-  };
-  button.addEventListener("click", () => {
-    theme = ORDER[(ORDER.indexOf(theme) + 1) % ORDER.length];
-    localStorage.setItem("theme", theme);
-    apply();
-  });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", onChange);
-  apply();
+const ORDER = ["auto", "light", "dark"];
+const { dataset } = document.documentElement;
+const button = document.getElementById("theme");
+const redraws = [];
+let theme = kept("theme");
+
+function apply(wanted) {
+  theme = ORDER.includes(wanted) ? wanted : "auto";
+  if (theme === "auto") delete dataset.theme;
+  else dataset.theme = theme;
+  button.querySelector("#theme_name").textContent = theme;
+  for (const redraw of redraws) redraw();
 }
+
+// Has pictures drawn anew when the colours change.
+export function onTheme(redraw) {
+  redraws.push(redraw);
+}
+
+button.addEventListener("click", () => {
+  apply(ORDER[(ORDER.indexOf(theme) + 1) % ORDER.length]);
+  keep("theme", theme);
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => apply(theme));
+apply(theme);

@@ -1,8 +1,9 @@
 """Application and routes of the rating page."""
 
+from collections import Counter as Counts
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path as FilePath
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Request, Response
 from prometheus_client import Counter, Gauge
@@ -20,6 +21,7 @@ from dextouch.serving import (
     page_headers,
     serve,
 )
+from services.evaluation.rating.invitations import Invitations, invitation_router
 from services.evaluation.rating.marks import (
     Judgement,
     Mark,
@@ -29,12 +31,19 @@ from services.evaluation.rating.marks import (
     read_rubrics,
     rubric_of,
 )
-from services.evaluation.rating.rating_queue import RatingQueue, RolloutPictures, rated_rollouts
+from services.evaluation.rating.rating_queue import (
+    RatedRollout,
+    RatingQueue,
+    RolloutPictures,
+    rated_rollouts,
+)
+from services.evaluation.rating.rating_report import rating_report
 from services.evaluation.settings import RatingSettings
 
 STATIC: Final = FilePath(__file__).parent / "static"
-FILES: Final = {"/": "rate.html"} | {
-    f"/rate.{kind}": f"rate.{kind}" for kind in ("js", "css", "svg")
+FILES: Final = {"/": "rate.html", "/lead": "lead.html"} | {
+    f"/{name}": name
+    for name in ("rate.js", "rate.css", "rate.svg", "lead.js", "keys.js", "request.js")
 }
 Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
 
@@ -102,13 +111,23 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
     page = file_router(STATIC, FILES, page_headers(images="'self' blob:"))
-    routers = [page, rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
+    # Not the tasks that rubrics are for, of which a release may bring more.
+    of_tasks = ", ".join(sorted(settings.tasks)) or "all tasks"
+    pool = f"{settings.study or 'all rollouts'}, {of_tasks} of {store.root.resolve()}"
+    invitations = Invitations(marks, pool)
+    routers = [
+        page,
+        rating_router(queue, marks, rubrics, pictures, on_mark=given.inc),
+        invitation_router(invitations),
+        agreement_router(marks, rollouts, rubrics, settings.raters_per_rollout),
+    ]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),
         ServedFolder(settings.marks.parent, "folder of marks"),
     ]
     app = create_service_app(name="rating", settings=settings, routers=routers, folders=folders)
     app.state.registry.register(given)
+    invitations.connect(app.state.access)
     text = "Rollouts that the service shows to raters."
     to_rate = Gauge("dextouch_rating_rollouts", text, registry=app.state.registry)
     to_rate.set(len(rollouts))
@@ -174,11 +193,33 @@ def rating_router(
         mark = Mark.model_validate(
             fields | {"rater": _rater(request, given.rater, key), "episode_id": rollout.episode_id}
         )
+        queue.check(mark)
         if not mark.cannot_judge:
             rubric_of(rollout.task, rubrics).score(mark.holds)
         number = marks.add(mark)
         on_mark()
         return SubmittedMarkNumber(number=number)
+
+    return router
+
+
+def agreement_router(
+    marks: MarkLog,
+    rollouts: Sequence[RatedRollout],
+    rubrics: Mapping[str, Rubric],
+    raters_per_rollout: int,
+) -> APIRouter:
+    """Router of the agreement so far, which raters must not see."""
+    leads = Depends(RequireScope("rate_lead"))
+    router = APIRouter(prefix="/v1/rating", tags=["rating"], dependencies=[leads])
+    task_of = {one.episode_id: one.task for one in rollouts}
+
+    @router.get("/agreement")
+    def get_agreement() -> dict[str, Any]:
+        """The report of all marks until now without single rollouts, with the rollouts by task."""
+        given = marks.latest().values()
+        report = rating_report(given, task_of, rubrics, {}, raters_per_rollout=raters_per_rollout)
+        return report | {"rollouts": dict(Counts(task_of.values()))}
 
     return router
 

@@ -1,8 +1,7 @@
 """Queue of rollouts to rate: blinded, balanced, in a different order for each rater."""
 
 import hashlib
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -12,13 +11,23 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, is_rollout
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, Rubric, StoredMark
-from services.evaluation.reporting.pictures import touch_image
+from services.evaluation.rating.marks import (
+    DECIDING,
+    FIRST,
+    REPEAT,
+    Mark,
+    MarkLog,
+    Rubric,
+    StoredMark,
+    by_people,
+    vote,
+)
+from services.evaluation.reporting.pictures import hands_image
 
 # A rater is shown a rollout again after this many other marks, at least.
 REPEAT_GAP: Final = 10
@@ -59,7 +68,9 @@ def token_of(episode_id: str) -> str:
 class RatingQueue:
     """Assigns rollouts to raters, until each has been rated by `raters_per_rollout` people.
 
-    Rollouts with the fewest raters come first; ties are broken by an order specific to the rater.
+    Rollouts with the fewest raters come first, in an order specific to the rater. When none is left
+    for a rater, they decide those on which the others are tied, as two raters are wherever they
+    differ, until one more rater of each has settled it.
     After every `1 / repeat_share` rollouts a rater is shown one again that they rated at least
     `REPEAT_GAP` marks ago. A repeated request without a mark returns the same rollout.
     """
@@ -94,32 +105,65 @@ class RatingQueue:
             (stored for (who, _, _), stored in latest.items() if who == rater),
             key=lambda stored: stored.number,
         )
-        seen = [one.mark.episode_id for one in mine if one.mark.presentation == FIRST]
-        raters = Counter(
-            episode_id
-            for (_, episode_id, presentation), stored in latest.items()
-            if presentation == FIRST and stored.mark.kind == "human"
-        )
+        seen = [one.mark.episode_id for one in mine if one.mark.presentation != REPEAT]
+        given = by_people(stored.mark for stored in latest.values())
+        raters = {
+            episode_id: sum(one.presentation == FIRST for one in marks)
+            for episode_id, marks in given.items()
+        }
+        every = self._rollouts.values()
         waiting = [
             one
-            for one in self._rollouts.values()
-            if one.episode_id not in seen and raters[one.episode_id] < self._raters_per_rollout
+            for one in every
+            if one.episode_id not in seen
+            and raters.get(one.episode_id, 0) < self._raters_per_rollout
         ]
+        tied = [one for one in every if self._decides(rater, given.get(one.episode_id, ()))]
+        num_open = len(waiting) + len(tied)
         repeated = self._repeat(rater, mine, len(seen))
         if repeated is not None:
-            return Assignment(repeated, REPEAT, len(seen), len(waiting))
-        if not waiting:
+            return Assignment(repeated, REPEAT, len(seen), num_open)
+        if not num_open:
             return None
         chosen = min(
-            waiting, key=lambda one: (raters[one.episode_id], _order(rater, one.episode_id))
+            waiting or tied,
+            key=lambda one: (raters.get(one.episode_id, 0), _order(rater, one.episode_id)),
         )
-        return Assignment(chosen, FIRST, len(seen), len(waiting))
+        return Assignment(chosen, FIRST if waiting else DECIDING, len(seen), num_open)
+
+    def check(self, mark: Mark) -> None:
+        """Refuse a mark by which a rater would count twice, or decide what is not tied.
+
+        Raises:
+            ConflictError: its presentation is not that of the rater's assignment.
+        """
+        latest = (stored.mark for stored in self._marks.latest().values())
+        given = [one for one in latest if one.episode_id == mark.episode_id]
+        first = [one for one in given if (one.presentation, one.kind) == (FIRST, "human")]
+        deciders = {one.rater for one in given if one.presentation == DECIDING}
+        if (
+            not self._decides(mark.rater, first)
+            if mark.presentation == DECIDING
+            else mark.presentation == FIRST and mark.rater in deciders
+        ):
+            raise ConflictError(
+                f"rollout {token_of(mark.episode_id)!r}: got presentation {mark.presentation}, but "
+                f"{DECIDING} decides where other raters are complete and tied, and {FIRST} is not "
+                "for whoever did; ask for the next rollout and use its presentation"
+            )
+
+    def _decides(self, rater: str, marks: Sequence[Mark]) -> bool:
+        """Whether a rollout's raters are complete and tied, and the rater is none of them."""
+        num_first = sum(one.presentation == FIRST for one in marks)
+        is_new = rater not in {one.rater for one in marks}
+        return is_new and num_first >= self._raters_per_rollout and bool(vote(marks).tied)
 
     def _repeat(self, rater: str, mine: list[StoredMark], num_seen: int) -> RatedRollout | None:
         repeats = {one.mark.episode_id for one in mine if one.mark.presentation == REPEAT}
         if len(repeats) >= int(num_seen * self._repeat_share):
             return None
-        old = [one.mark.episode_id for one in mine[: max(0, len(mine) - REPEAT_GAP)]]
+        shown = (one.mark for one in mine[: max(0, len(mine) - REPEAT_GAP)])
+        old = [mark.episode_id for mark in shown if mark.presentation == FIRST]
         known = [self._rollouts[t] for t in map(token_of, old) if t in self._rollouts]
         fresh = [one for one in known if one.episode_id not in repeats]
         return min(fresh, key=lambda one: _order(rater, one.episode_id), default=None)
@@ -234,7 +278,7 @@ def side_by_side(
     height, width = image.shape[:2]
     size = (round(width * IMAGE_HEIGHT_PX / height), IMAGE_HEIGHT_PX)
     shown = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
-    touch = Image.fromarray(touch_image(tactile_kpa, layout=layout))
+    touch = Image.fromarray(hands_image(tactile_kpa, cell_px=8, layout=layout))
     scale = min(IMAGE_HEIGHT_PX / touch.height, size[0] / touch.width)
     touch = touch.resize((round(touch.width * scale), round(touch.height * scale)))
     canvas = Image.new("RGB", (size[0] + touch.width + 8, IMAGE_HEIGHT_PX), (_BACKGROUND,) * 3)

@@ -13,7 +13,16 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from services.evaluation.rating.marks import FIRST, REPEAT, Mark, Rubric, StoredMark, rubric_of
+from services.evaluation.rating.marks import (
+    FIRST,
+    REPEAT,
+    Mark,
+    Rubric,
+    StoredMark,
+    by_people,
+    rubric_of,
+    vote,
+)
 from services.evaluation.statistics import (
     Interval,
     bootstrap_mean_interval,
@@ -24,6 +33,8 @@ from services.evaluation.statistics import (
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
 UNDEFINED = "undefined"
+# Of a rollout without marks of people.
+_UNDECIDED: Final[dict[str, Any]] = {"decided_score": UNDEFINED, "tied": [], "was_tied": False}
 
 
 @dataclass(frozen=True)
@@ -63,6 +74,34 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
     )
     expected = _disagreement(pooled, level) / (len(pooled) - 1)
     return float(1 - observed / expected) if expected > 0 else math.nan
+
+
+def alpha_interval(
+    ratings: Float64[np.ndarray, "_ _"], generator: np.random.Generator, *, num_draws: int = 1000
+) -> Interval | None:
+    """95 % bootstrap interval of alpha of scores: rollouts are drawn, with all of their ratings.
+
+    None if alpha is undefined, or is in more than one of twenty draws, as for very few rollouts.
+
+    Args:
+        ratings: [rollouts, raters], NaN where missing.
+        generator: random numbers of the draws.
+        num_draws: how many.
+    """
+    rated = ratings[np.isfinite(ratings).sum(axis=1) >= 2]
+    if len(rated) < 2:
+        return None
+    num = np.isfinite(rated).sum(axis=1).astype(np.float64)
+    # Sums of one rollout each, of which those of a draw are sums; centred, so that none cancels.
+    centred = np.nan_to_num(rated - np.nanmean(rated))
+    total, square = centred.sum(axis=1), (centred**2).sum(axis=1)
+    observed = 2 * (num * square - total**2) / (num - 1)
+    counts = start_counts(len(rated), generator, num_draws=num_draws)
+    all_num, all_total, all_square = (counts @ one for one in (num, total, square))
+    expected = 2 * (all_num * all_square - all_total**2) / (all_num - 1)
+    spread = expected > 1e-9 * all_num
+    draws = 1 - (counts @ observed)[spread] / expected[spread]
+    return central_interval(draws) if len(draws) > 0.95 * num_draws else None
 
 
 def _disagreement(values: np.ndarray, level: Level) -> float:
@@ -125,6 +164,8 @@ def rating_report(
     task_of: Mapping[str, str],
     rubrics: Mapping[str, Rubric],
     state_scores: Mapping[str, float],
+    *,
+    raters_per_rollout: int = 1,
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
@@ -135,11 +176,15 @@ def rating_report(
         task_of: task of each episode id; marks of others are skipped.
         rubrics: by task.
         state_scores: true scores by episode id, where they are known.
+        raters_per_rollout: of fewer nothing is tied yet.
     """
     known = [one.mark for one in marks if one.mark.episode_id in task_of]
+    decided = _decided(known, task_of, rubrics, raters_per_rollout)
     tasks = sorted({task_of[mark.episode_id] for mark in known})
     rollouts = [
-        row | {"state_score": state_scores.get(row["episode_id"], UNDEFINED)}
+        row
+        | decided.get(row["episode_id"], _UNDECIDED)
+        | {"state_score": state_scores.get(row["episode_id"], UNDEFINED)}
         for row in _rollouts(known, task_of, rubrics)
     ]
     return {
@@ -149,6 +194,7 @@ def rating_report(
                 [mark for mark in known if task_of[mark.episode_id] == task],
                 rubric_of(task, rubrics),
             )
+            | _conflicts([one for name, one in decided.items() if task_of[name] == task])
             | {"less_state_score": _less_state([r for r in rollouts if r["task"] == task])}
             for task in tasks
         },
@@ -171,6 +217,39 @@ def _rollouts(
         | {"score": float(np.mean(kinds["human"])) if kinds["human"] else UNDEFINED}
         for episode_id, kinds in sorted(found.items())
     ]
+
+
+def _decided(
+    marks: list[Mark],
+    task_of: Mapping[str, str],
+    rubrics: Mapping[str, Rubric],
+    raters_per_rollout: int,
+) -> dict[str, dict[str, Any]]:
+    """Of each rollout with marks of people the score of their majority, and what is tied."""
+    found: dict[str, dict[str, Any]] = {}
+    for episode_id, given in by_people(marks).items():
+        most = vote(given)
+        score: float | str = UNDEFINED
+        if most.holds and not most.tied:
+            rubric = rubric_of(task_of[episode_id], rubrics)
+            score = rubric.score(most.holds, is_inconsistent=most.is_inconsistent)
+        first = [mark for mark in given if mark.presentation == FIRST]
+        is_complete = len(first) >= raters_per_rollout
+        was_tied = is_complete and bool(vote(first).tied) and len(given) > 1
+        tied = list(most.tied) if is_complete else []
+        found[episode_id] = {"decided_score": score, "tied": tied, "was_tied": was_tied}
+    return found
+
+
+def _conflicts(decided: list[dict[str, Any]]) -> dict[str, Any]:
+    """Ties among the raters of a task's rollouts, and the mean score of the majorities."""
+    scores = [one["decided_score"] for one in decided if one["decided_score"] != UNDEFINED]
+    num_tied = sum(bool(one["tied"]) for one in decided)
+    num_settled = sum(one["was_tied"] and not one["tied"] for one in decided)
+    return {
+        "conflicts": {"open": num_tied, "settled": num_settled},
+        "decided_score": float(np.mean(scores)) if scores else UNDEFINED,
+    }
 
 
 def _less_state(rollouts: list[dict[str, Any]]) -> float | str:
@@ -199,14 +278,17 @@ def _task(marks: list[Mark], rubric: Rubric) -> dict[str, Any]:
             holds[name][cell] = held
     generator = np.random.default_rng(0)
     alpha = krippendorff_alpha(scores, level="interval")
+    between = alpha_interval(scores, generator)
     means = np.array([np.nanmean(row) for row in scores])
     interval = bootstrap_mean_interval(means, generator) if len(means) else None
     return {
         "num_rollouts": len(rollouts),
         "num_raters": len(raters),
+        "marks": dict(zip(raters, np.isfinite(scores).sum(axis=0).tolist(), strict=True)),
         "score": float(means.mean()) if len(means) else UNDEFINED,
         "score_interval": [interval.low, interval.high] if interval else UNDEFINED,
         "alpha": _defined(alpha),
+        "alpha_interval": [between.low, between.high] if between else UNDEFINED,
         "alpha_by_criterion": {
             name: _defined(krippendorff_alpha(values, level="nominal"))
             for name, values in holds.items()
@@ -218,7 +300,7 @@ def _task(marks: list[Mark], rubric: Rubric) -> dict[str, Any]:
             for one in rater_biases(raters, scores, generator)
         ],
         "repeats": _repeats(people, rubric),
-        "comment": _comment(alpha),
+        "comment": _comment(alpha, between),
     }
 
 
@@ -234,18 +316,23 @@ def _repeats(people: list[Mark], rubric: Rubric) -> dict[str, Any]:
     return {"num": len(pairs), "same_score": float(np.mean(same)) if same else UNDEFINED}
 
 
-def _comment(alpha: float) -> str:
+def _comment(alpha: float, between: Interval | None) -> str:
     if math.isnan(alpha):
         return (
             "Agreement is undefined: no rollout has two ratings, or all ratings are equal, so "
             "nothing shows that raters tell good rollouts from bad ones."
         )
+    known = f"alpha {alpha:.2f}"
+    if between is not None:
+        known += f", 95 % interval {between.low:.2f} to {between.high:.2f}"
     if alpha < LEAST_ALPHA:
         return (
-            f"Raters agree too little (alpha {alpha:.2f}, below {LEAST_ALPHA}) for conclusions "
+            f"Raters agree too little ({known}, below {LEAST_ALPHA}) for conclusions "
             "from these scores; discuss the rubric with examples and rate again."
         )
-    return f"Raters agree (alpha {alpha:.2f})."
+    if between is None or between.low < LEAST_ALPHA:
+        return f"Raters agree so far ({known}); rate more rollouts to be sure of it."
+    return f"Raters agree ({known})."
 
 
 def _defined(value: float) -> float | str:

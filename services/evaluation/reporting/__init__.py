@@ -6,14 +6,20 @@ appear in the raw figures at the end.
 """
 
 import json
+import os
+import platform
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from dextouch import __version__
 from dextouch.free_text import printable
 from services.evaluation.reporting.pictures import (
+    FULL_SCALE_KPA,
+    MAX_MOVING,
     ActionPicture,
     EpisodePicture,
     PredictionPicture,
@@ -21,8 +27,11 @@ from services.evaluation.reporting.pictures import (
     action_charts,
     action_picture,
     clock_chart,
+    episode_pair,
     episode_picture,
+    moving_picture,
     policy_panels,
+    scale_colours,
     strips,
 )
 from services.evaluation.reporting.sections import (
@@ -38,11 +47,13 @@ from services.evaluation.reporting.sections import (
 )
 
 __all__ = [
+    "MAX_MOVING",
     "ActionPicture",
     "EpisodePicture",
     "PredictionPicture",
     "ReportPictures",
     "action_picture",
+    "episode_pair",
     "episode_picture",
     "write_report",
 ]
@@ -62,6 +73,7 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
     text = environment.get_template("report.html.j2").render(
         title=report.get("title", "DexTouch report"),
         about=report.get("about", {}),
+        raw_report=report,
         tiles=tiles(report),
         stages=stage_bars(report.get("stages", [])),
         errors=error_rows(report.get("errors", {})),
@@ -77,6 +89,13 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
         undecided_note=undecided_note,
         num_rollouts=report.get("num_rollouts", 0),
         strips=strips(pictures),
+        moving=[moving_picture(pair) for pair in pictures.moving[:MAX_MOVING]],
+        scale=scale_colours(),
+        full_scale_kpa=FULL_SCALE_KPA,
+        written=datetime.now(UTC),
+        machine=f"{platform.node()} ({platform.system()} {platform.machine()}, "
+        f"{os.cpu_count()} cores)",
+        version=__version__,
         raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),
     )
     path.parent.mkdir(parents=True, exist_ok=True)

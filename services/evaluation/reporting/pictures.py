@@ -5,19 +5,28 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from markupsafe import Markup, escape
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from dextouch.episodes import EpisodeReader
 from dextouch.hands.actions import unpack_action
 from dextouch.images import encode_jpeg
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile import colour
-from dextouch.tactile.layout import DEXTOUCH_V1, FINGERS, SIDES, TactileLayout
+from dextouch.tactile.layout import (
+    CONTACT_THRESHOLD_KPA,
+    DEXTOUCH_V1,
+    FINGERS,
+    SIDES,
+    Side,
+    TactileLayout,
+)
+from services.evaluation.reporting.policy_picture import NAMESPACE, Rate, policy_picture
 from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
 
 # Photographs larger than this are embedded as JPEG.
@@ -29,7 +38,17 @@ _PALETTE = (
     "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
 )  # fmt: skip
 _KEY_PX = 24
-_WIDTH, _HEIGHT, _SIDE = 560, 240, 300
+_WIDTH, _HEIGHT = 560, 240
+# Pressure at the end of `colour`'s scale.
+FULL_SCALE_KPA: Final = 40.0
+MOVING_S: Final = 5.0
+MAX_MOVING_BYTES: Final = 1_500_000
+MAX_MOVING: Final = 8
+# A hand and its unloaded taxels, seen on light and on dark pages.
+_HAND: Final = (138, 144, 156, 64)
+_UNLOADED: Final = (138, 144, 156, 132)
+_BEHIND: Final = (24, 27, 34)
+_GAP_PX: Final = 16
 # S2 of every finger is abduction; the other three joints are flexion.
 _FLEXION_HINGES = [0, 2, 3]
 
@@ -56,7 +75,7 @@ class ActionPicture:
 
 @dataclass(frozen=True)
 class PredictionPicture:
-    """A few moments of one held-out window, true and predicted."""
+    """Moments of one held-out window, true and predicted; of a moving picture all steps."""
 
     title: str
     times_s: Float64[np.ndarray, " n"]
@@ -78,6 +97,7 @@ class ReportPictures:
     clock_residuals_ms: Mapping[str, Float64[np.ndarray, "2 n"]] = field(default_factory=dict)
     actions: ActionPicture | None = None
     predictions: tuple[PredictionPicture, ...] = ()
+    moving: tuple[PredictionPicture, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,7 +115,7 @@ def moments(
     """Columns of a strip, as data URLs of embedded images."""
     return [
         Moment(
-            f"{time:.2f} s", data_address(image), data_address(touch_image(taxels, layout=layout))
+            f"{time:.2f} s", data_address(image), data_address(hands_image(taxels, layout=layout))
         )
         for time, image, taxels in zip(times_s, images, tactile_kpa, strict=True)
     ]
@@ -110,17 +130,133 @@ def data_address(image: UInt8[np.ndarray, "h w channels"]) -> str:
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()
 
 
-def touch_image(
-    tactile_kpa: np.ndarray, *, scale: int = 3, layout: TactileLayout = DEXTOUCH_V1
+def hands_image(
+    tactile_kpa: np.ndarray, *, cell_px: int = 4, layout: TactileLayout = DEXTOUCH_V1
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Both hands [2, taxels] side by side in hand layout; transparent where there is no taxel."""
-    pairs = zip(tactile_kpa, SIDES, strict=True)
-    hands = [layout.hand_canvas(taxels, side=side) for taxels, side in pairs]
-    gap = np.full((hands[0].shape[0], 2), np.nan, dtype=np.float32)
-    canvas = np.concatenate([hands[0], gap, hands[1]], axis=1)
-    opacity = np.where(np.isnan(canvas), 0, 255).astype(np.uint8)
-    both = np.concatenate([colour(canvas), opacity[..., None]], axis=-1)
-    return both.repeat(scale, axis=0).repeat(scale, axis=1)
+    """Both hands [2, taxels] side by side as the dashboard draws them, transparent around them.
+
+    Taxels below half the contact threshold have the colour of the unloaded hand.
+    """
+    hands = []
+    for taxels, side in zip(tactile_kpa, SIDES, strict=True):
+        picture = _unloaded_hand(layout, side, cell_px).copy()
+        canvas = layout.hand_canvas(taxels, side=side)
+        rows, columns = np.nonzero(np.nan_to_num(canvas) >= CONTACT_THRESHOLD_KPA / 2)
+        colours = colour(canvas[rows, columns]).tolist()
+        drawn = ImageDraw.Draw(picture)
+        for row, column, rgb in zip(rows.tolist(), columns.tolist(), colours, strict=True):
+            drawn.rounded_rectangle(_cell(row, column, cell_px), cell_px / 2, (*rgb, 255))
+        hands.append(
+            picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.BOX)
+        )
+    return np.concatenate([np.asarray(hand) for hand in hands], axis=1)
+
+
+def _cell(row: int, column: int, cell_px: int) -> tuple[float, ...]:
+    """Corners of a taxel in a picture of twice the size with a margin of one cell."""
+    x, y, gap = 2 * cell_px * (column + 1), 2 * cell_px * (row + 1), 0.09 * 2 * cell_px
+    return x + gap, y + gap, x + 2 * cell_px - 1 - gap, y + 2 * cell_px - 1 - gap
+
+
+@lru_cache(maxsize=16)
+def _unloaded_hand(layout: TactileLayout, side: Side, cell_px: int) -> Image.Image:
+    """Silhouette and taxels of a hand without pressure, of twice the size, to be smoothed."""
+    rows, columns = layout.canvas
+    unit = 2 * cell_px
+    picture = Image.new("RGBA", ((columns + 2) * unit, (rows + 2) * unit), (*_HAND[:3], 0))
+    drawn = ImageDraw.Draw(picture)
+    # Left edge, top, width of each pad, mirrored on the left hand; the palm is drawn last.
+    boxes = {}
+    for pad in layout.pads:
+        (row, column), width = pad.origin, pad.shape[1]
+        boxes[pad.part] = column if side == "right" else columns - column - width, row, pad.shape
+    palm = boxes.pop("palm", None)
+    if palm is not None:
+        left, top, (height, width) = palm
+        for column, row, shape in boxes.values():
+            x = column + shape[1] / 2
+            inside = min(max(x, left + 2.5), left + width - 2.5)
+            reach = [(x, row + 1.9)]
+            reach += [(x, top + 4)] if inside == x else [(x, row + 3), (inside, top + 8)]
+            points = [((u + 1) * unit, (v + 1) * unit) for u, v in reach]
+            drawn.line(points, _HAND, round(4.9 * unit), joint="curve")
+            for u, v in points:
+                radius = 2.45 * unit
+                drawn.ellipse((u - radius, v - radius, u + radius, v + radius), _HAND)
+        corners = (left + 0.5, top + 0.5, left + width + 1.5, top + height + 1.5)
+        drawn.rounded_rectangle([unit * corner for corner in corners], 2.6 * unit, _HAND)
+    for row, column in np.argwhere(
+        np.isfinite(layout.hand_canvas(np.zeros(layout.num_taxels), side=side))
+    ).tolist():
+        drawn.rounded_rectangle(_cell(row, column, cell_px), cell_px / 2, _UNLOADED)
+    return picture
+
+
+def scale_colours() -> list[str]:
+    """CSS colours at equal steps of pressure, from none to `FULL_SCALE_KPA`."""
+    rows = colour(np.linspace(0.0, FULL_SCALE_KPA, 21)).tolist()
+    return ["rgb({} {} {})".format(*rgb) for rgb in rows]
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A moving picture of two worlds, real on the left, and its still one."""
+
+    title: str
+    moving: str
+    still: str
+    seconds: float
+
+
+def moving_picture(pair: PredictionPicture) -> Moving:
+    """At most five seconds of a pair with images of all steps, as animated WebP in a data URL.
+
+    A picture of more than `MAX_MOVING_BYTES` is compressed more, then shown at half the rate.
+    """
+    shown = np.flatnonzero(pair.times_s <= pair.times_s[0] + MOVING_S)
+    step_ms = 1000.0 * float(np.diff(pair.times_s[shown]).mean()) if len(shown) > 1 else 1000.0
+    frames = [_frame(pair, index, index / max(1, len(shown) - 1)) for index in shown.tolist()]
+    data = b""
+    for quality, stride in ((70, 1), (40, 1), (40, 2), (20, 4)):
+        data = _webp(frames[::stride], quality, round(step_ms * stride))
+        if len(data) <= MAX_MOVING_BYTES:
+            break
+    moving, still = (
+        "data:image/webp;base64," + base64.b64encode(one).decode()
+        for one in (data, _webp([frames[len(frames) // 2]], 80, 0))
+    )
+    return Moving(pair.title, moving, still, step_ms * len(shown) / 1000)
+
+
+def _webp(frames: Sequence[Image.Image], quality: int, duration_ms: int) -> bytes:
+    file, (first, *others) = io.BytesIO(), frames
+    moving = {"save_all": True, "append_images": others, "duration": duration_ms, "loop": 0}
+    first.save(file, "WEBP", quality=quality, method=2, **(moving if others else {}))
+    return file.getvalue()
+
+
+def _frame(pair: PredictionPicture, index: int, progress: float) -> Image.Image:
+    """Images above hands, real beside imagined, and how much of the time has passed."""
+    worlds = (
+        (pair.true_images, pair.true_tactile_kpa),
+        (pair.predicted_images, pair.predicted_tactile_kpa),
+    )
+    columns = []
+    for images, tactile_kpa in worlds:
+        hands = Image.fromarray(hands_image(tactile_kpa[index], cell_px=5, layout=pair.layout))
+        image = Image.fromarray(images[index])
+        size = (hands.width, round(image.height * hands.width / image.width))
+        columns.append((image.resize(size, Image.Resampling.BICUBIC), hands))
+    width = columns[0][1].width
+    height = max(image.height + hands.height for image, hands in columns)
+    # Opaque, since a translucent frame would be blended with the one before it.
+    frame = Image.new("RGB", (2 * width + _GAP_PX, height + _GAP_PX), _BEHIND)
+    for left, (image, hands) in zip((0, width + _GAP_PX), columns, strict=True):
+        frame.paste(image, (left, 0))
+        frame.paste(hands, (left, height - hands.height), hands)
+    line = (0, height + 6, round(progress * (frame.width - 1)), height + 10)
+    ImageDraw.Draw(frame).rectangle(line, _HAND[:3])
+    return frame
 
 
 @dataclass(frozen=True)
@@ -132,18 +268,6 @@ class Line:
     y: np.ndarray
     style: int = 0
     dashed: bool = False
-
-
-@dataclass(frozen=True)
-class Point:
-    """One policy in two worlds, with the confidence interval of each score."""
-
-    label: str
-    real: float
-    imagined: float
-    real_interval: tuple[float, float]
-    imagined_interval: tuple[float, float]
-    style: int = 0
 
 
 @dataclass(frozen=True)
@@ -192,28 +316,6 @@ def line_chart(lines: Sequence[Line], *, x_label: str, y_label: str) -> Markup:
             f"<title>{escape(line.label)}</title></polyline>"
         )
     return _svg(body, axes, f"{y_label} over {x_label}")
-
-
-def agreement_chart(points: Sequence[Point]) -> Markup:
-    """Imagined over real success, both 0 … 1, with intervals and the identity line."""
-    axes = _Axes((-0.04, 1.04), (-0.04, 1.04), _SIDE + _LEFT - _TOP, _SIDE)
-    (x0, y0), (x1, y1) = axes.to_px(0.0, 0.0), axes.to_px(1.0, 1.0)
-    body = [
-        _grid(axes, "success in the twin", "success imagined"),
-        f'<line class="guide" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>',
-    ]
-    for point in points:
-        x, y = axes.to_px(point.real, point.imagined)
-        low_x, low_y = axes.to_px(point.real_interval[0], point.imagined_interval[0])
-        high_x, high_y = axes.to_px(point.real_interval[1], point.imagined_interval[1])
-        body.append(
-            f'<g class="s{point.style % NUM_STYLES}"><path class="whisker" '
-            f'd="M{low_x:.1f} {y:.1f}H{high_x:.1f}M{x:.1f} {low_y:.1f}V{high_y:.1f}"/>'
-            f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="5">'
-            f"<title>{escape(point.label)}: real {point.real:.2f}, "
-            f"imagined {point.imagined:.2f}</title></circle></g>"
-        )
-    return _svg(body, axes, "imagined over real success of each policy")
 
 
 def stand_alone(charts: Sequence[Markup], keys: Mapping[str, int]) -> str:
@@ -373,31 +475,27 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
     panels = []
     for task in dict.fromkeys(str(e["task"]) for e in entries):
         rows = [e for e in entries if e["task"] == task]
-        points = [
-            Point(
-                str(entry["policy"]),
-                float(entry["real"]),
-                float(entry["imagined"]),
-                _interval(entry, "real"),
-                _interval(entry, "imagined"),
-                style=index,
-            )
-            for index, entry in enumerate(rows)
-            if is_number(entry.get("real"))
-            and is_number(entry.get("imagined"))
-            and entry.get("imagined_comparable", True)
-        ]
-        chart = agreement_chart(points) if points else None
+        pairs = {
+            str(one["policy"]): [(_rate(one, "real"), _rate(one, "imagined"))]
+            for one in rows
+            if is_number(one.get("real"))
+            and is_number(one.get("imagined"))
+            and one.get("imagined_comparable", True)
+        }
+        title = f"{report.get('imagined_world', 'imagined')}, {task.replace('_', ' ')}"
+        drawn = policy_picture(pairs, title, "svg").decode() if pairs else ""
+        # Names are escaped, the rest are numbers; within a page a picture needs no namespace.
+        chart = Markup(drawn.replace(f" {NAMESPACE}", "")) if drawn else None  # noqa: S704
         figures = agreement_figures(agreement.get(task, {}))
         rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
         panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
     return panels
 
 
-def _interval(entry: Mapping[str, Any], world: str) -> tuple[float, float]:
-    """Interval of a score, or the score itself if the report has none."""
+def _rate(entry: Mapping[str, Any], world: str) -> Rate:
+    """A score with its interval, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
-    return float(low), float(high)
+    return float(entry[world]), float(low), float(high)
 
 
 def strips(pictures: ReportPictures) -> list[Strip]:
@@ -425,6 +523,29 @@ def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePi
         window.images[HEAD_CAMERA][steps],
         window.tactile_kpa[steps],
         window.tactile_layout,
+    )
+
+
+def episode_pair(
+    title: str, true: EpisodeReader, imagined: EpisodeReader, num_moments: int | None = None
+) -> PredictionPicture:
+    """A true and an imagined episode, at evenly spaced steps that both have.
+
+    Without their number at all steps of the first five seconds, of which moving pictures are.
+    """
+    num_steps = min(true.num_steps, imagined.num_steps)
+    if num_moments is None:
+        num_steps = min(num_steps, math.ceil(MOVING_S * imagined.attributes.model_rate_hz) + 1)
+    shown = np.linspace(0, num_steps - 1, num_moments or num_steps).round().astype(np.int64)
+    left, right = (one.window(0, num_steps, cameras=(HEAD_CAMERA,)) for one in (true, imagined))
+    return PredictionPicture(
+        title,
+        shown / imagined.attributes.model_rate_hz,
+        left.images[HEAD_CAMERA][shown],
+        right.images[HEAD_CAMERA][shown],
+        left.tactile_kpa[shown],
+        right.tactile_kpa[shown],
+        left.tactile_layout,
     )
 
 

@@ -9,15 +9,16 @@ from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final
+from urllib.parse import quote
 
-from fastapi import APIRouter, Depends, FastAPI, Query
+from fastapi import APIRouter, Depends, FastAPI, Query, Response
 from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
-from services.evaluation.scores import RolloutFailure
+from services.evaluation.reporting.policy_picture import Format
 from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies.results import FILE, NAME_PATTERN, StudyDefinition, StudyResults
 from services.evaluation.studies.study_figures import (
@@ -26,9 +27,12 @@ from services.evaluation.studies.study_figures import (
     StudySummary,
     study_figures,
     study_rollouts,
+    study_summary,
 )
+from services.evaluation.studies.study_pictures import picture, picture_name
 
 SCOPE: Final = "study_read"
+PICTURE_TYPES: Final = {"svg": "image/svg+xml", "png": "image/png", "tex": "application/x-tex"}
 MAX_PAGE: Final = 500
 MAX_STUDIES: Final = 200
 # While a study runs, reading it takes at most this share of the time.
@@ -46,18 +50,7 @@ class _Study:
 
     @property
     def summary(self) -> StudySummary:
-        outcomes = self.results.outcomes.values()
-        return StudySummary(
-            name=self.name,
-            title=self.definition.name,
-            tasks=self.definition.tasks,
-            worlds=tuple(self.definition.imagined),
-            policies=tuple(self.definition.policies),
-            num_rollouts=self.definition.num_rollouts,
-            num_done=len(outcomes),
-            num_failed=sum(isinstance(one, RolloutFailure) for one in outcomes),
-            changed_at=self.changed_at,
-        )
+        return study_summary(self.name, self.definition, self.results, self.changed_at)
 
     @cached_property
     def rollouts(self) -> tuple[StudyRollout, ...]:
@@ -212,6 +205,19 @@ def study_router(folders: StudyFolders) -> APIRouter:
     def get_study(name: str) -> StudyFigures:
         """Success rates, agreement and progress of a study."""
         return folders.figures(name)
+
+    @router.get("/{name}/picture", response_class=Response)
+    def get_study_picture(
+        name: str,
+        world: Annotated[str, Query(max_length=64)],
+        task: Annotated[str, Query(max_length=64)] = "",
+        form: Format = "svg",
+    ) -> Response:
+        """Imagined over real success of every policy, of one task or of all, for a paper."""
+        content = picture(folders.figures(name), world, task, form)
+        file_name = quote(picture_name(world, task, form))
+        headers = {"content-disposition": f"attachment; filename*=UTF-8''{file_name}"}
+        return Response(content, headers=headers, media_type=PICTURE_TYPES[form])
 
     @router.get("/{name}/rollouts")
     def list_study_rollouts(name: str, query: Annotated[RolloutQuery, Query()]) -> StudyRolloutList:

@@ -172,6 +172,8 @@ def read_definition(path: Path) -> StudyDefinition:
 
 
 FILE: Final = "results.jsonl"
+# Store of a study's rollouts in its folder.
+KEPT_FOLDER: Final = "rollouts"
 _MAX_LABEL: Final = 64
 _LOCK_TRIES: Final = 10
 _LOCK_PAUSE_S: Final = 0.05

@@ -2,14 +2,25 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+import structlog
 from pydantic import AwareDatetime
 
 from dextouch.command_line import write_result
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import DexTouchError
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.filmed_pairs import example_pairs, title_of
+from services.evaluation.reporting import (
+    MAX_MOVING,
+    PredictionPicture,
+    ReportPictures,
+    episode_pair,
+    write_report,
+)
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import (
     LEAST_DECIDED,
@@ -22,13 +33,17 @@ from services.evaluation.scores import (
     undefined_by,
 )
 from services.evaluation.studies.results import (
+    KEPT_FOLDER,
     PlannedRollout,
     StudyDefinition,
     StudyResults,
+    cell_of,
     cells_of,
     rollout_episode_id,
     study_report,
 )
+
+logger = structlog.get_logger(__name__)
 
 # From this difference of success on, two worlds disagree about a start.
 DISAGREEMENT: Final = 0.5
@@ -146,6 +161,24 @@ class StudyFigures(FrozenModel):
     agreement: tuple[StudyAgreement, ...]
     num_disagreements: int
     meanings: dict[str, str] = MEANINGS
+
+
+def study_summary(
+    name: str, definition: StudyDefinition, results: StudyResults, changed_at: datetime
+) -> StudySummary:
+    """What the list of studies shows of one whose results can be read."""
+    outcomes = results.outcomes.values()
+    return StudySummary(
+        name=name,
+        title=definition.name,
+        tasks=definition.tasks,
+        worlds=tuple(definition.imagined),
+        policies=tuple(definition.policies),
+        num_rollouts=definition.num_rollouts,
+        num_done=len(outcomes),
+        num_failed=sum(isinstance(one, RolloutFailure) for one in outcomes),
+        changed_at=changed_at,
+    )
 
 
 def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[StudyRollout, ...]:
@@ -294,6 +327,22 @@ def _agreed(
     )
 
 
+def kept_pairs(
+    report: ClosedLoopReport, world: str, results: StudyResults
+) -> tuple[PredictionPicture, ...]:
+    """The example pairs of a study of those rollouts that its folder keeps, whole ones only."""
+    store = EpisodeStore(str(results.path.with_name(KEPT_FOLDER)))
+    found = list[PredictionPicture]()
+    for pair in example_pairs(report, world).values():
+        ids = [rollout_episode_id(results.header, cell_of(score)) for score in pair]
+        if len(found) < MAX_MOVING and all(map(store.exists, ids)):
+            try:
+                found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
+            except DexTouchError as error:
+                logger.warning("pair_not_shown", pair=title_of(pair), reason=error.message)
+    return tuple(found)
+
+
 def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, Any]:
     """Write all reports beside the results of a study, finished or not, and return the figures.
 
@@ -312,6 +361,7 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
             report.scores, (world, *others), report.policies, report.failures
         ).to_report()
         title = f"{definition.name}: {world} and the real world"
-        write_report(page | {"title": title}, ReportPictures(), folder / f"report {world}.html")
+        shown = ReportPictures(moving=kept_pairs(report, world, results))
+        write_report(page | {"title": title}, shown, folder / f"report {world}.html")
     (folder / TABLES_FILE).write_text(latex_tables(report), encoding="utf-8")
     return figures

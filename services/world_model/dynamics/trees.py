@@ -139,12 +139,13 @@ def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any
 
 
 def _names(part: Any, name: str = "") -> Iterator[str]:  # noqa: ANN401 - as above
-    """Names of the tensors of dataclasses, in the order of `_tensors`."""
+    """Names of the tensors of dataclasses and tuples, in the order of `_tensors`."""
     if isinstance(part, Tensor):
         yield name
-    else:
-        for field in _fields(part.__class__):
-            yield from _names(getattr(part, field), f"{name}.{field}" if name else field)
+        return
+    named_by = map(str, range(len(part))) if isinstance(part, tuple) else _fields(part.__class__)
+    for field, one in zip(named_by, _parts(part), strict=True):
+        yield from _names(one, f"{name}.{field}" if name else field)
 
 
 def _parts(part: Any) -> Sequence[Any]:  # noqa: ANN401 - as above

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
@@ -181,17 +182,28 @@ class KeysValues:
 class Text:
     """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
 
-    They do not depend on the flow time, so that the steps of a sampler can share one object.
+    They do not depend on the flow time, so that the steps of a sampler can share one object. The
+    keys and values of a batch may come from texts of single `rows`, which other batches share.
     """
 
     words: Float[Tensor, "batch words width"]
     kept: dict[int, KeysValues] = field(default_factory=dict)
+    rows: tuple["Text", ...] = ()
 
     def keys_values(self, layer: nn.Module, compute: Callable[[Tensor], KeysValues]) -> KeysValues:
         """Keys and values of the words in a layer, computed at most once."""
         number = id(layer)
         if number not in self.kept:
-            self.kept[number] = compute(self.words)
+            each = [row.keys_values(layer, compute) for row in self.rows]
+            if not each:
+                self.kept[number] = compute(self.words)
+            elif all(one is each[0] for one in each):
+                shape = (len(each), -1, -1, -1)
+                keys, values = each[0].keys.expand(shape), each[0].values.expand(shape)
+                self.kept[number] = KeysValues(keys, values)
+            else:
+                keys, values = (torch.cat([vars(o)[n] for o in each]) for n in ("keys", "values"))
+                self.kept[number] = KeysValues(keys, values)
         return self.kept[number]
 
 
@@ -307,11 +319,27 @@ class JointLayer(nn.Module):
         super().__init__()
         self.video = video
         self.tactile = tactile
+        # Whether training computes the layer again instead of keeping its activations.
+        self.recompute = False
 
     def forward(
         self, video: Stream, tactile: Stream | None, mask: Bool[Tensor, "tokens tokens"]
     ) -> tuple[Stream, Stream | None]:
         """Update both streams through the shared attention."""
+        if not self.recompute or not torch.is_grad_enabled():
+            return self._update(video, tactile, mask)
+
+        def update() -> tuple[Stream, Stream | None]:
+            # Keys and values of the text are computed again, too.
+            text = None if video.text is None else Text(video.text.words)
+            return self._update(replace(video, text=text), tactile, mask)
+
+        updated, touched = checkpoint(update, use_reentrant=False, preserve_rng_state=False)
+        return replace(updated, text=video.text), touched
+
+    def _update(
+        self, video: Stream, tactile: Stream | None, mask: Tensor
+    ) -> tuple[Stream, Stream | None]:
         query, key, value = self._queries_keys_values(video, tactile)
         attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return self._finish(video, tactile, attended)

@@ -146,12 +146,12 @@ class VideoCondition(ExpertCondition):
         # Of each latent frame after the first, as the right hand sees them.
         actions = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
         if self.actions is not None:
-            terms.append(after_first(self.actions(actions.flatten(2))))
+            terms.append(after_first(without_dropped(self.actions(actions.flatten(2)), inputs)))
         if self.action_tokens is not None:
-            tokens = after_first(self.action_tokens(actions))
+            tokens = after_first(without_dropped(self.action_tokens(actions), inputs))
         if self.geometry is not None:
             near = split_axis(inputs.geometry[:, 1:], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
-            terms.append(after_first(self.geometry(near)))
+            terms.append(after_first(without_dropped(self.geometry(near), inputs)))
         return Constants((*terms, self.static(inputs)[:, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
@@ -177,13 +177,16 @@ class TactileCondition(ExpertCondition):
         """What does not depend on the flow time."""
         terms, tokens = [], None
         if self.actions is not None:
-            terms.append(after_first(self.actions(features.per_hand[:, 1:])))
+            terms.append(
+                after_first(without_dropped(self.actions(features.per_hand[:, 1:]), inputs))
+            )
         if self.action_tokens is not None:
-            tokens = after_first(self.action_tokens(features.per_hand[:, 1:, :, None]))
-            tokens = tokens.flatten(1, 2)
+            tokens = self.action_tokens(features.per_hand[:, 1:, :, None])
+            tokens = after_first(without_dropped(tokens, inputs)).flatten(1, 2)
         if self.geometry is not None:
             own = inputs.geometry[:, 1:]
-            terms.append(after_first(self.geometry(torch.cat([own, own.flip(2)], dim=-1))))
+            near = self.geometry(torch.cat([own, own.flip(2)], dim=-1))
+            terms.append(after_first(without_dropped(near, inputs)))
         if self.scene is not None and self.layout is not None:
             terms.append((self.scene(inputs) + self.layout(features.layout))[:, None])
         return Constants((*terms, self.static(inputs)[:, None, None]), tokens)
@@ -241,6 +244,13 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
     return nn.Sequential(
         nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
     )
+
+
+def without_dropped(
+    condition: Float32[Tensor, "batch later ..."], inputs: ModelInputs
+) -> Float32[Tensor, "batch later ..."]:
+    """The condition, and zeros for windows without actions."""
+    return condition * inputs.acting.view(-1, *[1] * (condition.ndim - 1))
 
 
 def after_first(condition: Float32[Tensor, "batch later ..."]) -> Float32[Tensor, "batch time ..."]:

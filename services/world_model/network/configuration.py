@@ -1,10 +1,12 @@
 """Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
 
 from functools import cached_property
+from operator import not_
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, model_validator
+from pydantic_settings import CliSuppress
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.tactile import LayoutDescription
@@ -76,6 +78,9 @@ class WanConfig(FrozenModel):
     precision: Precision = Field(
         default="bfloat16", description="of the weights; norms, times and modulation are float32"
     )
+    # Of a checkpoint whose adapters are not merged; `--lora.rank` of a training.
+    lora_rank: CliSuppress[int] = Field(default=0, ge=0, exclude_if=not_)
+    lora_scale: CliSuppress[float] = Field(default=1.0, gt=0, exclude_if=lambda scale: scale == 1.0)
 
     @property
     def dtype(self) -> "torch.dtype":
@@ -192,7 +197,7 @@ class NetworkConfig(FrozenModel):
     sampling_time_shift: float = Field(
         default=3.0, ge=1.0, description="shift of flow-matching times in sampling"
     )
-    sampling_steps: int = Field(default=2, ge=1, le=64, description="network calls per chunk")
+    sampling_steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
     sampler: Sampler = Field(
         default="euler", description="solver of the flow: unipc needs fewer steps"
     )
@@ -255,6 +260,19 @@ class NetworkConfig(FrozenModel):
         if self.wan is not None and others:
             raise ValueError(f"video_expert wan: got other sizes (got, expected): {others}")
         return self
+
+    def adapted(self, rank: int, scale: float = 1.0) -> "NetworkConfig":
+        """The configuration with adapters of this rank for Wan2.2; 0 for none."""
+        if self.wan is None:
+            return self
+        wan = self.wan.model_copy(update={"lora_rank": rank, "lora_scale": scale})
+        return self.model_copy(update={"wan": wan})
+
+    @property
+    def adapters(self) -> tuple[int, float] | None:
+        """Rank and scale of the adapters of the pretrained video expert, if it has some."""
+        wan = self.wan
+        return (wan.lora_rank, wan.lora_scale) if wan is not None and wan.lora_rank else None
 
     @property
     def tokens_across(self) -> int:

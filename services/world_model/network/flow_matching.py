@@ -17,7 +17,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
-from services.world_model.network.attention import JointLayer, KeysValues, Stream
+from services.world_model.network.attention import JointLayer, KeysValues, Stream, Tokens
 from services.world_model.network.configuration import Sampler
 
 # Lower bound of training times: velocities divide by them.
@@ -160,15 +160,14 @@ def sample(
 
 @dataclass(frozen=True)
 class CleanTokens:
-    """Clean tokens of both streams after the last layer, and the keys and values of each layer.
+    """Clean tokens of each stream after the last layer, and the keys and values of each layer.
 
     Clean tokens (first latent frame and first touch) attend to each other only and have flow time
     0, so that in every layer their keys and values are the same at every step of the sampler. Noisy
     tokens attend to these and to each other, which needs no mask.
     """
 
-    video: Stream
-    tactile: Stream | None
+    streams: tuple[Tokens, ...]
     layers: tuple[KeysValues, ...]
 
     @classmethod
@@ -180,22 +179,23 @@ class CleanTokens:
         for layer in layers:
             video, tactile, keys_values = layer.update_after(None, video, tactile)
             kept.append(keys_values)
-        return cls(video, tactile, tuple(kept))
+        streams = (video,) if tactile is None else (video, tactile)
+        return cls(tuple(stream.tokens for stream in streams), tuple(kept))
 
     def update(
         self, layers: Iterable[JointLayer], video: Stream, tactile: Stream | None
     ) -> tuple[Stream, Stream | None]:
         """All tokens after the last layer; of those given, only the noisy ones are computed."""
-        video = video.split(self.video.tokens.shape[1])[1]
-        if tactile is not None and self.tactile is not None:
-            tactile = tactile.split(self.tactile.tokens.shape[1])[1]
+        video = video.split(self.streams[0].shape[1])[1]
+        if tactile is not None:
+            tactile = tactile.split(self.streams[1].shape[1])[1]
         for layer, past in zip(layers, self.layers, strict=True):
             video, tactile, _ = layer.update_after(past, video, tactile)
-        if tactile is None or self.tactile is None:
-            return _joined(self.video, video), None
-        return _joined(self.video, video), _joined(self.tactile, tactile)
+        if tactile is None:
+            return _joined(self.streams[0], video), None
+        return _joined(self.streams[0], video), _joined(self.streams[1], tactile)
 
 
-def _joined(clean: Stream, noisy: Stream) -> Stream:
+def _joined(clean: Tokens, noisy: Stream) -> Stream:
     """All tokens; modulation and so on are those of the noisy ones."""
-    return replace(noisy, tokens=torch.cat([clean.tokens, noisy.tokens], dim=1))
+    return replace(noisy, tokens=torch.cat([clean, noisy.tokens], dim=1))

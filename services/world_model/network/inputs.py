@@ -4,13 +4,14 @@ The training loader and the world server both call `build_inputs`, the only way 
 tensors, so that training and serving treat a window identically.
 """
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
@@ -45,7 +46,7 @@ from services.world_model.network.attention import (
     mirror_pose_9d,
 )
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.instruction import instruction_ids
+from services.world_model.network.instruction import NO_WORD, instruction_ids
 
 _PER_SLOT = SLOT_SIZE // len(SAMPLE_OFFSETS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
@@ -180,7 +181,10 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """Batched tensors of requests in physical units; normalized inside the network."""
+    """Batched tensors of requests in physical units; normalized inside the network.
+
+    `acting` is 0 for windows without actions, otherwise 1.
+    """
 
     first_image: UInt8[Tensor, "batch px px 3"]
     first_tactile_kpa: Float32[Tensor, "batch 2 taxels"]
@@ -190,6 +194,7 @@ class ModelInputs:
     raster: Float32[Tensor, "batch time 2 cells cells"]
     geometry: Float32[Tensor, "batch time 2 features"]
     commanded: Float32[Tensor, " batch"]
+    acting: Float32[Tensor, " batch"]
     words: Int64[Tensor, "batch ids"]
     instructions: tuple[str, ...]
 
@@ -203,10 +208,56 @@ class ModelInputs:
 
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
-        moved: dict[str, Any] = {
-            name: one.to(device) for name, one in vars(self).items() if isinstance(one, Tensor)
+        return self._changed(lambda _, one: one.to(device), self.instructions)
+
+    def first_step_keys(self) -> list[bytes]:
+        """A digest of all of each window that is known at its first step, without later actions."""
+        known = (self.first_image, self.first_tactile_kpa, self.layout, self.raster[:, 0])
+        arrays = [one.cpu().numpy() for one in (*known, self.commanded, self.words)]
+        digests = []
+        for index, text in enumerate(self.instructions):
+            parts = [text.encode(), *(array[index].tobytes() for array in arrays)]
+            digests.append(hashlib.sha256(b"".join(parts)).digest())
+        return digests
+
+    def rows(self, indices: Sequence[int]) -> "ModelInputs":
+        """Some of the windows."""
+        texts = tuple(self.instructions[index] for index in indices)
+        return self._changed(lambda _, one: one[list(indices)], texts)
+
+    def joined(self, others: "ModelInputs") -> "ModelInputs":
+        """These windows, then others."""
+        return self._changed(
+            lambda name, one: torch.cat([one, getattr(others, name)]),
+            (*self.instructions, *others.instructions),
+        )
+
+    def without(
+        self, text: Bool[Tensor, " batch"], actions: Bool[Tensor, " batch"]
+    ) -> "ModelInputs":
+        """The windows without the instructions and the actions after the first step of some."""
+
+        def kept(name: str, one: Tensor) -> Tensor:
+            if name == "words":
+                return one.where(~text[:, None], NO_WORD)
+            if name == "acting":
+                return one * ~actions
+            if name not in {"raster", "geometry"}:
+                return one
+            later = torch.arange(one.shape[1], device=one.device) > 0
+            dropped = actions[:, None] & later
+            return one.where(~dropped.view(*dropped.shape, *[1] * (one.ndim - 2)), 0.0)
+
+        texts = zip(self.instructions, text.tolist(), strict=True)
+        return self._changed(kept, tuple("" if absent else known for known, absent in texts))
+
+    def _changed(
+        self, change: Callable[[str, Tensor], Tensor], instructions: tuple[str, ...]
+    ) -> "ModelInputs":
+        changed: dict[str, Any] = {
+            name: change(name, one) for name, one in vars(self).items() if isinstance(one, Tensor)
         }
-        return replace(self, **moved)
+        return replace(self, **changed, instructions=instructions)
 
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
@@ -252,6 +303,7 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         raster=torch.from_numpy(raster),
         geometry=torch.from_numpy(geometry),
         commanded=torch.tensor([float(kind == "commanded") for kind in kinds]),
+        acting=torch.ones(len(requests)),
         words=torch.stack([instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
     )

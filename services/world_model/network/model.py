@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -30,6 +31,8 @@ from services.world_model.network.configuration import (
 from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import TextFeatures
+from services.world_model.network.kept import LastUsed
+from services.world_model.network.low_rank import add_adapters, merge_adapters
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
@@ -84,17 +87,30 @@ class Sampling:
     """How futures are sampled.
 
     `num_steps` (network calls) and `sampler` are the configuration's if None. With `keep_context`,
-    calls share what does not depend on the flow time, which changes results by rounding only.
+    calls share what does not depend on the flow time, which changes results by rounding only. With
+    a `guidance` other than 1, predictions are moved away from those without instruction and
+    actions, by that factor (classifier-free guidance, Ho and Salimans 2022). After `stop_after`
+    calls latents are noisy ones on the way.
     """
 
     num_steps: int | None = None
     sampler: Sampler | None = None
     keep_context: bool = True
+    guidance: float = 1.0
+    stop_after: int | None = None
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What chunks that start from equal observations have in common."""
+
+    first: FirstLatents
+    clean: CleanTokens
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future after the first step; images of all its steps, or of the last four only."""
+    """Future after the first step; images of all its steps, or of the last ones only."""
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
@@ -149,6 +165,21 @@ class JointWorldModel(nn.Module):
             )
             for index in range(config.num_layers)
         )
+        if wan is not None and wan.lora_rank:
+            for layer in self.joint_layers():
+                add_adapters(layer.video, wan.lora_rank, wan.lora_scale)
+        self._observed: LastUsed[Observed] | None = None
+
+    def keep_contexts(self, count: int) -> None:
+        """Keep what depends on the instruction and on the first step alone for later chunks.
+
+        At most `count` of each; weights must not change from now on. Clean tokens see the actions
+        of a chunk by the scene encoder, with which only texts are kept.
+        """
+        if not self.config.use_scene_encoder:
+            self._observed = LastUsed(count)
+        if isinstance(self.video_condition, WanVideoCondition):
+            self.video_condition.kept_texts = LastUsed(count)
 
     @property
     def text_features(self) -> TextFeatures | None:
@@ -188,18 +219,14 @@ class JointWorldModel(nn.Module):
 
         Residuals from the first latents, or the latents themselves, as the configuration says.
         """
-        video = self.codec.encode(to_unit(images))
-        if self.config.video_target == "residual":
-            video = video - video[:, :1]
+        video = from_first(self.codec.encode(to_unit(images)), self.config.video_target)
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
 
     def tactile_targets(
         self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
         """Clean tactile latents; as `targets`."""
-        tactile = self.tokenizer.encode(tactile_kpa)
-        if self.config.tactile_target == "residual":
-            tactile = tactile - tactile[:, :1]
+        tactile = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
         return tactile / self.tactile_residual_std
 
     def forward(
@@ -225,14 +252,14 @@ class JointWorldModel(nn.Module):
             None if touch is None else touch.constants(inputs, features),
         )
 
-    def with_clean_tokens(self, context: Context, noisy: JointLatents) -> Context:
-        """The context with its clean tokens, which no value of `noisy` changes."""
+    def clean_tokens(self, context: Context, noisy: JointLatents) -> CleanTokens:
+        """Clean tokens, which no value of `noisy` changes."""
         t = torch.ones(len(noisy.video), device=noisy.video.device)
         video, tactile, _, _ = self._begin(context, noisy, t)
         video = video.split(self.config.tokens_per_latent)[0]
         if tactile is not None:
             tactile = tactile.split(2 * self.tokenizer.num_tokens)[0]
-        return replace(context, clean=CleanTokens.through(self._joint_layers(), video, tactile))
+        return CleanTokens.through(self.joint_layers(), video, tactile)
 
     def denoise(
         self, context: Context, noisy: JointLatents, t: Float32[Tensor, " batch"]
@@ -244,13 +271,19 @@ class JointWorldModel(nn.Module):
             for layer in self.layers:
                 video, tactile = layer(video, tactile, mask)
         else:
-            video, tactile = context.clean.update(self._joint_layers(), video, tactile)
+            video, tactile = context.clean.update(self.joint_layers(), video, tactile)
         latents = self.video.finish(video, of_video)
         if self.tactile is None or tactile is None or of_tactile is None:
             return JointLatents(latents, self.with_clean_first(noisy, context.first).tactile)
         return JointLatents(latents, self.tactile.finish(tactile, of_tactile))
 
-    def _joint_layers(self) -> list[JointLayer]:
+    def merge_adapters(self) -> None:
+        """Merge adapters of the pretrained video expert into its weights, in place."""
+        merge_adapters(self)
+        self.config = self.config.adapted(rank=0)
+
+    def joint_layers(self) -> list[JointLayer]:
+        """The layers, typed."""
         return [layer for layer in self.layers if isinstance(layer, JointLayer)]
 
     def _begin(
@@ -311,15 +344,44 @@ class JointWorldModel(nn.Module):
         """Sample a future for every request.
 
         There is one `noise` per request; like the inputs it may be on any device. Of the images,
-        all are decoded or only those of the last latent. `precision` is that of the experts' matrix
+        all are decoded or only the last ones. `precision` is that of the experts' matrix
         products (autocast); codecs always use float32.
         """
-        inputs = inputs.to(self.device)
-        first, noise = self.first_latents(inputs), mapped(noise, lambda one: one.to(self.device))
-        clean = self.sample(inputs, first, noise, sampling or Sampling(), precision=precision)
+        inputs, sampling = inputs.to(self.device), sampling or Sampling()
+        noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
+        conditions = inputs
+        if sampling.guidance != 1.0:
+            everything = torch.ones(num_windows, dtype=torch.bool, device=self.device)
+            conditions = inputs.joined(inputs.without(everything, everything))
+        first, kept = self._observe(conditions, noise, sampling, precision)
+        clean = self.sample(conditions, first, noise, sampling, precision=precision, kept=kept)
+        first = mapped(first, lambda one: one[:num_windows])
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
         return Prediction(future.images, touch)
+
+    def _observe(
+        self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling, precision: Precision
+    ) -> tuple[FirstLatents, CleanTokens | None]:
+        """First latents, and clean tokens where those of earlier chunks are kept."""
+        if self._observed is None or not sampling.keep_context:
+            return self.first_latents(inputs), None
+
+        def compute(rows: list[int]) -> list[Observed]:
+            some, noisy = (
+                inputs.rows(rows),
+                mapped(noise, lambda one: one[:1].expand(len(rows), *one.shape[1:])),
+            )
+            first = self.first_latents(some)
+            with products_in(precision, self.device.type):
+                clean = self.clean_tokens(self.context(some, first), noisy)
+            whole = Observed(first, clean)
+            each = torch.split(torch.arange(len(rows), device=self.device), 1)
+            return [mapped(whole, partial(torch.index_select, dim=0, index=row)) for row in each]
+
+        keys = [(precision, key) for key in inputs.first_step_keys()]
+        found = combined(self._observed.of(keys, compute), torch.cat)
+        return found.first, found.clean
 
     @torch.no_grad()
     def sample(
@@ -330,24 +392,43 @@ class JointWorldModel(nn.Module):
         sampling: Sampling,
         *,
         precision: Precision = "float32",
-        stop_after: int | None = None,
+        kept: CleanTokens | None = None,
     ) -> JointLatents:
-        """Sample clean latents, or noisy ones after some of the steps."""
-        device = self.device
+        """Sample clean latents.
+
+        With guidance, `inputs` and `first` are those of all windows, followed by the same without
+        their instructions and actions. `kept` are clean tokens that are known already.
+        """
+        device, is_guided = self.device, sampling.guidance != 1.0
         num_steps = sampling.num_steps or self.config.sampling_steps
-        kept: Context | None = None
-        if sampling.keep_context and num_steps > 1:
+
+        def all_of(latents: Tensor) -> Tensor:
+            return torch.cat([latents, latents]) if is_guided else latents
+
+        context: Context | None = None
+        if sampling.keep_context and (num_steps > 1 or kept is not None):
             with products_in(precision, device.type):
-                kept = self.with_clean_tokens(self.context(inputs, first), noise)
+                context = self.context(inputs, first)
+                kept = kept or self.clean_tokens(context, mapped(noise, all_of))
+                context = replace(context, clean=kept)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
             with products_in(precision, device.type):
-                noisy = JointLatents(video, tactile)
+                noisy, times = JointLatents(all_of(video), all_of(tactile)), all_of(t)
                 # Weights that are sharded over processes are there in `forward` only.
                 guess = (
-                    self(inputs, first, noisy, t) if kept is None else self.denoise(kept, noisy, t)
+                    self(inputs, first, noisy, times)
+                    if context is None
+                    else self.denoise(context, noisy, times)
                 )
             found = guess.video.float(), guess.tactile.float()
+            if is_guided:
+                (conditioned, unconditional), touch = (one.chunk(2) for one in found)
+                scale = sampling.guidance
+                found = (
+                    torch.lerp(unconditional, conditioned, scale),
+                    torch.lerp(touch[1], touch[0], scale),
+                )
             if self.config.prediction == "clean":
                 return found
             return (
@@ -361,14 +442,14 @@ class JointWorldModel(nn.Module):
             num_steps=num_steps,
             shift=self.config.sampling_time_shift,
             sampler=sampling.sampler or self.config.sampler,
-            stop_after=stop_after,
+            stop_after=sampling.stop_after,
         )
         return JointLatents(video, tactile)
 
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step; of the images maybe the last four only.
+        """Images and pressures after the first step; of the images maybe the last ones only.
 
         Without touch all pressures are zero.
         """
@@ -400,6 +481,11 @@ def products_in(precision: Precision, device_type: str) -> Iterator[None]:
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:
     """Stack the noise of several rollouts into a batch."""
     return combined(noises, torch.cat)
+
+
+def from_first(latents: Float32[Tensor, "batch time ..."], target: str) -> Tensor:
+    """Residuals of latents from the first ones, or themselves if `target` is "plain"."""
+    return latents - latents[:, :1] if target == "residual" else latents
 
 
 def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:

@@ -76,7 +76,8 @@ def train_renderer(
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
     for loss in OptimizerLoop(run.network, settings.options(), budget).run(run.loss):
-        update_average(averaged, run.network, decay=settings.ema_decay, num_updates=budget.step - 1)
+        weights = averaged.parameters(), run.network.parameters()
+        update_average(*weights, decay=settings.ema_decay, num_updates=budget.step - 1)
         if on_progress is not None and budget.step % LOG_EVERY_STEPS == 0:
             on_progress(min(budget.share(), 1.0), budget.step, loss)
     return averaged, budget.cpu_s

@@ -4,11 +4,12 @@ Every process draws the windows and the noise of the whole batch from the same s
 own part, so that losses and weights do not depend on the number of processes, except for rounding.
 """
 
+import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
@@ -20,14 +21,18 @@ from torch.distributed.checkpoint.state_dict import (
 from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import fully_shard
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, UnavailableError
+from services.networks.optimizer import learned_weights
 
 Whole = TypeVar("Whole", Tensor, list[Any])
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Processes of one run; without torchrun there is one, with no `mesh`."""
+    """Processes of one run; without torchrun there is one, with no `mesh`.
+
+    A mesh of two dimensions has several copies of the model, each sharded over its own processes.
+    """
 
     rank: int = 0
     count: int = 1
@@ -38,22 +43,18 @@ class Processes:
         """Whether this process writes files and reports progress."""
         return self.rank == 0
 
-    def check(self, batch: int, device: str) -> None:
-        """Refuse a batch that cannot be divided, and a device that several cannot share yet.
+    def check(self, batch: int, accumulate: int) -> None:
+        """Refuse a batch that cannot be divided.
 
         Raises:
-            InvalidInputError: not a multiple of the number of processes, or several processes on
-                another device than the processor.
+            InvalidInputError: not a multiple of the number of processes times that of the parts
+                that each computes one after the other.
         """
-        if batch % self.count:
+        if batch % (self.count * accumulate):
             raise InvalidInputError(
-                f"training: got batches of {batch} windows for {self.count} processes, expected a "
-                "multiple; change --optimizer.batch or --nproc-per-node"
-            )
-        if self.mesh is not None and device != "cpu":
-            raise InvalidInputError(
-                f"training: got {self.count} processes on {device}, expected cpu; several "
-                "processes train on processors only"
+                f"training: got batches of {batch} windows for {self.count} processes with "
+                f"--accumulate {accumulate}, expected a multiple of {self.count * accumulate}; "
+                "change --optimizer.batch, --accumulate or --nproc-per-node"
             )
 
     def rand(self, shape: Sequence[int], generator: torch.Generator) -> Tensor:
@@ -83,40 +84,82 @@ class Processes:
         squares = (value - self.mean(value.mean())).square().sum()
         return (self.count * self.mean(squares) / (self.count * value.numel() - 1)).sqrt()
 
-    def shard(self, model: nn.Module, layers: nn.ModuleList) -> None:
-        """Keep only this process's share of every learned weight, gathered layer by layer.
+    def shard(
+        self, model: nn.Module, layers: nn.ModuleList, whole: Collection[nn.Module] = ()
+    ) -> None:
+        """Keep only this process's share of every weight, gathered layer by layer.
 
-        Frozen weights and statistics stay whole, since they are used outside of `forward`.
+        Parts that are used outside of `forward` stay whole, as do all buffers. Weights may be on
+        the meta device still; others move to the mesh's.
 
         Raises:
             InvalidInputError: learned weights of several precisions.
         """
         if self.mesh is None:
             return
-        frozen = {weight for weight in model.parameters() if not weight.requires_grad}
-        kinds = {str(weight.dtype) for weight in model.parameters() if weight.requires_grad}
+        ignored = {weight for part in whole for weight in part.parameters()}
+        kinds = {str(weight.dtype) for weight in learned_weights(model).values()}
         if len(kinds) > 1:
             raise InvalidInputError(
                 f"training: got learned weights of {', '.join(sorted(kinds))} in {self.count} "
-                "processes, expected one precision; use --network.wan.precision float32"
+                "processes, expected one precision; use --network.wan.precision float32, or freeze "
+                "the video expert with --lora.rank or --freeze-video"
             )
         for module in (*layers, model):
-            fully_shard(module, mesh=self.mesh, ignored_params=frozen)
+            fully_shard(module, mesh=self.mesh, ignored_params=ignored)
 
 
 ALONE = Processes()
+# Counters are on the processor, whatever the device of the weights.
+_BACKENDS: Final = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 
 
 @contextmanager
-def joined_processes() -> Iterator[Processes]:
-    """The processes that torchrun started; `ALONE` without it."""
+def joined_processes(device: str = "cpu", replicas: int = 1) -> Iterator[Processes]:
+    """The processes that torchrun started; `ALONE` without it.
+
+    On cuda, each takes the GPU of its number on its machine.
+
+    Args:
+        device: cpu or cuda.
+        replicas: copies of the sharded model, such as one for each machine.
+
+    Raises:
+        InvalidInputError: another device, or a number of processes that is no multiple of the
+            copies.
+        UnavailableError: fewer GPUs than processes on this machine.
+    """
     if not distributed.is_torchelastic_launched():
+        if replicas > 1:
+            raise InvalidInputError(
+                f"training: got --replicas {replicas} for one process; start several with torchrun"
+            )
         yield ALONE
         return
-    distributed.init_process_group("gloo")
+    if device not in _BACKENDS:
+        raise InvalidInputError(
+            f"training: got device {device} under torchrun, expected {' or '.join(_BACKENDS)}; "
+            "each process takes the GPU of its own number"
+        )
+    if device == "cuda":
+        own, there = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+        if own >= there:
+            raise UnavailableError(
+                f"training: process {own} of this machine finds {there} GPUs; start as many with "
+                "--nproc-per-node, or use --device cpu"
+            )
+        torch.cuda.set_device(own)
+    distributed.init_process_group(_BACKENDS[device])
     try:
         count = distributed.get_world_size()
-        mesh = init_device_mesh("cpu", (count,))
+        if count % replicas:
+            raise InvalidInputError(
+                f"training: got {count} processes for --replicas {replicas}, expected a multiple; "
+                "change --replicas, or the number of processes"
+            )
+        sizes = (replicas, count // replicas) if replicas > 1 else (count,)
+        names = ("replicas", "shards")[-len(sizes) :]
+        mesh = init_device_mesh(device, sizes, mesh_dim_names=names)
         with warnings.catch_warnings():
             # Nothing is changed in place.
             warnings.filterwarnings("ignore", message="FSDP2-wrapped module .* a view tensor")
@@ -136,5 +179,6 @@ def whole_weights(model: nn.Module) -> dict[str, Tensor]:
 
 
 def load_whole(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Load whole weights into a model, which may be sharded."""
-    set_model_state_dict(model, dict(weights), options=StateDictOptions(full_state_dict=True))
+    """Load whole weights into a model, which may be sharded; weights that are not named stay."""
+    options = StateDictOptions(full_state_dict=True, strict=False)
+    set_model_state_dict(model, dict(weights), options=options)

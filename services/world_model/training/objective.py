@@ -6,8 +6,9 @@ context of half the batches is predicted, and noisy latents are those that the s
 reaches; the target is always the recorded future.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float32
@@ -38,6 +39,7 @@ from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
 
 TouchLoss = Literal["all", "contact_or_changing"]
+_Part = TypeVar("_Part")
 # A taxel that differs by this much from the step before is changing.
 CHANGE_KPA = 0.5
 OWN_CONTEXT_SHARE = 0.5
@@ -59,12 +61,55 @@ class LossOptions:
     output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
     learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
+    `text_dropout` and `action_dropout` are the shares of windows without instruction, and
+    without actions, for guidance; the smaller share is without both.
     """
 
     context_noise: float = 0.0
     touch_loss: TouchLoss = "all"
     precision: Precision = "float32"
     own_noisy: bool = False
+    text_dropout: float = 0.0
+    action_dropout: float = 0.0
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What the network is given for some windows, what it should answer, and how that counts.
+
+    `counted` weighs the errors of tactile tokens, and `num_counted` is their sum over the windows
+    of a step, per process; `share` is that of these windows in those of the process.
+    """
+
+    inputs: ModelInputs
+    first: FirstLatents
+    noisy: JointLatents
+    t: Float32[Tensor, " batch"]
+    target: JointLatents
+    counted: Float32[Tensor, "batch steps 2 tokens 1"]
+    num_counted: Float32[Tensor, ""]
+    share: float = 1.0
+
+    def parts(self, count: int) -> Iterator["Examples"]:
+        """The windows in equal parts, whose losses sum to that of all."""
+        size = len(self.t) // count
+        for start in range(0, len(self.t), size):
+            yield self._rows(range(start, start + size), self.share / count)
+
+    def _rows(self, rows: range, share: float) -> "Examples":
+        def own(part: _Part) -> _Part:
+            return mapped(part, lambda tensor: tensor[rows.start : rows.stop])
+
+        return Examples(
+            self.inputs.rows(rows),
+            own(self.first),
+            own(self.noisy),
+            own(self.t),
+            own(self.target),
+            own(self.counted),
+            self.num_counted,
+            share,
+        )
 
 
 def losses(
@@ -75,15 +120,37 @@ def losses(
     options: LossOptions = LossOptions(),
     processes: Processes = ALONE,
 ) -> Losses:
-    """Errors of the prediction at random times.
+    """Errors of the prediction at random times; see `examples_of` and `errors`."""
+    examples = examples_of(model, batch, generator=generator, options=options, processes=processes)
+    return errors(model, examples, options.precision)
 
-    The batches of all `processes` together are the whole one. Losses are this process's
-    contributions to it, which have the whole one's loss as their mean.
+
+def examples_of(
+    model: JointWorldModel,
+    batch: WindowBatch,
+    *,
+    generator: torch.Generator,
+    options: LossOptions = LossOptions(),
+    processes: Processes = ALONE,
+    num_parts: int = 1,
+) -> Examples:
+    """Windows with random times and noise.
+
+    The batches of all `processes` together are the whole one. Images are encoded in `num_parts`.
     """
     device = model.device
     inputs = build_inputs(batch.requests, model.config).to(device)
+    if options.text_dropout or options.action_dropout:
+        drawn = processes.rand([len(inputs)], generator).to(device)
+        inputs = inputs.without(drawn < options.text_dropout, drawn < options.action_dropout)
     tactile_kpa = batch.tactile_kpa.to(device)
-    clean = model.targets(batch.images.to(device), tactile_kpa)
+    encoded = [
+        model.targets(images.to(device), felt)
+        for images, felt in zip(
+            batch.images.chunk(num_parts), tactile_kpa.chunk(num_parts), strict=True
+        )
+    ]
+    clean = combined(encoded, torch.cat)
     first = _with_noise(model.first_latents(inputs), options.context_noise, generator, processes)
     num_windows, shift = len(inputs) * processes.count, model.config.training_time_shift
     t = processes.own(training_times(num_windows, shift=shift, generator=generator)).to(device)
@@ -97,11 +164,6 @@ def losses(
     if model.config.prediction == "velocity":
         # Of the straight path from data to noise.
         target = combined([noise, clean], lambda pair: pair[0] - pair[1])
-    with products_in(options.precision, device.type):
-        guess = model(inputs, first, noisy, t)
-    video = (guess.video - target.video)[:, 1:].square().mean()
-    if not model.config.use_touch:
-        return Losses(video, torch.zeros((), device=device))
     valid = batch.tactile_valid.to(device)
     counted = (valid & valid[:, :1])[:, 1:, :, None]
     if options.touch_loss == "contact_or_changing":
@@ -110,8 +172,24 @@ def losses(
         )
         counted = counted & tokens[:, 1:]
     weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
-    error = (guess.tactile - target.tactile)[:, 1:].square() * weights
-    tactile = error.sum() / (processes.mean(weights.sum()) * error.shape[-1]).clamp_min(1.0)
+    num_counted = processes.mean(weights.sum())
+    return Examples(inputs, first, noisy, t, target, weights, num_counted)
+
+
+def errors(model: JointWorldModel, examples: Examples, precision: Precision) -> Losses:
+    """Losses of examples.
+
+    They are contributions to those of the whole batch: of parts of it, which sum to that of a
+    process, and of processes, which have the whole one's as their mean.
+    """
+    with products_in(precision, examples.t.device.type):
+        guess = model(examples.inputs, examples.first, examples.noisy, examples.t)
+    target = examples.target
+    video = (guess.video - target.video)[:, 1:].square().mean() * examples.share
+    if not model.config.use_touch:
+        return Losses(video, torch.zeros((), device=video.device))
+    error = (guess.tactile - target.tactile)[:, 1:].square() * examples.counted
+    tactile = error.sum() / (examples.num_counted * error.shape[-1]).clamp_min(1.0)
     return Losses(video, tactile)
 
 
@@ -210,7 +288,7 @@ def own_noisy(
     """Noisy latents and their time at a random step of the model's own sampler (Euler)."""
     num_steps = model.config.sampling_steps
     taken = int(torch.randint(num_steps, (), generator=generator))
-    sampling = Sampling(num_steps, "euler", keep_context=False)
-    noisy = model.sample(inputs, first, noise, sampling, stop_after=taken)
+    sampling = Sampling(num_steps, "euler", keep_context=False, stop_after=taken)
+    noisy = model.sample(inputs, first, noise, sampling)
     times = sampling_times(num_steps, model.config.sampling_time_shift)
     return noisy, times[taken].expand(len(inputs)).to(noisy.video.device)

@@ -252,7 +252,8 @@ def train_averaged(
     averaged = copy.deepcopy(network)
     for value in OptimizerLoop(network, options, budget).run(loss):
         # Begins with a longer memory than that of a first update.
-        update_average(averaged, network, decay=settings.ema_decay, num_updates=budget.step)
+        weights = averaged.parameters(), network.parameters()
+        update_average(*weights, decay=settings.ema_decay, num_updates=budget.step)
         if on_step is not None:
             on_step(budget.step, value)
     return averaged.eval()

@@ -187,7 +187,8 @@ def _learn(
     evaluate(averaged)
     num_evaluated = 0
     for _ in optimizer.OptimizerLoop(tokenizer, options, budget).run(loss):
-        optimizer.update_average(averaged, tokenizer, decay=_EMA_DECAY, num_updates=budget.step - 1)
+        weights = averaged.parameters(), tokenizer.parameters()
+        optimizer.update_average(*weights, decay=_EMA_DECAY, num_updates=budget.step - 1)
         due = budget.share() * settings.num_evaluations
         if num_evaluated + 1 <= due < settings.num_evaluations:
             evaluate(averaged)

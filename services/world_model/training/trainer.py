@@ -1,16 +1,19 @@
 """Training of the joint flow-matching model, from settings to an evaluated checkpoint."""
 
-import copy
 import json
+import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from pydantic import JsonValue
+from torch import Tensor
 
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
@@ -19,16 +22,27 @@ from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
-from services.world_model.network.configuration import WanFiles
+from services.world_model.network.configuration import WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import JointWorldModel
+from services.world_model.network.model import JointWorldModel, from_first
 from services.world_model.network.tactile import TactileTokenizer
+from services.world_model.network.video import to_unit
 from services.world_model.paper_settings import TrainSettings, command_line
-from services.world_model.pretrained_video import initial_model, share_texts
+from services.world_model.pretrained_video import (
+    freeze_pretrained,
+    initial_model,
+    is_pretrained,
+    share_texts,
+)
 from services.world_model.training import dataset, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
-from services.world_model.training.objective import LossOptions, losses, own_context
+from services.world_model.training.objective import (
+    LossOptions,
+    errors,
+    examples_of,
+    own_context,
+)
 
 LOG_EVERY_STEPS = 20
 
@@ -48,9 +62,10 @@ OnState = Callable[["TrainingRun"], None]
 
 
 class TrainingRun:
-    """One run: network, weight average, optimizer and clock.
+    """One run: network, averages of its learned weights, optimizer and clock.
 
     Windows depend on the seed only, not on whether they are cut in memory or streamed from disk.
+    Averages that would equal the weights (`ema_decay` 0) are not kept.
     """
 
     def __init__(
@@ -59,20 +74,29 @@ class TrainingRun:
         settings: TrainSettings,
         processes: Processes = ALONE,
     ) -> None:
-        processes.check(settings.optimizer.batch, settings.device)
+        processes.check(settings.optimizer.batch, settings.accumulate)
         self.settings = settings
         self.episodes = episodes
         self.processes = processes
-        self.budget = optimizer.Budget(settings.cpu_budget_s, settings.max_steps)
+        self.budget = optimizer.Budget(
+            settings.cpu_budget_s or math.inf,
+            settings.step_limit,
+            settings.wall_budget_s or math.inf,
+            paced_by_steps=True,
+        )
         self.log: list[TrainingProgress] = []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
-            has_weights = settings.init is not None or settings.resume
-            model = initial_model(settings.network, settings.wan, filled_later=has_weights)
-        self.model = on_device(model, settings.device)
-        self.averaged = copy.deepcopy(self.model).eval()
-        for network in (self.model, self.averaged):
-            processes.shard(network, network.layers)
+            is_filled = settings.init is not None
+            model = initial_model(
+                settings.network, settings.wan, filled_later=is_filled, prepare=self._prepare
+            )
+        # Sharded weights are there already.
+        is_alone = processes.mesh is None
+        self.model = on_device(model, settings.device) if is_alone else model.to(settings.device)
+        self.learned = optimizer.learned_weights(self.model)
+        self._averages: dict[str, Tensor] = {}
+        self._start_averages()
         self._generator = torch.Generator().manual_seed(settings.seed + 1)
         self._rng = np.random.default_rng(settings.seed + 2)
         # Generator states after the windows trained on, and after those read ahead.
@@ -87,6 +111,19 @@ class TrainingRun:
         options = settings.optimizer.options()
         self.loop = optimizer.OptimizerLoop(self.model, options, self.budget)
 
+    def _prepare(self, model: JointWorldModel) -> None:
+        """Freeze, shard and so on, before there is memory for the weights."""
+        settings, wan = self.settings, self.settings.network.wan
+        if settings.freeze_video or (wan is not None and wan.lora_rank):
+            freeze_pretrained(model)
+        for layer in model.joint_layers():
+            layer.recompute = settings.recompute
+        self.processes.shard(model, model.layers, whole=(model.codec, model.tokenizer))
+
+    def _start_averages(self) -> None:
+        if self.settings.optimizer.ema_decay > 0.0:
+            self._averages = {name: one.detach().clone() for name, one in self.learned.items()}
+
     @torch.no_grad()
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
         """Fit everything in closed form: codecs, action statistics, residual scales.
@@ -94,8 +131,9 @@ class TrainingRun:
         A pretrained tokenizer is taken instead of fitting one.
         """
         model, config = self.model, self.settings.network
-        if model.device.type != "cpu":
-            model.cpu()
+        fitted = [model.tokenizer, model.normalizer, *([] if config.wan else [model.codec])]
+        for part in fitted:
+            part.cpu()
         batch = self._sampler.draw(self.settings.windows.fit_windows, config.max_steps)
         model.codec.fit(batch.images)
         if tokenizer is None:
@@ -106,17 +144,18 @@ class TrainingRun:
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
         # The pretrained expert takes its latents as they are.
         if config.wan is None:
-            videos = model.targets(batch.images, batch.tactile_kpa).video
+            videos = from_first(model.codec.encode(to_unit(batch.images)), config.video_target)
             model.video_residual_std.copy_(videos[:, 1:].std().clamp_min(1e-3))
         if config.use_touch:
-            touch = model.tactile_targets(batch.tactile_kpa)
+            touch = from_first(model.tokenizer.encode(batch.tactile_kpa), config.tactile_target)
             model.tactile_residual_std.copy_(touch[:, 1:].std().clamp_min(1e-3))
-        if self.settings.device != "cpu":
-            on_device(model, self.settings.device)
-        self.averaged.load_state_dict(model.state_dict())
+        for part in fitted:
+            part.to(model.device)
 
     def start_from(self, checkpoint: checkpoints.Checkpoint) -> None:
         """Take over the weights and codecs of a checkpoint.
+
+        Its adapters are merged, unless the run has as large ones.
 
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
@@ -125,41 +164,57 @@ class TrainingRun:
             [checkpoint.metadata.network.tactile_layout, self.settings.network.tactile_layout],
             what="--init and the training episodes",
         )
-        sampling = {"sampling_steps", "sampler", "sampling_time_shift", "layout"}
-        requested = self.settings.network.model_dump(exclude=sampling)
-        there = checkpoint.metadata.network.model_dump(exclude=sampling)
+        own, stored = self.settings.network, checkpoint.metadata.network
+        free: Any = {
+            **dict.fromkeys(("sampling_steps", "sampler", "sampling_time_shift", "layout"), True),
+            "wan": {"precision", "lora_rank", "lora_scale"},
+        }
+        requested, there = own.model_dump(exclude=free), stored.model_dump(exclude=free)
         others = {n: (there[n], value) for n, value in requested.items() if there[n] != value}
         if others:
             raise ConflictError(
                 "training: the initial checkpoint has other network settings (stored, "
                 f"requested): {others}; request the stored ones"
             )
+        if stored.adapters != own.adapters:
+            checkpoint.model.merge_adapters()
         load_whole(self.model, checkpoint.model.state_dict())
-        load_whole(self.averaged, checkpoint.model.state_dict())
+        self._start_averages()
         share_texts(checkpoint.model, self.model)
 
+    @torch.no_grad()
     def whole_average(self) -> JointWorldModel | None:
-        """The averaged network with whole weights; None in all processes but the first."""
-        if self.processes.mesh is None:
-            return self.averaged
-        weights = whole_weights(self.averaged)
-        if not self.processes.is_first:
-            return None
-        model = initial_model(self.settings.network, WanFiles(), filled_later=True).eval()
-        model.load_state_dict(weights)
-        share_texts(self.model, model)
-        return model
+        """The averaged network with whole weights; None in all processes but the first.
+
+        Weights of the run become their averages, and adapters are merged, unless they are kept.
+        """
+        for name, average in self._averages.items():
+            self.learned[name].copy_(average)
+        model = self.model
+        if self.processes.mesh is not None:
+            weights = whole_weights(model)
+            if not self.processes.is_first:
+                return None
+            model = initial_model(self.settings.network, WanFiles(), filled_later=True)
+            model.load_state_dict(weights)
+            share_texts(self.model, model)
+        if not self.settings.lora.keep:
+            model.merge_adapters()
+        return model.eval()
 
     def state(self, identity: dict[str, JsonValue]) -> training_state.TrainingState:
         """Tensors and metadata that the next steps depend on."""
-        tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
-        tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
-        tensors |= training_state.optimizer_tensors(self.loop.optimizer)
+        named = self.model.named_parameters()
+        given = {n for n, one in named if is_pretrained(n) and not one.requires_grad}
+        tensors = {f"model.{n}": t for n, t in self.model.state_dict().items() if n not in given}
+        tensors |= {f"averaged.{n}": t for n, t in self._averages.items()}
+        tensors |= training_state.optimizer_tensors(self.loop.optimizer, self.learned)
         tensors["generator"] = self._generator.get_state()
         facts = training_state.RunFacts(
             identity=identity,
             step=self.budget.step,
             cpu_s=self.budget.cpu_s,
+            wall_s=self.budget.wall_s,
             window_numbers=self._window_numbers,
             log=tuple(astuple(entry) for entry in self.log),
         )
@@ -167,13 +222,18 @@ class TrainingRun:
 
     def restore(self, state: training_state.TrainingState) -> None:
         """Continue from `state`."""
-        self.model.load_state_dict(training_state.part_of(state.tensors, "model."))
-        self.averaged.load_state_dict(training_state.part_of(state.tensors, "averaged."))
-        training_state.restore_optimizer(self.loop.optimizer, state.tensors)
+        weights = training_state.part_of(state.tensors, "model.")
+        self.model.load_state_dict(weights, strict=False)
+        self._averages = {
+            name: average.to(self.model.device)
+            for name, average in training_state.part_of(state.tensors, "averaged.").items()
+        }
+        training_state.restore_optimizer(self.loop.optimizer, self.learned, state.tensors)
         self._generator.set_state(state.tensors["generator"])
         self._window_numbers = state.facts.window_numbers
         self._rng.bit_generator.state = json.loads(self._window_numbers)
-        self.budget.step, self.budget.cpu_s = state.facts.step, state.facts.cpu_s
+        facts, budget = state.facts, self.budget
+        budget.step, budget.cpu_s, budget.wall_s = facts.step, facts.cpu_s, facts.wall_s
         self.log = [TrainingProgress(*row) for row in state.facts.log]
 
     def run(
@@ -192,7 +252,8 @@ class TrainingRun:
             loss_video, loss_tactile = self.learn(next(batches))
             self._window_numbers = self._drawn.popleft()
             budget.advance()
-            budget.cpu_s = self.processes.mean(torch.tensor(budget.cpu_s)).item()
+            spent = torch.tensor([budget.cpu_s, budget.wall_s], dtype=torch.float64)
+            budget.cpu_s, budget.wall_s = self.processes.mean(spent).tolist()
             if budget.step % LOG_EVERY_STEPS == 0 or budget.share() >= 1.0:
                 share = min(budget.share(), 1.0)
                 progress = TrainingProgress(budget.step, share, loss_video, loss_tactile)
@@ -205,26 +266,41 @@ class TrainingRun:
 
     def learn(self, batch: dataset.WindowBatch) -> tuple[float, float]:
         """One optimizer step; returns the video and tactile losses."""
-        settings = self.settings.optimizer
+        settings, num_parts = self.settings.optimizer, self.settings.accumulate
         if self.settings.self_forcing:
             batch = own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
-        noise, is_own = self.settings.windows.context_noise, self.settings.self_forcing
-        options = LossOptions(noise, settings.touch_loss, settings.precision, own_noisy=is_own)
-        loss = losses(
+        windows = self.settings.windows
+        options = LossOptions(
+            windows.context_noise,
+            settings.touch_loss,
+            settings.precision,
+            own_noisy=self.settings.self_forcing,
+            text_dropout=windows.text_dropout,
+            action_dropout=windows.action_dropout,
+        )
+        examples = examples_of(
             self.model,
             batch,
             generator=self._generator,
             options=options,
             processes=self.processes,
+            num_parts=num_parts,
         )
-        total = loss.video + settings.tactile_weight * loss.tactile
-        self.loop.learn(total, video=loss.video, touch=loss.tactile)
+        self.loop.optimizer.zero_grad()
+        both = torch.zeros(2, device=examples.t.device)
+        for part in examples.parts(num_parts):
+            loss = errors(self.model, part, settings.precision)
+            torch.autograd.backward(loss.video + settings.tactile_weight * loss.tactile)
+            both += torch.stack([loss.video, loss.tactile]).detach()
+        self.loop.step(video=both[0], touch=both[1])
+        averages = self._averages
+        weights = [self.learned[name] for name in averages]
         optimizer.update_average(
-            self.averaged, self.model, decay=settings.ema_decay, num_updates=self.budget.step
+            averages.values(), weights, decay=settings.ema_decay, num_updates=self.budget.step
         )
-        video, tactile = self.processes.mean(torch.stack([loss.video, loss.tactile])).tolist()
+        video, tactile = self.processes.mean(both).tolist()
         return video, tactile
 
     def _batches(self) -> Iterator[dataset.WindowBatch]:
@@ -266,6 +342,7 @@ class TrainingReport:
     num_parameters: int
     steps: int
     cpu_s: float
+    wall_s: float
     num_train_episodes: int
     num_heldout_episodes: int
     metrics: dict[str, float]
@@ -296,7 +373,7 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     settings, tokenizer = tokenizer_trainer.with_tokenizer(settings)
-    settings = _with_layout(settings, (*trained, *heldout), tokenizer)
+    settings = _with_layout(settings.with_adapters(), (*trained, *heldout), tokenizer)
     if tokenizer is not None:
         tokenizer_trainer.check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
@@ -315,19 +392,28 @@ def train_on(
     run = TrainingRun(trained, settings, processes)
     log = _run_or_resume(run, ancestor, tokenizer, on_progress)
     averaged = run.whole_average()
+    files, budget = training_state.StateFiles(settings.output, processes), run.budget
+    # Its gradients and moments need not be there while the checkpoint is evaluated.
+    del run
     if averaged is None:
         return None
+    windows = settings.windows
+    dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
     metadata = checkpoints.CheckpointMetadata(
         name=settings.name,
-        network=settings.network,
+        network=averaged.config,
         tasks=tuple(sorted({episode.task for episode in trained})),
         command=command_line(settings),
         seed=settings.seed,
-        training_steps=run.budget.step,
-        training_cpu_s=round(run.budget.cpu_s, 1),
+        training_steps=budget.step,
+        training_cpu_s=round(budget.cpu_s, 1),
         train_episode_ids=tuple(sorted(names)),
         train_fingerprints=tuple(sorted(prints)),
         data_hash=_data_hash(trained, settings, ancestor),
+        horizon_latents=max(
+            num_latents(max(map(len, trained))) - 1,
+            0 if ancestor is None else ancestor.metadata.horizon_latents,
+        ),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
         sets=dataset.training_sets(
@@ -339,8 +425,11 @@ def train_on(
             ancestor=None if ancestor is None else ancestor.digest,
         ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
+        text_dropout=dropped[0],
+        action_dropout=dropped[1],
     )
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
+    del averaged
     # Evaluate the weights as stored, then store them again with the results.
     stored = on_device(checkpoints.read_checkpoint(settings.output).model, settings.device)
     metrics = evaluate_prediction(
@@ -349,13 +438,15 @@ def train_on(
     digest = checkpoints.write_checkpoint(
         settings.output, stored, metadata.model_copy(update={"metrics": metrics})
     )
-    training_state.StateFiles(settings.output, processes).remove()
+    if not is_cut_short(settings, budget):
+        files.remove()
     return TrainingReport(
         checkpoint=settings.output,
         digest=digest,
         num_parameters=sum(p.numel() for p in stored.parameters()),
-        steps=run.budget.step,
-        cpu_s=run.budget.cpu_s,
+        steps=budget.step,
+        cpu_s=budget.cpu_s,
+        wall_s=budget.wall_s,
         num_train_episodes=len(trained),
         num_heldout_episodes=len(heldout),
         metrics=metrics,
@@ -417,22 +508,37 @@ def _run_or_resume(
         init_digest=None if ancestor is None else ancestor.digest,
         tokenizer_digest=None if tokenizer is None else tokenizer.digest,
     )
-    if settings.resume and files.exists():
-        like = {**training_state.moments_like(run.loop.optimizer), **run.state(identity).tensors}
-        run.restore(files.read(identity, like))
-    elif ancestor is not None:
+    if ancestor is not None:
         run.start_from(ancestor)
-    else:
+    if settings.resume and files.exists():
+        like = {**training_state.moments_like(run.learned), **run.state(identity).tensors}
+        run.restore(files.read(identity, like))
+        if run.budget.share() >= 1.0 and is_cut_short(settings, run.budget):
+            raise ConflictError(
+                f"training: cut short at step {run.budget.step} of {settings.step_limit} after "
+                f"{run.budget.wall_s:.0f} s ({run.budget.cpu_s:.0f} CPU s), and limits count in "
+                "all; resume with a larger --wall-budget-s or --cpu-budget-s"
+            )
+    elif ancestor is None:
         run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
-    kept_cpu_s = run.budget.cpu_s
+    kept_s = run.budget.wall_s
 
     def keep(now: TrainingRun) -> None:
-        nonlocal kept_cpu_s
-        if now.budget.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
+        nonlocal kept_s
+        is_last = now.budget.share() >= 1.0 and is_cut_short(settings, now.budget)
+        if is_last or now.budget.wall_s - kept_s >= settings.state_every_s:
+            began_s = time.monotonic()
             files.write(now.state(identity))
-            kept_cpu_s = now.budget.cpu_s
+            spent = torch.tensor(time.monotonic() - began_s, dtype=torch.float64)
+            # The same in all processes, which must decide alike.
+            kept_s = now.budget.wall_s + run.processes.mean(spent).item()
 
     return run.run(on_progress, keep)
+
+
+def is_cut_short(settings: TrainSettings, budget: optimizer.Budget) -> bool:
+    """Whether time ended a run before its last step, so that `--resume` can go on."""
+    return settings.step_limit is not None and budget.step < settings.step_limit
 
 
 def load_split(

@@ -10,14 +10,14 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import torch
 from pydantic import JsonValue, ValidationError
-from torch import Tensor, distributed
+from torch import Tensor, distributed, nn
 from torch.distributed.checkpoint.hf_storage import (
     HuggingFaceStorageReader,
     HuggingFaceStorageWriter,
@@ -35,11 +35,12 @@ from services.world_model.training.distribution import Processes
 METADATA_KEY: Final = "dextouch_training_state"
 SUFFIX: Final = ".resume"
 FACTS: Final = "newest.json"
+_OPTIMIZER: Final = "optimizer."
 # Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
-    "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
+    "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_s", "init",
     "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks", "new_tasks",
-    "device", "wan", "plan",
+    "device", "wan", "plan", "plan_processes", "recompute", "accumulate", "replicas",
 }  # fmt: skip
 
 
@@ -53,6 +54,7 @@ class RunFacts(FrozenModel):
     identity: dict[str, JsonValue]
     step: int
     cpu_s: float
+    wall_s: float
     window_numbers: str
     log: tuple[tuple[int, float, float, float], ...]
 
@@ -61,8 +63,8 @@ class RunFacts(FrozenModel):
 class TrainingState:
     """Everything that the next steps of a run depend on.
 
-    Tensor names begin with `model.`, `averaged.` or `optimizer.` (followed by the number of the
-    parameter and the name of its moment), or are `generator`.
+    Tensor names begin with `model.`, `averaged.` or `optimizer.` (followed by the name of a moment
+    and that of its weight), or are `generator`. Pretrained weights that are not trained are absent.
     """
 
     tensors: dict[str, Tensor]
@@ -97,7 +99,8 @@ class StateFiles:
     def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
         """Read the state of a run with these settings and data.
 
-        `own` has a tensor of the same name, shape and sharding for every tensor of the state.
+        `own` has a tensor of the same name, shape and sharding for every tensor of the state. Of a
+        sharded state, those of the model are loaded in place.
 
         Raises:
             ConflictError: the state has other settings or data; they are named.
@@ -110,14 +113,18 @@ class StateFiles:
             except CorruptDataError as error:
                 raise CorruptDataError(f"{error.message}; remove it to start over") from error
             facts = checked_facts(notes.get(METADATA_KEY, ""), identity, where)
+            _check_names(tensors.keys(), own.keys(), where)
             return TrainingState(tensors, facts)
         where = f"training state {self._folder.name}"
         facts = checked_facts((self._folder / FACTS).read_text(), identity, where)
         reader = HuggingFaceStorageReader(str(self._of_step(facts.step)))
         stored = reader.read_metadata().state_dict_metadata
-        if not stored or stored.keys() - own.keys():
-            raise CorruptDataError(f"{where}: incomplete; remove it to start over")
-        tensors = {name: torch.zeros_like(own[name]) for name in stored}
+        _check_names(stored.keys(), own.keys(), where)
+        # Those of the optimizer have the weights in their place.
+        tensors = {
+            name: torch.zeros_like(own[name]) if name.startswith(_OPTIMIZER) else own[name]
+            for name in stored
+        }
         load(tensors, storage_reader=reader)
         return TrainingState(tensors, facts)
 
@@ -161,14 +168,31 @@ class StateFiles:
         return self._folder / f"step-{step:08d}"
 
 
+def _check_names(stored: Set[str], own: Set[str], where: str) -> None:
+    # A weight without a gradient so far has no moments.
+    missing = {name for name in own if not name.startswith(_OPTIMIZER)} - stored
+    if missing or stored - own:
+        raise CorruptDataError(
+            f"{where}: incomplete, or of another release ({len(missing)} tensors missing, "
+            f"{len(stored - own)} unexpected); remove it to start over"
+        )
+
+
 def state_path(output: Path) -> Path:
     """Path of the state of a run with this output."""
     return output.with_name(output.name + SUFFIX)
 
 
 def identity_of(settings: TrainSettings, **digests: str | None) -> dict[str, JsonValue]:
-    """Settings, and digests of the data and of files, that must not change when a run resumes."""
-    return {**settings.model_dump(mode="json", exclude=_FREE_SETTINGS), **digests}
+    """Settings, and digests of the data and of files, that must not change when a run resumes.
+
+    Limits of time may change where the learning rate follows the steps.
+    """
+    free = _FREE_SETTINGS | {"max_steps"}
+    if settings.step_limit is not None:
+        free |= {"cpu_budget_s", "wall_budget_s"}
+    kept = settings.model_dump(mode="json", exclude=free)
+    return {**kept, "max_steps": settings.step_limit, **digests}
 
 
 def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> RunFacts:
@@ -193,32 +217,37 @@ def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> R
     return facts
 
 
-def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Optimizer moments of every parameter, by name."""
-    kept: dict[int, dict[str, Tensor]] = optimizer.state_dict()["state"]
+def optimizer_tensors(
+    optimizer: torch.optim.Optimizer, learned: Mapping[str, nn.Parameter]
+) -> dict[str, Tensor]:
+    """Optimizer moments of every learned weight, by name; none before its first step."""
     return {
-        f"optimizer.{number}.{name}": moment
-        for number, moments in kept.items()
-        for name, moment in moments.items()
+        f"{_OPTIMIZER}{moment}.{name}": value
+        for name, weight in learned.items()
+        for moment, value in optimizer.state.get(weight, {}).items()
     }
 
 
-def moments_like(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def moments_like(learned: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
     """Tensors of the names and shapes that `optimizer_tensors` returns after a step of AdamW."""
-    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     return {
-        f"optimizer.{number}.{name}": like
-        for number, weight in enumerate(weights)
-        for name, like in (("step", torch.zeros(())), ("exp_avg", weight), ("exp_avg_sq", weight))
+        f"{_OPTIMIZER}{moment}.{name}": like
+        for name, weight in learned.items()
+        for moment, like in (("step", torch.zeros(())), ("exp_avg", weight), ("exp_avg_sq", weight))
     }
 
 
-def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer,
+    learned: Mapping[str, nn.Parameter],
+    tensors: Mapping[str, Tensor],
+) -> None:
     """Restore the moments returned by `optimizer_tensors`."""
+    numbers = {name: number for number, name in enumerate(learned)}
     moments: dict[int, dict[str, Any]] = {}
-    for name, tensor in part_of(tensors, "optimizer.").items():
-        number, moment = name.split(".", 1)
-        moments.setdefault(int(number), {})[moment] = tensor
+    for stored, tensor in part_of(tensors, _OPTIMIZER).items():
+        moment, name = stored.split(".", 1)
+        moments.setdefault(numbers[name], {})[moment] = tensor
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
 

@@ -1,6 +1,7 @@
 """HTTP client of the episode store: uploads, queries, windows and samples."""
 
 import json
+import ssl
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import TypeVar
@@ -62,6 +63,8 @@ class EpisodeStoreClient:
             headers=headers,
             timeout=timeout_s,
             transport=transport,
+            # Authorities of the system, or of SSL_CERT_FILE, as for `HttpLink`; no proxy settings.
+            verify=ssl.create_default_context(),
             trust_env=False,
         )
 

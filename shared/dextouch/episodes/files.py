@@ -24,6 +24,8 @@ _SYNC_THREADS = 16
 # End of the name of a file that is being replaced; one that was interrupted is left.
 PARTIAL = ".partial"
 _COPY_BYTES = 1 << 22
+# IOV_MAX of Linux: what one writev takes.
+_MAX_PARTS = 1024
 # EFBIG: the file size limit of the process or file system; handled like a full disk.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
@@ -47,14 +49,19 @@ def disk_errors(what: str, *, advice: str = "free space and try again") -> Itera
         raise StorageError(f"{what}: {error}") from error
 
 
-def write_parts(descriptor: int, *parts: bytes) -> None:
+def write_parts(descriptor: int, *parts: bytes | memoryview) -> None:
     """Write every byte of all parts in order, without joining them first (writev)."""
     views = [memoryview(part) for part in parts if part]
-    while views:
-        num_written = os.writev(descriptor, views)
-        while views and num_written >= len(views[0]):
-            num_written -= len(views.pop(0))
-        if views:
+    num_left = sum(map(len, views))
+    while num_left:
+        num_written = os.writev(descriptor, views[:_MAX_PARTS])
+        num_left -= num_written
+        num_done = 0
+        while num_left and num_written >= len(views[num_done]):
+            num_written -= len(views[num_done])
+            num_done += 1
+        del views[:num_done]
+        if num_left:
             views[0] = views[0][num_written:]
 
 

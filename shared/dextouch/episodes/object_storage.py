@@ -202,7 +202,7 @@ class ObjectStorage:
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
 
-    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes, *, replaces: bool) -> EpisodeWriter:
         """Writer of a new group.
 
         Raises ConflictError for an id that exists, InvalidInputError if the work folder belongs to
@@ -217,7 +217,7 @@ class ObjectStorage:
                 f"{kind} {item_id!r} waits in {target} to be uploaded; `complete_uploads` does so, "
                 "as does the store's service while it runs"
             )
-        if self.exists(kind, item_id):
+        if not replaces and self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
         stage = new_stage(self.root, kind, item_id)
         writer = UploadingWriter(stage=stage, target=target, attributes=attributes)
@@ -283,6 +283,14 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
+
+    def get_file(self, name: str) -> bytes | None:
+        """An object beside the groups; None if it does not exist."""
+        return self._bucket.get(name)
+
+    def put_file(self, name: str, content: bytes) -> None:
+        """Put an object beside the groups in place of an earlier one."""
+        self._bucket.put(name, content)
 
     def held(self, kind: Kind, item_id: str, *, waits: bool) -> AbstractContextManager[None]:
         """Nothing: a bucket has no locks; only that the group exists."""

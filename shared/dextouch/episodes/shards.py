@@ -33,8 +33,8 @@ _H264_MIN_BYTES = 4 + 3 + 1
 # Adjacent storage chunks are fetched together up to this many bytes: enough for most windows in one
 # request, while whole arrays are still read in pieces.
 _SPAN_BYTES = 1 << 21
-# A writer collects small storage chunks, such as those of stamps, up to this many bytes.
-_WRITE_BYTES = 1 << 16
+# A writer collects storage chunks up to this many bytes.
+_WRITE_BYTES = 1 << 18
 # At most IOV_MAX of Linux, 1024.
 _WRITE_PARTS = 512
 # Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
@@ -75,14 +75,9 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
         raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
 
 
-def crc_of(data: bytes) -> bytes:
-    """The crc32c of bytes as it is stored."""
-    return google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
-
-
 def with_crc(data: bytes) -> bytes:
     """Append the crc32c to bytes."""
-    return data + crc_of(data)
+    return data + google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
 
 
 def _without_crc(
@@ -326,7 +321,7 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 
 
 class ShardWriter:
-    """Appends rows to a new shard of a stage; buffers at most one storage chunk and 64 KiB.
+    """Appends rows to a new shard of a stage; buffers at most one storage chunk and 256 KiB.
 
     The entry of the array has 0 rows and no hash yet. Raises StorageError if a file cannot be
     created, StorageFullError without space; nothing can be appended afterwards.
@@ -341,12 +336,11 @@ class ShardWriter:
             if entry.codec == "zstd"
             else np.zeros(0, dtype=self._dtype)
         )
-        self._num_pending = 0
-        # Of a `bytes` array, what does not fill a storage chunk yet.
-        self._rest = b""
+        # Rows of a storage chunk that is not full yet; of a `bytes` array its crc32c so far.
+        self._num_pending = self._crc = 0
         self._crcs = bytearray()
         # Not written yet.
-        self._parts: list[bytes] = []
+        self._parts: list[bytes | memoryview] = []
         self._num_waiting = 0
         self._sha256 = hashlib.sha256()
         # Offset and length of each storage chunk.
@@ -370,23 +364,32 @@ class ShardWriter:
     def append_bytes(self, data: bytes) -> None:
         """Append to a `bytes` array, whose sha256 is the caller's to compute."""
         self.num_rows += len(data)
-        size = self._entry.chunk_rows
-        place = min(len(data), size - len(self._rest))
-        self._rest += data[:place]
-        while len(self._rest) == size:
-            self._write(self._rest, crc_of(self._rest))
-            self._rest = data[place : place + size]
-            place += size
+        self._append_bytes(data)
+
+    def _append_bytes(self, data: bytes) -> None:
+        size, pending, crc, start = self._entry.chunk_rows, self._num_pending, self._crc, 0
+        # Cut as an array, without copies.
+        view = np.frombuffer(data, dtype=np.uint8)
+        for end in (*range(size - pending, len(data), size), len(data)):
+            part, pending = view[start:end], pending + end - start
+            crc = google_crc32c.extend(crc, part)
+            self._parts.append(part.data)
+            if pending == size:
+                self._parts.append(crc.to_bytes(CRC_BYTES, "little"))
+                pending = crc = 0
+            start = end
+        self._num_pending, self._crc = pending, crc
+        self._num_waiting += len(data)
+        self._flush_much()
 
     def finish(self) -> ArrayEntry:
         """Complete the shard and return the array's entry of the commit record."""
-        if self._num_pending:
+        if self._num_pending and self._entry.codec == "zstd":
             self._chunk[self._num_pending :] = 0
             self._write_rows()
-        if self._rest:
-            self._write(with_crc(self._rest.ljust(self._entry.chunk_rows, b"\0")))
         index = np.array(self._index, dtype="<u8").reshape(-1, 2)
         if self._entry.codec == "bytes":
+            self._append_bytes(bytes(-self._num_pending % self._entry.chunk_rows))
             step = self._entry.chunk_rows + CRC_BYTES
             numbers = np.arange(-(-self.num_rows // self._entry.chunk_rows), dtype="<u8")
             index = np.stack([numbers * step, np.full_like(numbers, step)], axis=1)
@@ -420,9 +423,12 @@ class ShardWriter:
         self._index.append((sum(self._index[-1]) if self._index else 0, len(data)))
         return data
 
-    def _write(self, *parts: bytes) -> None:
-        self._parts += parts
-        self._num_waiting += sum(map(len, parts))
+    def _write(self, part: bytes | memoryview) -> None:
+        self._parts.append(part)
+        self._num_waiting += len(part)
+        self._flush_much()
+
+    def _flush_much(self) -> None:
         if self._num_waiting >= _WRITE_BYTES or len(self._parts) >= _WRITE_PARTS:
             self._flush()
 

@@ -77,8 +77,7 @@ if TYPE_CHECKING:
 
 
 _OBJECT_SCHEME = "s3://"
-# The files of a group that a catalog is made of: its content, and remarks beside it.
-_STAMPED = (COMMIT_FILE, METADATA_FILE, *REMARK_FILES)
+_IS_ID = re.compile(ID_PATTERN).fullmatch
 
 
 class EpisodeStore:
@@ -103,8 +102,12 @@ class EpisodeStore:
         """The folder that other machines must see to use this store; none for a bucket."""
         return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
 
-    def writer(self, *, kind: Kind = "episode", attributes: Attributes) -> EpisodeWriter:
+    def writer(
+        self, *, kind: Kind = "episode", attributes: Attributes, replaces: bool = False
+    ) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
+
+        With `replaces` its id may exist until the end of the context, where it must be gone.
 
         Raises ConflictError for an id that exists, InvalidInputError for attributes of the other
         kind.
@@ -115,7 +118,7 @@ class EpisodeStore:
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
             )
         _check(kind, attributes_id(attributes))
-        return self._storage.writer(kind, attributes)
+        return self._storage.writer(kind, attributes, replaces=replaces)
 
     def open(self, episode_id: str) -> EpisodeReader:
         """Open a committed episode.
@@ -263,6 +266,32 @@ class EpisodeStore:
             self._set_remark(kind, item_id, NOTES_FILE, found if found.notes else None)
         return found
 
+    def copy_remarks(
+        self, source: "EpisodeStore", item_id: str, *, kind: Kind, only_missing: bool = False
+    ) -> bool:
+        """Make the remarks on an item those of another store, byte for byte; whether any changed.
+
+        With `only_missing` those that it has stay. Raises NotFoundError without the id in both.
+        """
+        theirs, ours = source.files(item_id, kind=kind), self.files(item_id, kind=kind)
+        changed = {
+            name: content
+            for name in REMARK_FILES
+            if (content := theirs.get(name)) != (own := ours.get(name))
+            and not (only_missing and own is not None)
+        }
+        for name, content in changed.items():
+            self._storage.set_remark(kind, item_id, name, content)
+        return bool(changed)
+
+    def get_file(self, name: str) -> bytes | None:
+        """A small file of the store as a whole, beside its items; None where there is none."""
+        return self._storage.get_file(name)
+
+    def put_file(self, name: str, content: bytes) -> None:
+        """Replace a file that `get_file` reads; nobody but its owner may read it."""
+        self._storage.put_file(name, content)
+
     def held(self, item_id: str, *, kind: Kind = "episode") -> AbstractContextManager[None]:
         """Hold an item while it is edited, so that no other program edits it; not in a bucket.
 
@@ -391,9 +420,9 @@ class _LocalStorage:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def writer(self, kind: Kind, attributes: Attributes) -> EpisodeWriter:
+    def writer(self, kind: Kind, attributes: Attributes, *, replaces: bool) -> EpisodeWriter:
         target = self._folder(kind, attributes_id(attributes))
-        if target.exists():
+        if target.exists() and not replaces:
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
         stage = new_stage(self.root, kind, target.name)
         return EpisodeWriter(stage=stage, target=target, attributes=attributes)
@@ -429,18 +458,22 @@ class _LocalStorage:
                 return {}
 
     def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
-        folder, found = f"{self.root}/{kind}s", {}
+        found, none = {}, " ".join([""] * len(REMARK_FILES))
         with disk_errors(f"look at {kind}s"):
-            for name, number in numbers.items():
-                if not re.fullmatch(ID_PATTERN, name):
-                    continue
+            for name in filter(_IS_ID, numbers):
+                folder = f"{self.root}/{kind}s/{name}/"
                 try:
-                    commit, *others = (_stamp(f"{folder}/{name}/{file}") for file in _STAMPED)
+                    commit = _stamp(folder + COMMIT_FILE)
+                    content = f"{commit} {_stamp(folder + METADATA_FILE)}"
+                    # Most have none, and raising errors would take as long as all the rest.
+                    remarks = none
+                    if any(os.access(folder + file, os.F_OK) for file in REMARK_FILES):
+                        remarks = " ".join(_stamp(folder + file) for file in REMARK_FILES)
                 except PermissionError:
                     # Reading it says what is wrong.
-                    commit, others = "?", ["", "", ""]
+                    commit, content, remarks = "?", "? ", none
                 if commit:
-                    found[name] = Stamps(number, f"{commit} {others[0]}", " ".join(others[1:]))
+                    found[name] = Stamps(numbers[name], content, remarks)
         return found
 
     def delete(self, kind: Kind, item_id: str) -> None:
@@ -459,6 +492,16 @@ class _LocalStorage:
             except FileNotFoundError as error:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
+
+    def get_file(self, name: str) -> bytes | None:
+        path = self.root / name
+        with disk_errors(f"read {path}"):
+            return path.read_bytes() if path.is_file() else None
+
+    def put_file(self, name: str, content: bytes) -> None:
+        with disk_errors(f"write {self.root / name}"):
+            self.root.mkdir(parents=True, exist_ok=True)
+            replace_file(self.root / name, content, mode=0o600)
 
     @contextmanager
     def held(self, kind: Kind, item_id: str, *, waits: bool) -> Iterator[None]:
@@ -504,7 +547,7 @@ def _is_committed(folder: Path) -> bool:
     try:
         return (folder / COMMIT_FILE).is_file()
     except PermissionError:
-        return re.fullmatch(ID_PATTERN, folder.name) is not None
+        return _IS_ID(folder.name) is not None
 
 
 def write_rollout(

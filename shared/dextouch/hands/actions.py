@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_6d, rotation_to_6d
+from dextouch.hands.robot_hand import RobotHand
 
 ACTION_DIM = 67
 POSE_DIM = 9
@@ -59,6 +60,25 @@ class HandTrajectory:
             self.Ts_world_wrist_right[index],
             self.Ts_world_camera_head[index],
         )
+
+
+def action_names(*, has_robot_joints: bool = True) -> list[str]:
+    """Names of the 67 components of an action or a state, in order.
+
+    A pose is a translation in metres and two columns of the rotation matrix. Joints without those
+    of the robot's hands, such as of a human hand, have numbers in place of names.
+    """
+    rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
+    left, right, head = (
+        [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
+        for name in ("wrist_left", "wrist_right", "camera_head")
+    )
+    joints = [
+        f"{name}_rad" if has_robot_joints else f"{side}_joint_{index}_rad"
+        for side in ("left", "right")
+        for index, name in enumerate(RobotHand(side).joint_names)
+    ]
+    return [*left, *right, *joints, *head]
 
 
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:

@@ -103,6 +103,7 @@ from .observations import rollout_uncertainty as rollout_uncertainty
 from .observations import start_from as start_from
 from .observations import start_of_parts as start_of_parts
 from .observations import validate_fields as validate_fields
+from .rollouts import BOUND_SHARE as BOUND_SHARE
 from .rollouts import CHUNK_STEPS as CHUNK_STEPS
 from .rollouts import MAX_SEED as MAX_SEED
 from .rollouts import MILESTONE_PREFIX as MILESTONE_PREFIX
@@ -164,7 +165,9 @@ from .station import RecorderStatus as RecorderStatus
 from .station import RobotFollowing as RobotFollowing
 from .station import SavedTakes as SavedTakes
 from .station import SaveTake as SaveTake
+from .station import SetFault as SetFault
 from .station import SharedLink as SharedLink
+from .station import SimulatedFault as SimulatedFault
 from .station import SpooledTake as SpooledTake
 from .station import StaleCode as StaleCode
 from .station import StationEnrolment as StationEnrolment

@@ -390,6 +390,7 @@ class PlayedStream(FrozenModel):
 
     `interpolated` are the spans of actions that nothing measured, `unmeasured_taxels` those that
     alignment refused. `layout` is that of the taxels of a tactile stream, None of `dextouch_v1`.
+    `components` name the values of actions of the robot's hands, with their unit as a suffix.
 
     A gap is an interval of more than one and a half nominal periods between samples. Times are
     those of the reference clock for episodes, of the host's arrivals for recordings; None if the
@@ -410,6 +411,7 @@ class PlayedStream(FrozenModel):
     gaps_ns: tuple[tuple[int, int], ...] = ()
     interpolated: tuple[InterpolatedSpan, ...] = ()
     unmeasured_taxels: tuple[int, ...] = ()
+    components: tuple[str, ...] = ()
     layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
 
 

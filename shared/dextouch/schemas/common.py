@@ -52,6 +52,7 @@ STATUS_OF_CLASS: tuple[tuple[type[errors.DexTouchError], int], ...] = (
 STATUS_OF_REASON = {
     **dict.fromkeys(("missing_scope", "other_key", "other_station", "foreign_origin"), 403),
     **dict.fromkeys(("unknown_token", "used_token", "expired_token"), 403),
+    **dict.fromkeys(("expired_link", "revoked_link", "other_pool"), 403),
     "foreign_host": 421,
     "too_many_wrong_keys": 429,
 }
@@ -106,7 +107,7 @@ def status_of(error: errors.DexTouchError) -> int:
 
     Two classes depend on their details: a temporary limit (`retry_after_s`) is 429, any other 413;
     a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope, what is of
-    another key or station, a foreign origin or an invalid enrolment token 403, a foreign host name
+    another key or station, a foreign origin or an invalid token or link 403, a foreign host name
     421, one of many wrong keys 429.
     """
     if isinstance(error, errors.LimitExceededError) and "retry_after_s" in error.details:

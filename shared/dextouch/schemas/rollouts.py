@@ -19,6 +19,8 @@ _USUAL_TAXELS: Final = 320
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
 # policies, models in the paper's form and comparisons have.
 CHUNK_STEPS: Final = 16
+# In `info` of a response: the largest figure of the chunk's uncertainty as a share of its bound.
+BOUND_SHARE: Final = "uncertainty/bound_share"
 # Version 1 of the API says doubt for uncertainty, and so does the episode format.
 WIRE_NAMES: Final = ConfigDict(validate_by_name=True, serialize_by_alias=True)
 # Quality figures of imagined episodes, and the fields of `RolloutUncertainty` that they hold.
@@ -296,7 +298,13 @@ class WatchedRollout(FrozenModel):
 
 
 class WatchedRollouts(FrozenModel):
-    """Response of GET /v1/watch: the newest rollouts first, and how many there are."""
+    """Response of GET /v1/watch: the newest rollouts first, and how many there are.
+
+    Attributes:
+        over: those that their clients ended last, the newest first, as they were then,
+            but for `age_s` and `idle_s`, which go on.
+    """
 
     rollouts: tuple[WatchedRollout, ...]
     num_open: int
+    over: tuple[WatchedRollout, ...] = ()

@@ -124,7 +124,10 @@ class RecorderSession(FrozenModel):
 
 
 class RecorderStatus(FrozenModel):
-    """Current state of the recorder, and the actions that are possible."""
+    """Current state of the recorder, and the actions that are possible.
+
+    A station that `needs_consent` arms no take without an operator who agreed to be recorded.
+    """
 
     state: RecorderState
     actions: tuple[RecorderAction, ...]
@@ -135,6 +138,7 @@ class RecorderStatus(FrozenModel):
     problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
     session: RecorderSession | None = None
+    needs_consent: bool = Field(default=False, exclude_if=not_)
 
 
 class CameraLive(FrozenModel):
@@ -288,11 +292,24 @@ class PracticeStatus(FrozenModel):
     state: Literal["unavailable", "off", "on"]
 
 
+# What a simulated station does on request, for operators to see: its glove, and the whole station.
+SimulatedFault = Literal["unplug", "drift", "dead_taxel", "slow_host"]
+
+
+class SetFault(FrozenModel):
+    """Whether a fault is simulated from now on."""
+
+    model_config = example(on=True)
+
+    on: bool
+
+
 class StationHealth(FrozenModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 
     `findings` and `figures` are those of the station itself: disk, calibration and uploads.
-    `causes` explain the findings of station and streams, widest and gravest first.
+    `causes` explain the findings of station and streams, widest and gravest first. `faults` are
+    those that a simulated station shows on request, None of real devices.
     """
 
     station: str
@@ -302,6 +319,9 @@ class StationHealth(FrozenModel):
     figures: dict[str, FiniteFloat] = Field(default_factory=dict)
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...]
+    faults: tuple[SimulatedFault, ...] | None = Field(
+        default=None, exclude_if=lambda faults: faults is None
+    )
 
 
 class StationOverview(FrozenModel):
@@ -369,11 +389,16 @@ class HealthHistory(FrozenModel):
 
 
 class EnrolStation(FrozenModel):
-    """Request for a token; the station's key will have the station's name."""
+    """Request for a token; the station's key will have the station's name.
+
+    Attributes:
+        renew: for a station that has a key, which stays valid beside the new one.
+    """
 
     model_config = example(station="bench-1")
 
     station: KeyName
+    renew: bool = False
 
 
 class EnrolmentToken(FrozenModel):

@@ -119,8 +119,12 @@ class AccessControl:
     """The keys of one service; without keys (loopback only, see settings) access is open."""
 
     def __init__(self, api_keys: Sequence[ApiKey]) -> None:
-        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
         self._enrolled: tuple[tuple[bytes, Grant], ...] = ()
+        self.set_keys(api_keys)
+
+    def set_keys(self, api_keys: Sequence[ApiKey]) -> None:
+        """Accept these keys in place of those of the settings."""
+        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
 
     @property
     def has_keys(self) -> bool:
@@ -128,9 +132,14 @@ class AccessControl:
         return bool(self._keys)
 
     @property
+    def key_names(self) -> frozenset[str]:
+        """Names of the keys of the settings."""
+        return frozenset(key.name for _, key in self._keys)
+
+    @property
     def names(self) -> frozenset[str]:
         """Names of all keys."""
-        return frozenset(grant.name for _, grant in (*self._keys, *self._enrolled))
+        return self.key_names | {grant.name for _, grant in self._enrolled}
 
     def set_enrolled(self, enrolled: Sequence[tuple[bytes, Grant]]) -> None:
         """Accept these keys, given as digests, beside those of the settings, and no earlier ones.
@@ -141,7 +150,10 @@ class AccessControl:
 
     def find(self, authorization: str | None) -> Grant | None:
         """What the key in the header allows, if it is a valid one."""
-        presented = secret_digest(presented_key(authorization) or "")
+        return self.of_digest(secret_digest(presented_key(authorization) or ""))
+
+    def of_digest(self, presented: bytes) -> Grant | None:
+        """What the key with this `secret_digest` allows, if it is a valid one."""
         # Every key is compared, to avoid a timing side channel.
         known = (*self._keys, *self._enrolled)
         matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]

@@ -2,18 +2,22 @@
 
 import errno
 import gc
+import signal
 import socket
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
+import structlog
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.serving.logs import configure_logging
+from dextouch.serving.logs import configure_logging, hide_secrets
 from dextouch.serving.settings import ServiceSettings, load_settings
 from dextouch.serving.spans import SPANS
+
+logger = structlog.get_logger(__name__)
 
 
 def bound_socket(what: str, host: str, port: int, *, advice: str) -> socket.socket:
@@ -141,5 +145,37 @@ def serve(
     check_address(service, settings)
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
     SPANS.configure(service)
-    run(SPANS.close_with(create_app(settings)), settings)
+    app = create_app(settings)
+    reload_keys_at_hangup(app, lambda: load_settings(kind, list(arguments)))
+    run(SPANS.close_with(app), settings)
     return 0
+
+
+def reload_keys_at_hangup(app: FastAPI, load: Callable[[], ServiceSettings]) -> None:
+    """At SIGHUP accept the `api_keys` that the settings have then, without a restart.
+
+    A mistake in them is logged, and changes nothing. A service at a terminal ends with it.
+    """
+
+    def reload(*_: object) -> None:
+        try:
+            settings = load()
+        except InvalidInputError as error:
+            logger.error("keys_not_reloaded", reason=error.message)  # noqa: TRY400
+            return
+        if not (settings.api_keys and app.state.access.has_keys):
+            reason = "a service gets its first key, and loses its last one, when it starts"
+            logger.error("keys_not_reloaded", reason=reason)
+            return
+        hide_secrets(settings)
+        access = app.state.access
+        others = access.names - access.key_names
+        access.set_keys(settings.api_keys)
+        logger.warning("keys_reloaded", names=sorted(access.key_names))
+        if doubled := sorted(others & access.key_names):
+            # Such as two people who would be one rater.
+            reason = "a link or an enrolled key has this name, too; choose another, or revoke it"
+            logger.error("key_names_doubled", names=doubled, reason=reason)
+
+    if sys.stdin is None or not sys.stdin.isatty():
+        signal.signal(signal.SIGHUP, reload)

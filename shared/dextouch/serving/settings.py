@@ -151,9 +151,13 @@ class ServiceSettings(CommandSettings):
                 f"host {self.host} is not loopback and no api_keys are set; "
                 "set at least one key with its scopes, or listen on 127.0.0.1"
             )
-        names = [key.name for key in self.api_keys]
-        if len(set(names)) != len(names):
-            raise ValueError(f"api_keys: names must differ, got {names}")
+        grants = {key.name: (set(key.scopes), key.station) for key in self.api_keys}
+        for key in self.api_keys:
+            if grants[key.name] != (set(key.scopes), key.station):
+                raise ValueError(
+                    f"api_keys: got the name {key.name!r} with different scopes or stations; keys "
+                    "of one name, such as an old and a new one, allow the same"
+                )
         return self
 
 

@@ -44,6 +44,12 @@ PLACE_TTL_S = 600.0
 # Of an id, the beginning that all rollouts of one API key share.
 OWNER_LETTERS = 8
 ID_LETTERS: Final = 32
+# Notes of the rollouts that were ended last, how many are kept, and for how long.
+OVER_KEY: Final = "rollouts over"
+NUM_OVER: Final = 10
+OVER_TTL_S: Final = 86_400.0
+# Chosen: as many as end at once when a study stops; after that a rollout is not listed.
+MAX_TRIES: Final = 32
 # More images are encoded as JPEG beside the event loop; JPEG takes some 15 ms for a megabyte.
 MAX_INLINE_IMAGE_BYTES: Final = 2**16
 
@@ -238,9 +244,32 @@ class RecordStore:
         return await self._store.note(GROUP + watch_id)
 
     async def delete(self, rollout_id: str) -> None:
-        """Forget a rollout; raises NotFoundError where unknown, deleted or expired."""
+        """Forget a rollout but its note; raises NotFoundError where unknown, deleted or expired."""
+        note = await self._store.note(_key_of(rollout_id))
         if not await self._store.delete(_key_of(rollout_id)):
             raise _unknown(rollout_id)
+        if note:
+            with suppress(StorageError, UnavailableError):
+                await self._keep_ended(note)
+
+    async def _keep_ended(self, note: bytes) -> None:
+        for _ in range(MAX_TRIES):
+            stored = await self._store.get(OVER_KEY)
+            kept = [] if stored is None else msgpack.unpackb(stored.value)
+            # Of several that end at once, one is written; the others try again.
+            with suppress(ConflictError):
+                await self._store.set(
+                    OVER_KEY,
+                    msgpack.packb([note, *kept][:NUM_OVER]),
+                    expected_version=0 if stored is None else stored.version,
+                    ttl_s=OVER_TTL_S,
+                )
+                return
+
+    async def notes_of_ended(self) -> list[bytes]:
+        """Notes of the rollouts that were deleted last, the newest first."""
+        stored = await self._store.get(OVER_KEY)
+        return [] if stored is None else msgpack.unpackb(stored.value)
 
 
 def _unknown(rollout_id: str) -> NotFoundError:
@@ -313,10 +342,13 @@ class RolloutWatch:
         self._reading = asyncio.Lock()
 
     async def listed(self, limit: int) -> WatchedRollouts:
-        """Open rollouts, the newest first."""
+        """Open rollouts, the newest first, and those that ended last."""
         notes, num_open = await self._records.newest_notes(limit)
-        found = tuple(_watched(*WatchNote.from_bytes(note)) for note in notes)
-        return WatchedRollouts(rollouts=found, num_open=num_open)
+        found, over = (
+            tuple(_watched(*WatchNote.from_bytes(note)) for note in some)
+            for some in (notes, await self._records.notes_of_ended())
+        )
+        return WatchedRollouts(rollouts=found, num_open=num_open, over=over)
 
     async def newest(self, watch_id: str, known: str = "") -> tuple[str, bytes | None]:
         """The newest response as the rollout's client got it, and a tag of it.

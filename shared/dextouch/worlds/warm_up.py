@@ -5,7 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from dextouch.hands.actions import ACTION_DIM, IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.hands.actions import (
+    ACTION_DIM,
+    IDENTITY_POSE_9D,
+    POSE_SLICES,
+    WRIST_LEFT,
+    AnchorPoses,
+)
 from dextouch.schemas import Observation, RolloutStart, WorldDescription
 from dextouch.worlds.world import World
 
@@ -13,12 +19,16 @@ from dextouch.worlds.world import World
 def first_chunk_s(world: World[Any]) -> float:
     """Start a rollout and advance it by one chunk; returns the duration.
 
+    In a model, a wrist moves by a millimetre, since a scene at rest is not computed.
+
     Raises DexTouchError if the world begins nothing from black images, or cannot continue.
     """
     began_s = time.perf_counter()
     description = world.description
     started = world.reset(_plain_start(description))
     held = np.repeat(started.observation.action_reached[-1:], description.chunk_multiple, axis=0)
+    if description.kind == "model":
+        held[:, WRIST_LEFT.start] += 1e-3
     stepped = world.step(started.state, held, seed=0)
     world.restore(world.snapshot(stepped.state))
     return time.perf_counter() - began_s

@@ -174,6 +174,16 @@ def test_mocks_get_no_advice_about_cables(code):
     assert cause.advice == SIMULATED_ADVICE
 
 
+def test_simulated_devices_that_share_a_bridge_get_none_either():
+    gone = finding("unplugged", "STALE", 4.0)
+    (cause,) = causes(
+        [stream("a", gone, device="a"), stream("b", gone, device="b")],
+        shares={"a": BRIDGE, "b": BRIDGE},
+        simulated=True,
+    )
+    assert (cause.code, cause.advice) == ("bridge", SIMULATED_ADVICE)
+
+
 def test_the_docs_hold_the_table_of_causes():
     text = DOCS.read_text(encoding="utf-8")
     assert cause_table() in text, "docs/health.md says how to print what belongs there"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import ConflictError, UnavailableError
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
@@ -16,7 +16,8 @@ from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort, PtyPort
-from services.acquisition.recorder import Recorder
+from services.acquisition.recorder import CALIBRATION, Recorder
+from services.alignment.station_calibration import glove, runs
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up", consent=True)
 ANYWAY = SaveTake(accept_incomplete=True)
@@ -72,6 +73,25 @@ def take(recorder, clock, seconds=2.0, **options):
     recorder.record("take")
     play(recorder, clock, seconds, **options)
     return recorder.stop()
+
+
+@pytest.mark.parametrize(
+    ("who", "missing"),
+    [({"consent": True}, "no operator"), ({"operator": "p7"}, "no consent"), ({}, "no operator")],
+)
+def test_a_take_of_nobody_is_not_armed_where_consent_is_needed(recorder, who, missing):
+    recorder.needs_consent = True
+    asked = {"task": "stand_bottle", "instruction": "stand the bottle up"}
+    with pytest.raises(InvalidInputError, match=f"got {missing}, expected the pseudonym"):
+        recorder.arm(TakePrompt(**asked, **who))
+    assert recorder.status().state == "idle"
+    # Of devices and boards nobody has to agree.
+    assert recorder.arm(TakePrompt(task="calibrate-glove", instruction="rest")).state == "armed"
+    assert recorder.arm(TakePrompt(**asked, operator="p7", consent=True)).state == "armed"
+
+
+def test_the_takes_of_guided_runs_need_no_operator():
+    assert set(CALIBRATION) == {glove.TASK, runs.TIME_TASK}
 
 
 def test_a_take_from_prompt_to_spool(recorder, clock, tmp_path):

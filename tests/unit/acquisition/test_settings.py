@@ -20,6 +20,7 @@ OPTIONS = {
     "mock_episode_id",
     "mock_faults",
     "mock_links",
+    "require_consent",
     "seed",
     "devices",
     "calibration",

@@ -124,6 +124,9 @@ def test_problems_say_what_to_do_and_nothing_twice(health):
     assert found[1].message == (
         "camera_head: image_blurred found once. Clean the lens and adjust the focus."
     )
+    findings._simulated.add("camera_head")
+    plain = findings.problems(("head", "camera_head"), (gap,))
+    assert plain[1].message == "camera_head: image_blurred found once"
 
 
 def test_without_health_there_is_nothing():

@@ -9,10 +9,9 @@ import pytest
 from av.bitstream import BitStreamFilterContext
 
 from dextouch.bridges.lerobot import ExportOptions, export_lerobot, exporting, video
-from dextouch.bridges.lerobot.layout import action_names
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, ShapeError
-from dextouch.hands.actions import pose_to_9d, poses_from_actions
+from dextouch.hands.actions import action_names, pose_to_9d, poses_from_actions
 from tests.unit.bridges.lerobot_episodes import CAMERAS, make_episode
 from tests.unit.bridges.lerobot_structure import problems
 

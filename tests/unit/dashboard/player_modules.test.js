@@ -5,12 +5,17 @@ import { readdirSync, readFileSync } from "node:fs";
 import { test } from "node:test";
 
 import { exportCommand, itemsOfKind } from "./static/catalog/export_command.js";
+import { date } from "./static/dates.js";
+import { bytes } from "./static/format.js";
 import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
-import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
+import { binCentres, componentWords, isSignal, withGaps } from "./static/player/curves.js";
 import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
 import { FetchQueue } from "./static/player/fetch_queue.js";
-import { BONES, frameOfMatrix, frameOfPose, Orbit, toWorld } from "./static/player/geometry.js";
+import { byStage, largestChange, worstOf } from "./static/player/figures.js";
+import { HandDriving, moveOf } from "./static/hand_driving.js";
+import { outcomeOf } from "./static/rollout_rows.js";
 import { unpack } from "./static/packed.js";
+import { apply, matrixOfPose } from "./static/projection.js";
 import { PlayClock } from "./static/player/play_clock.js";
 import { allAfter, clockText, parseSeconds, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
 import { formatState, parseState } from "./static/player/url_state.js";
@@ -50,6 +55,17 @@ test("times are exact beyond 2^53", () => {
   for (const text of ["", "x", "1e3", "1.2.3", null, "99999999"]) assert.equal(parseSeconds(text), null);
   assert.equal(clockText(83_456_700_000), "1:23.457");
   assert.equal(clockText(59_999_900_000), "1:00.000");
+});
+
+test("dates have one form, and values their unit", () => {
+  assert.equal(date("2026-11-30T14:05:09"), "30 Nov 2026, 14:05:09");
+  assert.deepEqual(["day", "time", "minute"].map((name) => date("2026-01-02T03:04:05", name)), ["2 Jan 2026", "03:04:05", "03:04"]);
+  assert.equal(date(Date.parse("2026-11-30T14:05:09") / 1000), "30 Nov 2026, 14:05:09");
+  assert.deepEqual([null, undefined, "", "soon", NaN].map((at) => date(at)), Array(5).fill("–"));
+  assert.deepEqual([0, 999.6, 999_600_000, 123_456_789, 1e19, null].map(bytes), ["0 B", "1 kB", "1.0 GB", "123 MB", "10000 PB", "–"]);
+  assert.deepEqual(componentWords("l_index_finger_mcp_abd_rad"), { text: "left index finger mcp abd", unit: "rad" });
+  assert.deepEqual(componentWords("camera_head.x_m"), { text: "camera head x", unit: "m" });
+  assert.deepEqual(componentWords("wrist_left.r00"), { text: "wrist left r00", unit: "" });
 });
 
 test("a ruler has round marks", () => {
@@ -147,23 +163,39 @@ test("curves break at gaps, and only there", () => {
 
 test("a pose moves points as a quarter turn about z does", () => {
   const half = Math.SQRT1_2;
-  const frame = frameOfPose([1, 2, 3, half, 0, 0, half]);
-  near(toWorld(frame, [1, 0, 0]), [1, 3, 3]);
-  near(toWorld(frame, [0, 1, 0]), [0, 2, 3]);
-  near(toWorld(frameOfMatrix([0, -1, 0, 1, 1, 0, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]), [1, 0, 0]), [1, 3, 3]);
-  assert.equal(frameOfPose([NaN, 0, 0, 1, 0, 0, 0]), null);
-  assert.equal(frameOfPose([0, 0, 0, 0, 0, 0, 0]), null);
+  const T = matrixOfPose([1, 2, 3, half, 0, 0, half]);
+  near(apply(T, [1, 0, 0]), [1, 3, 3]);
+  near(apply(T, [0, 1, 0]), [0, 2, 3]);
+  // 120 degrees about (1, 1, 1) takes x to y, y to z and z to x.
+  near(apply(matrixOfPose([0, 0, 0, 0.5, 0.5, 0.5, 0.5]), [1, 2, 3]), [3, 1, 2]);
+  assert.equal(matrixOfPose([NaN, 0, 0, 1, 0, 0, 0]), null);
+  assert.equal(matrixOfPose([0, 0, 0, 0, 0, 0, 0]), null);
 });
 
-test("the orbit sees its target in the middle, and up above", () => {
-  const orbit = new Orbit({ azimuth: 0, elevation: 0, distance_m: 2, target: [0, 0, 1] });
-  const project = orbit.projector(400, 200);
-  assert.deepEqual(project([0, 0, 1]), { x: 200, y: 100, depth: 2 });
-  assert.ok(project([0, 0, 1.1]).y < 100);
-  // From +x, the axis y points to the right.
-  assert.ok(project([0, 0.1, 1]).x > 200);
-  assert.equal(project([3, 0, 1]), null);
-  assert.equal(BONES.length, 24);
+test("figures are grouped by the stage that measured them, in words", () => {
+  const quality = { tactile_left_num_gaps: 2, retargeting_left_tip_error_p95_mm: 4.21764, static_share: 0.25, origin_after_start_ns: 250_000_007, wrist_left_peak_speed_m_s: 0.5 };
+  assert.deepEqual(byStage(quality).map(([stage, figures]) => [stage, ...figures.map(({ text, value }) => `${text} = ${value}`)]), [
+    ["Retargeting", "left tip error, 95th percentile = 4.218 mm"],
+    ["Motion", "static share = 25 %", "wrist left peak speed = 0.5 m/s"],
+    ["Synchronization", "origin after start = 0.25 s"],
+    ["Recorded streams", "tactile left: gaps = 2"],
+  ]);
+});
+
+test("the worst second is where a gap is longest, or a signal changes most", async () => {
+  const action = { name: "action", num_samples: 20, first_ns: 0, last_ns: 19e9, gaps_ns: [], interpolated: [{ span_ns: [1e9, 2e9] }, { span_ns: [3e9, 7e9] }] };
+  const head = { name: "head", num_samples: 9, gaps_ns: [[1e9, 2e9], [5e9, 8e9]] };
+  // A step of one metre between the bins 11 and 12.
+  const high = Array.from({ length: 20 }, (_, k) => (k > 11 ? 1 : 0));
+  const item = { start_ns: 0, stop_ns: 20e9, streams: new Map([["action", action], ["head", head]]), signals: async (names) => new Map(names.map((name) => [name, { high }])) };
+  assert.deepEqual(await worstOf(item, "head_num_gaps")(), [5e9, 8e9]);
+  assert.deepEqual(await worstOf(item, "num_steps_interpolated")(), [3e9, 7e9]);
+  const [from_ns, to_ns] = await worstOf(item, "wrist_left_peak_speed_m_s")();
+  assert.ok(from_ns < 11.4e9 && 11.4e9 < to_ns && to_ns - from_ns === 1e9);
+  assert.equal(worstOf(item, "static_share"), null);
+  assert.equal(worstOf(item, "retargeting_left_tip_error_mm"), null);
+  assert.equal(largestChange([[0, 0, 5, 5]], 1), 1.5);
+  assert.equal(largestChange([[1]], 1), null);
 });
 
 test("a selection is steps of the grid, from its start to before its end", () => {
@@ -178,7 +210,7 @@ test("a selection is steps of the grid, from its start to before its end", () =>
 test("commands can be pasted into a shell", () => {
   assert.equal(trimCommand("a", [15, 29], { outcome: "keep", keep: false }), "dextouch store trim a --steps 15 29 --outcome keep");
   const labels = { task: undefined, instruction: "it's $(up)", operator: "", outcome: "", keep: true };
-  assert.equal(relabelCommand({ kind: "recording", id: "a" }, labels), `dextouch store relabel a --kind recording --instruction 'it'"'"'s $(up)' --keep`);
+  assert.equal(relabelCommand({ kind: "recording", id: "a" }, labels), `dextouch store relabel a --kind recording --instruction 'it'\\''s $(up)' --keep`);
 });
 
 test("a selection without an item of the kind has no command to export", () => {
@@ -186,4 +218,39 @@ test("a selection without an item of the kind has no command to export", () => {
   assert.equal(exportCommand({ format: "mcap", kind: "episode", ids, filters: {} }), "");
   assert.match(exportCommand({ format: "mcap", kind: "recording", ids: ["a"], filters: {} }), / a --to a.mcap$/);
   assert.match(exportCommand({ format: "mcap", kind: "episode", ids: null, filters: { task: "wipe" } }), /--task=wipe/);
+});
+
+test("held keys and a gamepad move hands, opposite keys cancel, and a stick at rest does not", () => {
+  assert.deepEqual(moveOf(new Set(["w", "d", " ", "x"])), { forward: 1, right: 1, close: 1 });
+  assert.equal(moveOf(new Set(["w", "s"])).forward, 0);
+  const pad = { axes: [0.5, -1, 0.1, 0.4], buttons: Array.from({ length: 8 }, (_, index) => ({ value: index === 6 ? 1 : 0 })) };
+  assert.deepEqual(moveOf(new Set(), pad), { right: 0.5, forward: 1, up: -0.4, close: -1 });
+  assert.deepEqual(moveOf(new Set(["w"]), pad).forward, 1);
+});
+
+test("a refused move is said once, and tried again after the keys were let go", async () => {
+  const listeners = {}, output = { dataset: {} };
+  const pad = { addEventListener: (name, work) => { listeners[name] = work; }, querySelector: () => output };
+  globalThis.document = { activeElement: pad };
+  globalThis.navigator ??= {};
+  let asked = 0;
+  const driving = new HandDriving(pad, { value: "both" }, async () => { asked += 1; throw new Error("it is over"); });
+  const press = () => listeners.keydown({ key: "W", preventDefault: () => {} });
+  press();
+  for (let frame = 0; frame < 9; frame += 1) {
+    await driving.tick();
+    press(); // as keys that are held down repeat
+  }
+  assert.deepEqual([asked, output.textContent, output.dataset.level], [1, "it is over", "ERROR"]);
+  listeners.keyup({ key: "w" });
+  await driving.tick();
+  press();
+  await driving.tick();
+  assert.equal(asked, 2);
+  delete globalThis.document;
+});
+
+test("an outcome is what the world knows, else its own estimate", () => {
+  const words = [{ success: true }, { success: false }, { success: null, rollout_doubt: { success_probability: 0.256 } }, { success: null }].map(outcomeOf);
+  assert.deepEqual(words, ["success", "no success", "success with 26 %, imagined", "–"]);
 });

@@ -59,7 +59,8 @@ async def test_what_follows_from_a_cause_is_folded_below_it(feeds, services):
     view = await feeds.station()
     (shown,) = view.causes
     assert (shown.level, shown.message) == ("ERROR", "Overloaded: 9 tasks")
-    assert (shown.advice, shown.lasted_s, shown.num_streams) == ("Close programs.", 7.0, 1)
+    assert (shown.advice, shown.lasted_s) == ("Close programs.", 7.0)
+    assert shown.streams == ("tactile_left",)
     assert shown.findings == ("tactile_left: 0.6 s without a sample · 55 Hz, expected 60 Hz",)
     assert view.summary == "1 cause · 1 of 2 streams OK"
     assert (view.host.level, view.host.cpu_percent, view.host.wake_ms) == ("ERROR", 98.0, None)
@@ -84,7 +85,7 @@ async def test_the_stations_own_finding_is_a_cause_and_sets_the_level(feeds, ser
     services.health["causes"] = [cause]
     view = await feeds.station()
     assert (view.level, view.host.level, view.streams[0].level) == ("ERROR", "ERROR", "OK")
-    assert view.causes[0].num_streams == 0
+    assert view.causes[0].streams == ()
 
 
 async def test_trends_are_shares_of_the_nominal_rate(feeds, services):
@@ -117,8 +118,11 @@ async def test_incomplete_take_is_shown(feeds, services):
 
 async def test_the_worst_of_a_take_leads(feeds, services):
     levels = {"b: 2 % lost": "WARN", "head: 0.4 s gap": "ERROR", "a: 1 % lost": "WARN"}
-    about = {"stream": "head", "code": "gap"}
-    problems = [about | {"level": level, "message": text} for text, level in levels.items()]
+    levels["head: 9 Hz"] = "WARN"
+    problems = [
+        {"stream": text.partition(":")[0], "code": "gap", "level": level, "message": text}
+        for text, level in levels.items()
+    ]
     services.recorder = {
         "state": "checking",
         "actions": ["save", "discard"],
@@ -130,9 +134,10 @@ async def test_the_worst_of_a_take_leads(feeds, services):
     }
     recorder = (await feeds.station()).recorder
     assert (recorder.cause, recorder.advice) == ("hub 1: nothing comes", "Plug it in again.")
+    assert recorder.num_findings == 5
     assert recorder.problems == (
         "the disk is full",
-        "head: 0.4 s gap",
+        "head: 0.4 s gap · 9 Hz",
         "b: 2 % lost",
         "a: 1 % lost",
     )

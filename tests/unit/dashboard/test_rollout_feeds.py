@@ -172,7 +172,7 @@ async def test_replays_need_a_session_and_their_services():
             answer = await client.post("/v1/comparisons", json=body)
             assert answer.status_code == status
             assert (await client.get("/v1/comparisons/x/chunks/0")).status_code == status
-    assert "DEXTOUCH_DASHBOARD_TWIN_URL" in answer.json()["detail"]
+    assert "DEXTOUCH_DASHBOARD_WORLD_MODEL_URL" in answer.json()["detail"]
     async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
         hostile = await client.post("/v1/comparisons", json={"episode_id": "../../x"})
     assert hostile.status_code == 422

@@ -11,7 +11,13 @@ from services.dashboard.upstream import Upstream
 SESSION = {"started_at": "2026-11-24T08:00:00Z", "last_saved": "take-7"}
 STORED = {"recording_id": "take-7", "uploaded": True, "stored_as": "take-7-abc"}
 JOB = {"alignment_id": "take-7-abc-0", "recording_id": "take-7-abc", "options": {}, "progress": 0.4}
-REPORT = {"num_steps": 81, "duration_s": 5.4, "refused_parts": [], "streams": {}}
+REPORT = {
+    "episode_id": "take-7-abc-0",
+    "num_steps": 81,
+    "duration_s": 5.4,
+    "refused_parts": [],
+    "streams": {},
+}
 PROBLEM = {"type": "urn:dextouch:error:InvalidInputError", "title": "InvalidInput", "status": 422}
 
 
@@ -102,6 +108,19 @@ async def test_in_alignment(service, facts, job, expected):
     assert await stage(service) == expected
     # Asked by the id that the take has in the store.
     assert facts["asked"] == ["take-7-abc"]
+
+
+async def test_what_can_be_played_of_it(service, facts):
+    async def player():
+        return (await last_take(service, service)).player
+
+    assert await player() == "recording/take-7-abc"
+    facts["jobs"] = [JOB | {"state": "done", "report": REPORT}]
+    assert await player() == "episode/take-7-abc-0"
+    facts["jobs"] = [JOB | {"state": "failed", "problem": PROBLEM | {"detail": "no K"}}]
+    assert await player() == "recording/take-7-abc"
+    facts["upload"] = STORED | {"uploaded": False}
+    assert await player() == ""
 
 
 async def test_stored_and_no_further(service, facts):

@@ -15,6 +15,7 @@ import yaml
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.take import STALL_NS
 from services.cli.main import COMMANDS, find_command
+from services.episode_store.parser import store_parser
 from tests.containers import engine
 from tests.containers.engine import PACKAGES
 from tests.system.compose_processes import VARIABLE, keys_of
@@ -315,3 +316,37 @@ def test_a_station_reports_to_systemd_that_it_works():
     assert "\nRestart=always\n" in unit
     (command,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
     assert find_command(command.split())[0] == "station serve"
+
+
+SERVED = {
+    "store": "store serve",
+    "alignment": "align serve",
+    "dashboard": "dashboard",
+    "world-model": "serve",
+}
+
+
+@pytest.mark.parametrize(("name", "command"), SERVED.items())
+def test_units_start_commands_that_exist_on_the_ports_of_the_tls_examples(name, command):
+    unit = (ROOT / f"deploy/systemd/dextouch-{name}.service").read_text()
+    (words,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
+    found, flags = find_command(words.split())
+    assert (found, flags[0]) == (command, "--port")
+    for line in ("Type=notify", "Restart=always", "NoNewPrivileges=true", "ProtectSystem=strict"):
+        assert f"\n{line}\n" in unit
+    if name in {"store", "dashboard"}:
+        for example in ("nginx/dextouch.conf", "caddy/Caddyfile"):
+            assert f"127.0.0.1:{flags[1]}" in (ROOT / "deploy" / example).read_text()
+    # Workers of a world replace themselves at SIGHUP; a single one reads no keys anew.
+    assert ("ExecReload=/bin/kill -HUP $MAINPID" in unit) is (name != "world-model")
+
+
+def test_the_backup_is_made_by_a_command_that_exists():
+    unit = (ROOT / "deploy/systemd/dextouch-backup.service").read_text()
+    (words,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
+    command, rest = find_command(words.split())
+    assert (command, store_parser().parse_args(rest).command) == ("store", "backup")
+    # Of the store that is served, wherever its settings say that it is.
+    served = (ROOT / "deploy/systemd/dextouch-store.service").read_text()
+    (settings,) = re.findall(r"^EnvironmentFile=.+$", served, re.M)
+    assert settings in unit.splitlines()

@@ -207,3 +207,32 @@ def test_a_wrong_limit_fails_the_unit_tests(tmp_path, promtool):
     path.write_text(tests.replace("../../../deploy/prometheus/rules.yml", "rules.yml"))
     done = subprocess.run([promtool, "test", "rules", str(path)], capture_output=True, check=False)
     assert done.returncode != 0
+
+
+@pytest.mark.parametrize(
+    ("labels", "receiver"),
+    [(("severity=page", "service=episode_store"), "page"), (("severity=ticket",), "ticket")],
+)
+def test_alerts_reach_their_receivers(labels, receiver):
+    amtool = needed_program("amtool", package="prometheus-alertmanager")
+    config = str(PROMETHEUS / "alertmanager.yml")
+    checked = subprocess.run([amtool, "check-config", config], capture_output=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    words = [amtool, "config", "routes", "test", f"--config.file={config}", *labels]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (0, [receiver])
+    assert {rule["labels"]["severity"] for rule in RULES if "alert" in rule} == {"page", "ticket"}
+
+
+@pytest.mark.long
+def test_the_documented_block_connects_prometheus_to_alertmanager(promtool, tmp_path):
+    text = (ROOT / "docs/operations.md").read_text()
+    (block,) = re.findall(r"^alerting:\n(?:  .*\n)+", text, re.MULTILINE)
+    for name in ("prometheus.yml", "rules.yml"):
+        (tmp_path / name).write_text((PROMETHEUS / name).read_text())
+    with (tmp_path / "prometheus.yml").open("a") as file:
+        file.write(block)
+    words = [promtool, "check", "config", str(tmp_path / "prometheus.yml")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load(block)["alerting"]["alertmanagers"]

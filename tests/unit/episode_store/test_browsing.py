@@ -193,6 +193,20 @@ async def test_what_was_not_measured_is_there_to_be_drawn(store, http):
     ]
     assert streams["tactile_left"]["unmeasured_taxels"] == [3, 90]
     assert streams["camera_head"]["interpolated"] == []
+    names = streams["action"]["components"]
+    assert [names[k] for k in (0, 9, 12, 18, 57)] == [
+        "wrist_left.x_m",
+        "wrist_right.x_m",
+        "wrist_right.r00",
+        "l_thumb_cmc_flex_rad",
+        "r_pinky_dip_rad",
+    ]
+    assert (len(names), streams["tactile_left"]["components"]) == (67, [])
+    # Those of a person in the twin are of a human hand.
+    write_episode(store, "human", domain="human")
+    answer = (await http.get("/v1/playback/episode/human")).json()
+    (human,) = (one["components"] for one in answer["streams"] if one["name"] == "action")
+    assert [human[k] for k in (0, 18, 57)] == [names[0], "left_joint_0_rad", "right_joint_19_rad"]
 
 
 def store_attributes(store):

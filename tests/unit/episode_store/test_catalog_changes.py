@@ -171,18 +171,15 @@ def test_an_item_with_a_damaged_remark_is_listed_without_it(store, name):
 
 
 def test_a_mistake_does_not_end_a_thread():
-    done = threading.Event()
+    done, rounds = threading.Event(), []
 
-    class Wrong(PeriodicThread):
-        rounds = 0
+    def wrong():
+        rounds.append(1)
+        if len(rounds) > 2:
+            done.set()
+        raise ValueError("a mistake")
 
-        def work(self):
-            self.rounds += 1
-            if self.rounds > 2:
-                done.set()
-            raise ValueError("a mistake")
-
-    thread = Wrong("failed", 0.001)
+    thread = PeriodicThread("failed", 0.001, wrong)
     with capture_logs() as logs:
         thread.start()
         assert done.wait(10)

@@ -110,7 +110,7 @@ def test_a_problem_that_comes_back_is_logged_again(store, monkeypatch):
         elif reason is not None:
             raise StorageError(reason)
 
-    monkeypatch.setattr(watch, "work", look)
+    monkeypatch.setattr(watch, "_work", look)
     with capture_logs() as logs:
         watch.start()
         watch._thread.join()

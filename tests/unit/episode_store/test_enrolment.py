@@ -310,3 +310,27 @@ async def test_long_and_odd_tokens_are_refused_without_repeating_them(http):
         refused = await http.post("/v1/enrolments/exchange", json={"token": token})
         assert refused.status_code in {413, 422}
         assert "xxxx" not in refused.text
+
+
+def test_a_renewed_key_is_valid_beside_the_former_one_until_that_is_revoked(make):
+    enrolments, access = make()
+    with pytest.raises(ConflictError, match="renew"):
+        make((ADMIN, ApiKey(**ADMIN.model_dump() | {"name": "desk-7"})))[0].issue(
+            "desk-7", by="admin", renew=True
+        )
+    first = enrolments.exchange(enrolments.issue("desk-7", by="admin").token, client="a").key
+    with pytest.raises(ConflictError, match="renew or revoke it"):
+        enrolments.issue("desk-7", by="admin")
+    with pytest.raises(NotFoundError, match="no former enrolled key"):
+        enrolments.revoke("desk-7", by="admin", former=True)
+    token = enrolments.issue("desk-7", by="admin", renew=True).token
+    second = enrolments.exchange(token, client="a").key
+    for _ in range(2):
+        assert [allows(access, key) for key in (first, second)] == ["desk-7", "desk-7"]
+        enrolments, access = make()
+    enrolments.revoke("desk-7", by="admin", former=True)
+    for _ in range(2):
+        assert [allows(access, key) for key in (first, second)] == ["unknown_key", "desk-7"]
+        enrolments, access = make()
+    enrolments.revoke("desk-7", by="admin")
+    assert allows(access, second) == "unknown_key"

@@ -6,10 +6,12 @@ import pytest
 from fastapi.testclient import TestClient
 
 from dextouch.episodes import EpisodeStore
+from dextouch.episodes.trash import put_into_trash
 from dextouch.errors import StorageError, UnavailableError
-from services.episode_store.app import PendingUploads, create_app
+from services.episode_store.app import PendingUploads, create_app, purge_old_trash
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.contracts.s3_server import CREDENTIALS, running_s3
+from tests.unit.episode_store.episodes import write_episode
 from tests.unit.episodes.conftest import episode_of
 
 # Port 9 (discard) answers nobody on a loopback device.
@@ -76,3 +78,14 @@ def test_a_take_that_waits_is_no_conflict(s3_server, store):
     fail_to_upload(s3_server, store, made)
     with pytest.raises(UnavailableError, match="waits in"):
         made.write(store)
+
+
+@pytest.mark.parametrize(("keep_days", "left"), [(30.0, ["new"]), (None, ["old", "new"])])
+def test_the_trash_is_emptied_after_some_days(tmp_path, keep_days, left):
+    store = EpisodeStore(tmp_path)
+    for name, age_days in (("old", 31), ("new", 29)):
+        write_episode(store, name)
+        deleted_ns = time.time_ns() - age_days * 86_400 * 10**9
+        put_into_trash(tmp_path, "episode", name, now_ns=deleted_ns)
+    purge_old_trash(store, keep_days)
+    assert [entry.item_id for entry in store.trash_list()] == left

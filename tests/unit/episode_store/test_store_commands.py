@@ -109,17 +109,22 @@ def test_show_is_a_table(store, word):
     lines = out.splitlines()
     assert status == 0
     assert lines[0] == "episode e-1  stand_bottle  robot"
-    assert lines[2].split() == ["stream", "Hz", "samples", "gaps", "size", "codec", "encoder"]
+    head = ["stream", "Hz", "samples", "gaps", "size", "per", "hour", "codec", "encoder"]
+    assert lines[2].split() == head
     assert lines[3].split()[:4] == ["force", "10", "5", "1"]
     assert lines[4].split()[:4] == ["camera_head", "30", "5", "0"]
     assert "h264   libx264 ultrafast" in lines[4]
-    assert store.open("e-1").content_sha256 in lines[5]
+    assert lines[5].endswith("B per hour")
+    assert store.open("e-1").content_sha256 in lines[6]
     result = json.loads(word("show", "r-1", "--json", "-")[1])
     size = sum(
         shard_of(store, "recordings", "r-1", name).stat().st_size
         for name in ("force", "force_t_host_ns", "force_t_device_ns", "force_sequence")
     )
     assert result["streams"]["force"]["num_bytes"] == size
+    # 20 samples at its rate.
+    hours = 20 / result["streams"]["force"]["rate_hz"] / 3600
+    assert result["streams"]["force"]["bytes_per_hour"] == round(size / hours)
 
 
 EPISODE_ROW = "e-1  episode  stand_bottle  robot  twin  0 steps  not judged\n"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import spool
+from dextouch.episodes.files import write_parts
 from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC, open_log
 from dextouch.errors import (
     ConflictError,
@@ -341,6 +342,13 @@ def test_short_writes_go_on_where_they_ended(path, monkeypatch, portion):
         for first in range(3):
             writer.append("glove_left", glove_batch(first))
     assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
+
+
+def test_more_parts_than_one_call_takes_are_written(tmp_path):
+    parts = [bytes([number % 251]) * (1 + number % 3) for number in range(2500)]
+    with (tmp_path / "parts").open("wb") as file:
+        write_parts(file.fileno(), *parts)
+    assert (tmp_path / "parts").read_bytes() == b"".join(parts)
 
 
 def test_an_encoded_batch_is_written_later_and_must_follow(path):

@@ -7,10 +7,12 @@ from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import (
     brier,
     expected_calibration_error,
+    final_endings,
     fit_calibration,
     fit_combination,
     undecided_band,
 )
+from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.scores import LEAST_DECIDED
 from services.evaluation.success_classifier import Calibration, Combination, sigmoid
 
@@ -184,3 +186,24 @@ def test_one_outcome_is_refused():
 
 def test_no_calibration_is_the_plain_sigmoid():
     assert Calibration().probabilities(np.array([0.0, np.log(3)])) == pytest.approx([0.5, 0.75])
+
+
+def test_true_endings_that_show_poses_alone_are_left_out():
+    """A probe gets no poses of true endings, so that nothing would be left of them."""
+
+    def episode(*, imagined, images):
+        ending = Ending(images, np.zeros((3, 2, 320), np.float32), "t", poses, imagined)
+        return EndingEpisode("e", "t", "do it", "s", not imagined, "d", 9, {9: ending}, "c")
+
+    poses = np.zeros((3, 2, 7), np.float32)
+    pictures = np.zeros((3, 8, 8, 3), np.uint8)
+    episodes = [
+        episode(imagined=False, images=None),
+        episode(imagined=False, images=pictures),
+        episode(imagined=True, images=None),
+    ]
+    true, success = final_endings(episodes, "t", "true")
+    assert [one.images is pictures and one.object_poses is None for one in true] == [True]
+    assert success.tolist() == [True]
+    imagined, _ = final_endings(episodes, "t", "imagined")
+    assert [one.object_poses is poses for one in imagined] == [True]

@@ -12,6 +12,7 @@ from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, evaluate
+from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import StudyWorlds, WorldAddress, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.replay import HoldPolicy
@@ -110,6 +111,31 @@ def report(client, policies, probe):
         plan=EvaluationPlan(toy.INSTRUCTIONS, SEEDS),
         probe=probe,
     )
+
+
+def test_the_pair_to_show_is_the_one_that_tells_most(client, policies, probe, report):
+    """Of each task one whose outcomes differ, or a success; played as it was, with all images."""
+    given = {"imagined": addresses(client, "dream"), "policies": policies, "probe": probe}
+    plan = EvaluationPlan(toy.INSTRUCTIONS, SEEDS)
+    shown = film(report, real=WorldAddress(client, "judge"), plan=plan, **given)
+    known = {(s.world, s.task, s.policy, s.seed): s.success for s in report.scores}
+    assert len(shown) == len(toy.TASKS)
+    for task, pair in zip(toy.TASKS, shown, strict=True):
+        _, policy, rest = pair.title.split(", ", 2)
+        seed = int(rest.split()[1].rstrip(":"))
+        real, imagined = (known[world, task, policy, seed] for world in ("real", "dream"))
+        others = [
+            (known["real", task, p, s], known["dream", task, p, s]) for p in policies for s in SEEDS
+        ]
+        assert real != imagined or (real and all(a == b for a, b in others))
+        assert rest.endswith(
+            f"{'success' if real else 'failure'} in fact, "
+            f"{'success' if imagined else 'failure'} imagined"
+        )
+        assert pair.true_images.shape == pair.predicted_images.shape == (81, 32, 32, 3)
+        assert pair.times_s[-1] == pytest.approx(80 / 15)
+        np.testing.assert_array_equal(pair.true_images[0], pair.predicted_images[0])
+        assert (pair.true_images[0] != pair.true_images[-1]).any() or policy == "hold"
 
 
 def test_a_doubt_amid_a_rollout_is_not_forgotten_at_its_end(client, policies, probe):

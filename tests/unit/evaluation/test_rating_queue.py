@@ -6,9 +6,18 @@ from collections import Counter
 import pytest
 from pydantic import ValidationError
 
-from dextouch.errors import NotFoundError, StorageError
-from services.evaluation.rating.marks import FIRST, REPEAT, Mark, MarkLog, read_rubrics
-from services.evaluation.rating.rating_queue import RatedRollout, RatingQueue, token_of
+from dextouch.errors import ConflictError, NotFoundError, StorageError
+from services.evaluation.rating.marks import (
+    DECIDING,
+    FIRST,
+    REPEAT,
+    Mark,
+    MarkLog,
+    by_people,
+    read_rubrics,
+    vote,
+)
+from services.evaluation.rating.rating_queue import Assignment, RatedRollout, RatingQueue, token_of
 from services.evaluation.rating.rating_report import rating_report
 
 IDS = [f"rollout-{number}" for number in range(12)]
@@ -146,3 +155,89 @@ def test_the_report_by_hand(log):
     assert task["repeats"] == {"num": 1, "same_score": 0.0}
     assert {row["rater"]: row["bias"] for row in task["raters"]} == {"ada": 0.25, "bob": -0.25}
     assert "agree too little" in task["comment"]
+
+
+def test_two_raters_who_differ_are_decided_by_a_third_who_is_neither(log):
+    queue = RatingQueue(rollouts(IDS[:4]), log, raters_per_rollout=2, repeat_share=0.0)
+    rate_all(queue, log, "ada")
+    rate_all(queue, log, "bob", standing=lambda name: name in IDS[:2])
+    assert queue.next("ada") is None
+    assert queue.next("bob") is None
+    # Only where they differ, and said to be what it is.
+    decided = rate_all(queue, log, "carl", standing=lambda name: name == IDS[2])
+    assert sorted(decided) == [(IDS[2], DECIDING), (IDS[3], DECIDING)]
+    assert queue.next("dora") is None
+    found = rating_report(
+        log.latest().values(), dict.fromkeys(IDS, "stand_bottle"), read_rubrics(), {}
+    )
+    rows = {row["episode_id"]: row["decided_score"] for row in found["rollouts"]}
+    assert rows == {IDS[0]: 1.0, IDS[1]: 1.0, IDS[2]: 1.0, IDS[3]: 0.0}
+    task = found["tasks"]["stand_bottle"]
+    assert task["conflicts"] == {"open": 0, "settled": 2}
+    # Whoever decides sees only the hard ones, so that alpha is that of the first two alone:
+    # 1, 1, 1, 1 against 1, 1, 0, 0, by `krippendorff` 0.9.0.
+    assert task["num_raters"] == 2
+    assert task["alpha_by_criterion"]["standing"] == pytest.approx(-1 / 6)
+
+
+def test_a_tie_on_whether_it_can_be_judged_is_decided_too(log):
+    queue = RatingQueue(rollouts(IDS[:1]), log, raters_per_rollout=2, repeat_share=0.0)
+    log.add(mark("ada", IDS[0]))
+    log.add(mark("bob", IDS[0], holds={}, cannot_judge=True))
+    assert queue.next("carl").presentation == DECIDING
+    log.add(mark("carl", IDS[0], holds={}, cannot_judge=True, presentation=DECIDING))
+    assert queue.next("dora") is None
+
+
+def test_nobody_decides_without_a_tie_or_twice(log):
+    queue = RatingQueue(rollouts(IDS[:2]), log, raters_per_rollout=2)
+    for rater, stands in (("ada", True), ("bob", False)):
+        log.add(mark(rater, IDS[0], standing=stands))
+        log.add(mark(rater, IDS[1]))
+    queue.check(mark("carl", IDS[0], presentation=DECIDING))
+    for rater, name in (("ada", IDS[0]), ("carl", IDS[1])):
+        with pytest.raises(ConflictError, match="other raters are complete and tied"):
+            queue.check(mark(rater, name, presentation=DECIDING))
+    more = RatingQueue(rollouts(IDS[:2]), log, raters_per_rollout=3)
+    with pytest.raises(ConflictError, match="other raters are complete and tied"):
+        more.check(mark("carl", IDS[0], presentation=DECIDING))
+    # The work of two who decide at the same time is kept.
+    log.add(mark("carl", IDS[0], presentation=DECIDING))
+    queue.check(mark("dora", IDS[0], presentation=DECIDING))
+    with pytest.raises(ConflictError, match="got presentation 1"):
+        queue.check(mark("carl", IDS[0]))
+    queue.check(mark("carl", IDS[1]))
+    # Marks of before that was refused: one rater, one vote.
+    log.add(mark("carl", IDS[0]))
+    latest = (stored.mark for stored in log.latest().values())
+    assert [one.rater for one in by_people(latest)[IDS[0]]] == ["ada", "bob", "carl"]
+
+
+def test_a_deciding_mark_is_not_repeated(log):
+    queue = RatingQueue(rollouts(), log, raters_per_rollout=2, repeat_share=0.5)
+    for number, name in enumerate(IDS):
+        log.add(mark("carl", name, presentation=DECIDING if number < 2 else FIRST))
+    assert queue.next("carl") is None
+    log.add(mark("carl", "of-another-store"))
+    assert queue.next("carl") == Assignment(queue.rollout(token_of(IDS[2])), REPEAT, 13, 0)
+
+
+def test_a_tie_is_a_conflict_once_its_raters_are_complete(log):
+    for rater, stands in (("ada", True), ("bob", False)):
+        log.add(mark(rater, IDS[0], standing=stands))
+    known, rubrics, found = log.latest().values(), read_rubrics(), []
+    for num in (2, 3):
+        tasks = {IDS[0]: "stand_bottle"}
+        report = rating_report(known, tasks, rubrics, {}, raters_per_rollout=num)
+        found.append(report["tasks"]["stand_bottle"]["conflicts"]["open"])
+    assert found == [1, 0]
+
+
+def test_votes_count_each_criterion_by_itself():
+    def judged(met):
+        return mark("ada", IDS[0], holds={"a": "a" in met, "b": "b" in met})
+
+    assert vote([judged("a"), judged("ab")]).tied == ("b",)
+    three = vote([judged("a"), judged("ab"), judged("b")])
+    assert (three.holds, three.tied) == ({"a": True, "b": True}, ())
+    assert vote([judged("a")]).tied == ()

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import platform
 import re
 from html.parser import HTMLParser
 from xml.etree import ElementTree as ET
@@ -10,21 +11,23 @@ import cv2
 import numpy as np
 import pytest
 
+from dextouch import __version__
 from services.evaluation.reporting import (
     ActionPicture,
     EpisodePicture,
     PredictionPicture,
     ReportPictures,
+    pictures,
     write_report,
 )
 from services.evaluation.reporting.pictures import (
     Line,
-    Point,
-    agreement_chart,
     data_address,
+    hands_image,
     line_chart,
+    moving_picture,
+    scale_colours,
     ticks,
-    touch_image,
 )
 from services.evaluation.reporting.sections import clock_rows, error_rows, figure, tiles
 
@@ -65,6 +68,7 @@ PICTURES = ReportPictures(
     clock_residuals_ms={"tactile_left": np.stack([TIMES, TIMES * 0.01])},
     actions=ActionPicture(np.arange(20) / 15, ACTIONS, ACTIONS + 0.01),
     predictions=(PredictionPicture("a window", TIMES, IMAGES, IMAGES, TOUCH, TOUCH),),
+    moving=(PredictionPicture("a pair", TIMES, IMAGES, IMAGES, TOUCH, 0 * TOUCH),),
 )
 
 EMPTY = ReportPictures()
@@ -73,7 +77,7 @@ EMPTY = ReportPictures()
 class Tags(HTMLParser):
     """Collects tags, and checks that they nest."""
 
-    VOID = frozenset({"meta", "img", "link", "br"})
+    VOID = frozenset({"meta", "img", "link", "br", "input"})
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,7 +115,7 @@ def test_a_full_report_stands_alone(tmp_path):
     assert not re.search(r"https?://|@import|url\(", text)
     assert "script" not in tags.seen
     assert "prefers-color-scheme: dark" in text
-    assert tags.seen.count("img") == 2 * (4 + 8)
+    assert tags.seen.count("img") == 2 * (4 + 8) + 2
     assert tags.seen.count("svg") == 1 + 4 + 1
     for words in ("an episode", "a window", "script-0mm", "tactile_left", "0.70\u20131.00"):
         assert words in text
@@ -139,7 +143,8 @@ def test_undefined_figures_say_so(tmp_path):
 
 def test_agreement_counts_ties_and_says_what_it_means(tmp_path):
     text, _ = page(tmp_path, REPORT)
-    words = re.sub(r"<[^>]*>|\s+", " ", text.split("<h2>All figures")[0])
+    shown = re.sub(r"</summary><span>.*?</span>", "", text.split("<h2>All figures")[0])
+    words = re.sub(r"<[^>]*>|\s+", " ", shown)
     assert re.search(r"MMRV, ties counted +0\.450 +0\.21.0\.68", words)
     assert re.search(r"MMRV, paper&#39;s rule +0\.0 ", words)
     assert "The dream flatters." in words
@@ -256,10 +261,89 @@ def test_large_photographs_are_embedded_as_jpeg():
     assert base64.b64decode(data)[:2] == b"\xff\xd8"
 
 
-def test_taxel_maps_are_transparent_where_there_is_no_taxel():
-    image = touch_image(TOUCH[0], scale=1)
-    assert np.count_nonzero(image[..., 3]) == 640
-    assert image.shape[2] == 4
+def test_hands_show_every_loaded_taxel_in_its_place_and_colour():
+    """As on the dashboard: the left hand's thumb is on the right, opposite the right hand's."""
+    touch = np.zeros((2, 320), dtype=np.float32)
+    still = hands_image(touch, cell_px=8)
+    assert (still[..., 3] == 0).any()
+    touch[0, 0] = touch[1, 0] = 40.0
+    touch[1, 80] = 0.9
+    pressed = hands_image(touch, cell_px=8)
+    rows, columns = np.nonzero((pressed != still).any(axis=2))
+    width = still.shape[1]
+    # One cell of 8 px of each hand, mirrored; not the weak one.
+    left, right = columns[columns < width / 2], columns[columns >= width / 2]
+    assert {len(np.unique(left)), len(np.unique(right))} <= {7, 8}
+    np.testing.assert_array_equal(np.unique(left), width - 1 - np.unique(right)[::-1])
+    assert (rows.min() // 8, rows.max() // 8) == (9, 9)
+    full = pressed[rows.min() + 4, left.min() + 4]
+    assert full.tolist() == [255, 240, 170, 255]
+    assert scale_colours()[-1] == "rgb(255 240 170)"
+
+
+def moving_data(steps, noise=0.0):
+    """The file of a pair whose imagined touch is none; images get brighter by time."""
+    images = np.full((steps, 16, 16, 3), 20, dtype=np.uint8)
+    images += np.arange(steps, dtype=np.uint8)[:, None, None, None]
+    if noise:
+        images = rng.integers(0, 256, (steps, 256, 256, 3), dtype=np.uint8)
+    touch = np.full((steps, 2, 320), 20.0, dtype=np.float32)
+    pair = PredictionPicture("p", np.arange(steps) / 15, images, images, touch, 0 * touch)
+    made = moving_picture(pair)
+    kind, _, data = made.moving.partition(";base64,")
+    assert kind == "data:image/webp"
+    assert made.still.startswith("data:image/")
+    return base64.b64decode(data), made
+
+
+def test_moving_pictures_are_animated_webp_of_five_seconds():
+    """By its container (RIFF): chunks ANMF with their duration in ms, and ANIM with the loop."""
+    data, made = moving_data(90)
+    assert (data[:4], data[8:12]) == (b"RIFF", b"WEBP")
+    at, durations_ms = 12, []
+    while at < len(data):
+        name, size = data[at : at + 4], int.from_bytes(data[at + 4 : at + 8], "little")
+        body = data[at + 8 : at + 8 + size]
+        if name == b"ANMF":
+            durations_ms.append(int.from_bytes(body[12:15], "little"))
+        if name == b"ANIM":
+            assert int.from_bytes(body[4:6], "little") == 0
+        at += 8 + size + size % 2
+    assert sum(durations_ms) == pytest.approx(5000, rel=0.03)
+    assert made.seconds == pytest.approx(5.0, abs=0.1)
+
+
+def test_moving_pictures_are_bounded(monkeypatch):
+    monkeypatch.setattr(pictures, "MAX_MOVING_BYTES", 60_000)
+    plain, limited = len(moving_data(30)[0]), len(moving_data(30, noise=1.0)[0])
+    monkeypatch.setattr(pictures, "MAX_MOVING_BYTES", 10**9)
+    assert plain < 60_000
+    assert limited < len(moving_data(30, noise=1.0)[0]) / 4
+
+
+def test_the_page_begins_in_words(tmp_path):
+    report = REPORT | {"num_rollouts": 12, "takes": {"human": {}, "robot": {}}}
+    report["world_model"] = report["world_model"] | {"num_rollouts": 6.0}
+    text, tags = page(tmp_path, report, PICTURES)
+    lead = text.split("What was done")[1].split("</section>")[0]
+    words = " ".join(re.sub("<[^>]*>", " ", lead).split())
+    for said in (
+        "2 takes (human, robot) were recorded",
+        "predicted 6 held-out scenes",
+        "2 policies were rolled out on 1 task (stand bottle) in the real world of this run and in "
+        "a world model, from the same starts: 12 rollouts.",
+        f"UTC by DexTouch {__version__} on {platform.node()}",
+        "misses 1 of 2 bounds: Clock of camera head, RMS, the worst of 2.",
+        "within ±0.15 at worst (95 %)",
+        "r = undefined",
+        "Calibrate the station again",
+    ):
+        assert said in words
+    assert "1 of 2" not in page(tmp_path, {"policies": REPORT["policies"]})[0].split("<h2>")[0]
+    # Words are explained in place, without a script, by what every browser opens.
+    assert "<summary>worst clock</summary><span>Root mean square" in text
+    assert tags.seen.count("summary") > 8
+    assert "prefers-reduced-motion: reduce" in text
 
 
 @pytest.mark.parametrize(
@@ -284,7 +368,6 @@ def test_charts_are_well_formed_and_inside():
             assert 0 <= x <= width
             assert 0 <= y <= height
     assert [line.attrib["class"] for line in root.iter("polyline")] == ["curve s0", "curve s1"]
-    ET.fromstring(agreement_chart([Point("p", 1.0, 0.0, (0.5, 1.0), (0.0, 0.5))]))  # noqa: S314
 
 
 def test_long_curves_are_thinned():

@@ -32,6 +32,7 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
+from services.evaluation.studies.study_figures import kept_pairs, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
@@ -428,9 +429,24 @@ def test_kept_rollouts_hold_what_the_worlds_returned(tmp_path, url, study, parts
         np.testing.assert_allclose(array, expected, atol=1e-5)
     images = np.concatenate([one.images["camera_head"] for one in seen]).astype(float)
     assert np.abs(window.images["camera_head"] - images).mean() < 3
+    # The report shows a pair of every task, of the rollouts that were kept.
+    pairs = kept_pairs(report, "dream", results)
+    assert [pair.title.split(",")[0] for pair in pairs] == list(toy.TASKS)
+    # Of their 81 steps those of five seconds at 15 Hz.
+    assert {pair.true_images.shape[0] for pair in pairs} == {76}
+    write_reports(results, None)
+    page = (tmp_path / "report dream.html").read_text(encoding="utf-8")
+    assert page.count("data:image/webp") == 2 * len(toy.TASKS)  # moving and still
     np.testing.assert_allclose(
         episode.read("action_commanded").values[1:], demonstration.commanded[1:]
     )
+    # A kept rollout that is damaged is not shown, and costs no report.
+    for name in store.list():
+        if store.open(name).attributes.task == toy.TASKS[0]:
+            (store.root / f"episodes/{name}/tactile_left/c/0/0").write_bytes(b"")
+    write_reports(results, None)
+    page = (tmp_path / "report dream.html").read_text(encoding="utf-8")
+    assert page.count("data:image/webp") == 2 * (len(toy.TASKS) - 1)
 
 
 def test_a_start_that_was_trained_on_is_refused(tmp_path, study, parts):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dextouch.clients import RolloutClient
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, check_id
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Uncertainty
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
-from services.generation import imagine_episode
+from services.generation import imagine_episode, imagined_id
 from services.pipelines.servers import served
 from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
@@ -37,6 +37,14 @@ def client():
     )
     with served({"worlds": app}) as urls, RolloutClient(urls["worlds"]) as client:
         yield client
+
+
+def test_a_long_id_of_a_source_is_cut_and_stays_its_own():
+    assert imagined_id("take-1", "0123456789ab") == "imagined-01234567-take-1"
+    # Of 110 letters and more, with the world's 18; ids have at most 128.
+    one, other = (imagined_id("t" * 120 + last, "0123456789ab") for last in "ab")
+    assert check_id(one) != check_id(other)
+    assert len(check_id(imagined_id("t" * 110, "0123456789ab"))) == 128
 
 
 @pytest.mark.long

@@ -76,6 +76,24 @@ def test_a_run_is_as_complete_as_the_tighter_limit_says(clock):
         assert budget.share() == share
 
 
+def test_wall_time_ends_a_run_and_the_learning_rate_may_follow_the_steps(clock, monkeypatch):
+    wall = [100.0]
+    monkeypatch.setattr(optimizer.time, "monotonic", lambda: wall[0])
+    budgets = [Budget(10.0, 4, 20.0, paced_by_steps=by_steps) for by_steps in (False, True)]
+    timed = Budget(10.0, None, 20.0, paced_by_steps=True)
+    clock[0] += 1.0
+    wall[0] += 8.0
+    for budget in (*budgets, timed):
+        budget.advance()
+    assert [one.share() for one in (*budgets, timed)] == [0.4, 0.4, 0.4]
+    assert [one.schedule_share() for one in (*budgets, timed)] == [0.4, 0.25, 0.4]
+    assert (timed.step, timed.cpu_s, timed.wall_s) == (1, 1.0, 8.0)
+    with timed.paused():
+        wall[0] += 50.0
+    timed.advance()
+    assert timed.wall_s == 8.0
+
+
 def test_paused_time_does_not_count_and_a_resumed_run_goes_on(clock):
     budget = Budget(10.0)
     clock[0] += 1.0
@@ -94,8 +112,9 @@ def test_gradients_that_are_no_numbers_move_no_weight():
     network = one_weight()
     loop = OptimizerLoop(network, OptimizerOptions(0.1, 0.1), Budget(max_steps=3))
     loss = (network.weight * math.inf).sum()
+    torch.autograd.backward(loss)
     with pytest.raises(NonFiniteError, match=r"step 0 of Linear .*loss inf, touch 2"):
-        loop.learn(loss, touch=torch.tensor(2.0))
+        loop.step(loss=loss, touch=torch.tensor(2.0))
     assert network.weight.item() == 1.0
 
 
@@ -112,6 +131,6 @@ def test_an_average_begins_with_a_short_memory():
     network, averaged = one_weight(1.0), one_weight(0.0)
     expected = 0.0
     for count in range(5):
-        update_average(averaged, network, decay=0.3, num_updates=count)
+        update_average(averaged.parameters(), network.parameters(), decay=0.3, num_updates=count)
         expected += (1 - min(0.3, (1 + count) / (10 + count))) * (1.0 - expected)
         np.testing.assert_allclose(averaged.weight.item(), expected, rtol=1e-6)

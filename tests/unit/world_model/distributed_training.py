@@ -13,15 +13,14 @@ from services.world_model.training.trainer import TrainingProgress, train
 
 def main(settings: Path, log: Path, killed_rank: int) -> None:
     """Train with these settings and write the loss log of the first process."""
-    with joined_processes() as processes:
+    given = TrainSettings.model_validate_json(settings.read_text())
+    with joined_processes(given.device, given.replicas) as processes:
 
         def on_progress(_: TrainingProgress) -> None:
             if processes.rank == killed_rank:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-        report = train(
-            TrainSettings.model_validate_json(settings.read_text()), on_progress, processes
-        )
+        report = train(given, on_progress, processes)
     if report is not None:
         rows = [(one.step, one.loss_video, one.loss_tactile) for one in report.log]
         log.write_text(json.dumps(rows))

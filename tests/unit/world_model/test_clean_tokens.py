@@ -1,5 +1,7 @@
 """Clean tokens computed once per chunk give what masked attention over all tokens gives."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -20,11 +22,11 @@ def assert_kept_tokens_change_nothing(model, inputs):
     """At flow times of every kind, and after several steps."""
     noisy = noise_of(model, len(inputs))
     context = model.context(inputs, model.first_latents(inputs))
-    kept = model.with_clean_tokens(context, noisy)
     other = noise_of(model, len(inputs) + 1)
     other = type(other)(other.video[1:], other.tactile[1:])
     # Whatever is noisy while they are computed.
-    for clean in (kept, model.with_clean_tokens(context, other)):
+    for while_noisy in (noisy, other):
+        clean = replace(context, clean=model.clean_tokens(context, while_noisy))
         for t in (1.0, 0.6, 1e-3):
             times = torch.full((len(inputs),), t)
             expected = model.denoise(context, noisy, times)

@@ -77,7 +77,7 @@ def test_two_processes_train_as_one(toy_store, settings, tmp_path):
 def test_after_a_kill_any_number_of_processes_goes_on(toy_store, settings, tmp_path, count):
     expected = train(settings)
     output = tmp_path / "killed" / "model.safetensors"
-    kept = settings.model_copy(update={"output": output, "state_every_cpu_s": 0.0, "resume": True})
+    kept = settings.model_copy(update={"output": output, "state_every_s": 0.0, "resume": True})
     done, log = run_processes(kept, killed_rank=1)
     assert done.returncode != 0
     assert log is None
@@ -122,7 +122,7 @@ def test_sharded_training_is_resumed_and_equals_plain_training(
     kept = short.model_copy(
         update={
             "output": settings.output.parent / "kept" / "model.safetensors",
-            "state_every_cpu_s": 0.0,
+            "state_every_s": 0.0,
             "resume": True,
         }
     )

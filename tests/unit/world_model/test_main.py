@@ -32,6 +32,9 @@ def test_train_then_show(toy_store, tmp_path, capsys):
     assert "--episodes=store --" in shown[0]["command"]
     assert "--network.video-width=16" in shown[0]["command"]
     assert str(tmp_path) not in json.dumps(shown)
+    assert "cut short" not in capsys.readouterr().out
+    assert run_train(["--preset=tiny", *arguments, "--wall-budget-s=1e-9"]) == 0
+    assert "cut short at step 1 of 3; --resume with a larger limit" in capsys.readouterr().out
 
 
 def test_nonsense_is_refused(tmp_path):

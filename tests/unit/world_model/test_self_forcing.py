@@ -148,7 +148,7 @@ def test_a_checkpoint_is_distilled_and_an_interrupted_run_goes_on(
     def stop(_):
         raise StoppedError
 
-    changes = {"output": tmp_path / "again.safetensors", "state_every_cpu_s": 0.0, "resume": True}
+    changes = {"output": tmp_path / "again.safetensors", "state_every_s": 0.0, "resume": True}
     again = student.model_copy(update=changes)
     with pytest.raises(StoppedError):
         train_on(toy_episodes, heldout, again, stop)

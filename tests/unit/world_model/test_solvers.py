@@ -115,4 +115,4 @@ def test_a_world_samples_as_it_is_asked_to(checkpoint, toy_episode, tmp_path):
     assert np.array_equal(touch(None, "euler"), stored)
     assert not np.array_equal(touch(4, "unipc"), touch(4))
     with pytest.raises(InvalidInputError, match="without sampling"):
-        open_world(sampler="unipc")
+        open_world(sampling=Sampling(sampler="unipc"))

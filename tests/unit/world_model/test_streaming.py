@@ -169,7 +169,7 @@ def test_streamed_training_gives_the_weights_of_training_in_memory(
         run = TrainingRun(episodes, settings)
         run.fit_codecs()
         run.run()
-        return run.averaged.state_dict()
+        return run.whole_average().state_dict()
 
     expected = weights(in_memory)
     for workers in (0, 1):

@@ -11,7 +11,12 @@ from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
+from services.world_model.network.model import (
+    JointLatents,
+    JointWorldModel,
+    Sampling,
+    stack_noise,
+)
 from services.world_model.network.tactile import build_tokenizer
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.dataset import WindowPosition, WindowSampler
@@ -133,7 +138,8 @@ def test_the_committed_checkpoint_predicts_what_it_did_with_one_token_per_hand(t
         first_tactile_kpa=touch.numpy(),
     )
     inputs = build_inputs([request], model.config)
-    future = model.predict(inputs, model.noise(17, torch.Generator().manual_seed(0)))
+    noise = model.noise(17, torch.Generator().manual_seed(0))
+    future = model.predict(inputs, noise, sampling=Sampling(2))
     steps = [0, 7, 15]
     expected_kpa = [[1314.365, 5825.875], [1246.653, 5869.729], [1262.991, 5915.386]]
     np.testing.assert_allclose(future.tactile_kpa.sum(-1)[0, steps], expected_kpa, rtol=1e-3)

@@ -38,7 +38,7 @@ def test_the_same_seed_gives_the_same_weights(toy_episodes, train_settings):
         run = TrainingRun(toy_episodes, train_settings)
         run.fit_codecs()
         run.run()
-        return run.averaged.state_dict()
+        return run.whole_average().state_dict()
 
     a, b = weights(), weights()
     assert all(torch.equal(a[name], b[name]) for name in a)
@@ -48,22 +48,21 @@ def test_averaged_weights_follow_fast_at_first(toy_episodes, train_settings):
     run = TrainingRun(toy_episodes, train_settings)
     run.fit_codecs()
     batches = run._batches()
-    mean = [weight.clone() for weight in run.averaged.parameters()]
+    averages = run._averages
+    mean = [weight.clone() for weight in averages.values()]
     # 1 − (1 + k) / (10 + k) of the way at step k, as long as that is more than 1 − ema_decay.
     for share in (9 / 10, 9 / 11, 9 / 12):
         run.learn(next(batches))
         run.budget.step += 1
-        weights = list(run.model.parameters())
+        weights = list(run.learned.values())
         mean = [m + share * (w - m) for m, w in zip(mean, weights, strict=True)]
-        for expected, averaged in zip(mean, run.averaged.parameters(), strict=True):
+        for expected, averaged in zip(mean, averages.values(), strict=True):
             torch.testing.assert_close(averaged, expected)
     run.budget.step = 10**6
-    before = [weight.clone() for weight in run.averaged.parameters()]
+    before = [weight.clone() for weight in averages.values()]
     run.learn(next(batches))
     decay = train_settings.optimizer.ema_decay
-    for was, weight, averaged in zip(
-        before, run.model.parameters(), run.averaged.parameters(), strict=True
-    ):
+    for was, weight, averaged in zip(before, run.learned.values(), averages.values(), strict=True):
         torch.testing.assert_close(averaged, decay * was + (1 - decay) * weight)
 
 

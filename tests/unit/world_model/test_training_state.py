@@ -4,13 +4,18 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
+from services.networks import optimizer
 from services.world_model.checkpoints import read_checkpoint
+from services.world_model.training import trainer
 from services.world_model.training.distribution import ALONE
 from services.world_model.training.trainer import TrainingRun, train, train_on
 from services.world_model.training.training_state import StateFiles, state_path
@@ -47,9 +52,7 @@ def test_a_killed_run_of_both_domains_goes_on_as_if_nothing_had_happened(
     settings = settings.model_copy(update=mixed)
     expected = train(settings)
     output = tmp_path / "killed" / "model.safetensors"
-    killed = settings.model_copy(
-        update={"output": output, "state_every_cpu_s": 0.0, "resume": True}
-    )
+    killed = settings.model_copy(update={"output": output, "state_every_s": 0.0, "resume": True})
     (tmp_path / "settings.json").write_text(killed.model_dump_json())
     path = os.pathsep.join([str(ROOT), str(ROOT / "shared")])
     ended = subprocess.run(
@@ -68,6 +71,29 @@ def test_a_killed_run_of_both_domains_goes_on_as_if_nothing_had_happened(
 
 
 @pytest.mark.slow
+def test_a_run_may_be_killed_at_any_moment(toy_store, settings, tmp_path):
+    """Two runs are killed a random while after they began to write states, at every step."""
+    expected = train(settings)
+    output = tmp_path / "killed" / "model.safetensors"
+    kept = settings.model_copy(update={"output": output, "state_every_s": 0.0, "resume": True})
+    (tmp_path / "settings.json").write_text(kept.model_dump_json())
+    path = os.pathsep.join([str(ROOT), str(ROOT / "shared")])
+    command = [sys.executable, str(CHILD), str(tmp_path / "settings.json")]
+    rng = np.random.default_rng()
+    for _ in range(2):
+        begun = state_path(output).stat().st_mtime_ns if state_path(output).exists() else 0
+        with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
+            while process.poll() is None and (
+                not state_path(output).exists() or state_path(output).stat().st_mtime_ns == begun
+            ):
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0.0, 0.3))
+            process.kill()
+    assert not output.exists()
+    assert_same_run(train(kept), expected)
+
+
+@pytest.mark.slow
 def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_path):
     expected = train(settings.model_copy(update={"streaming": True}))
 
@@ -78,7 +104,7 @@ def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_pa
         raise StoppedError
 
     for workers in (0, 1):
-        changes = {"streaming": True, "loader_workers": workers, "state_every_cpu_s": 0.0}
+        changes = {"streaming": True, "loader_workers": workers, "state_every_s": 0.0}
         output = tmp_path / f"{workers}.safetensors"
         stopped = settings.model_copy(update={**changes, "output": output})
         with pytest.raises(StoppedError):
@@ -96,7 +122,7 @@ def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
     def stop(progress):
         raise StoppedError
 
-    kept = settings.model_copy(update={"state_every_cpu_s": 0.0})
+    kept = settings.model_copy(update={"state_every_s": 0.0})
     with pytest.raises(StoppedError):
         train(kept, stop)
     other = kept.model_copy(update={"resume": True, "seed": 7})
@@ -119,8 +145,8 @@ def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, 
     later = settings.model_copy(update=changes)
     run = TrainingRun(toy_episodes[3:], later)
     run.start_from(ancestor)
-    for mine in (run.model, run.averaged):
-        for name, tensor in mine.state_dict().items():
+    for mine in (run.model.state_dict(), run._averages):
+        for name, tensor in mine.items():
             assert torch.equal(tensor, ancestor.model.state_dict()[name])
     report = train_on(toy_episodes[3:], heldout, later)
     metadata = read_checkpoint(report.checkpoint).metadata
@@ -146,6 +172,29 @@ def test_a_state_is_kept_now_and_then(toy_episodes, toy_episode, settings, monke
     monkeypatch.setattr(StateFiles, "write", lambda files, state: kept.append(state.facts.step))
     train_on(toy_episodes, [toy_episode(9, 25)], settings.model_copy(update={"max_steps": 3}))
     assert kept == []
-    often = settings.model_copy(update={"max_steps": 3, "state_every_cpu_s": 0.0})
+    often = settings.model_copy(update={"max_steps": 3, "state_every_s": 0.0})
     train_on(toy_episodes, [toy_episode(9, 25)], often)
     assert kept == [1, 2, 3]
+
+
+def test_seconds_between_states_count_from_the_end_of_the_last_one(
+    toy_episodes, settings, monkeypatch
+):
+    now_s, kept = [0.0], []
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], process_time=lambda: 0.0)
+    for module in (optimizer, trainer):
+        monkeypatch.setattr(module, "time", clock)
+
+    def learn(run, batch):
+        now_s[0] += 1.0
+        return 0.0, 0.0
+
+    def write(files, state):
+        now_s[0] += 10.0
+        kept.append(state.facts.step)
+
+    monkeypatch.setattr(TrainingRun, "learn", learn)
+    monkeypatch.setattr(StateFiles, "write", write)
+    slow = settings.model_copy(update={"max_steps": 12, "state_every_s": 5.0})
+    trainer._run_or_resume(TrainingRun(toy_episodes, slow), None, None, None)
+    assert kept == [5, 10]

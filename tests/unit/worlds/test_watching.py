@@ -13,6 +13,7 @@ from pydantic import SecretStr
 from dextouch.clients import RolloutClient
 from dextouch.schemas import RolloutUncertainty, Uncertainty, decode_answer
 from dextouch.serving.keys import ApiKey
+from dextouch.serving.state import MemoryState
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.records import RecordStore, RolloutWatch
@@ -91,6 +92,34 @@ async def test_the_listing_says_who_does_what_since_when(client):
     assert one["watch_id"] != begun.rollout.id
 
 
+async def test_the_last_ten_that_ended_are_listed_as_they_were(client):
+    for number in range(12):
+        begun = await start(client, **{"dextouch-client": f"policy-{number}"})
+        await step(client, begun.rollout.id, 0)
+        await client.delete(f"/v1/rollouts/{begun.rollout.id}", headers=bearer("policy"))
+    page = await listed(client)
+    assert (page["rollouts"], page["num_open"]) == ([], 0)
+    assert [one["client"] for one in page["over"]] == [f"policy-{n}" for n in range(11, 1, -1)]
+    assert {one["last_step"] for one in page["over"]} == {4}
+    assert begun.rollout.id not in str(page)
+
+
+async def test_rollouts_that_end_at_once_are_all_listed(client, monkeypatch):
+    begun = [await start(client, **{"dextouch-client": f"policy-{n}"}) for n in range(8)]
+    get = MemoryState.get
+
+    async def get_and_wait(store, key):
+        stored = await get(store, key)
+        await asyncio.sleep(0)
+        return stored
+
+    monkeypatch.setattr(MemoryState, "get", get_and_wait)
+    paths = [f"/v1/rollouts/{one.rollout.id}" for one in begun]
+    await asyncio.gather(*(client.delete(path, headers=bearer("policy")) for path in paths))
+    over = (await listed(client))["over"]
+    assert sorted(one["client"] for one in over) == [f"policy-{n}" for n in range(8)]
+
+
 class DoubtfulWorld(SumWorld):
     """Doubts chunks of which joint values are negative."""
 
@@ -134,7 +163,9 @@ async def test_an_end_is_listed_with_its_reason(client):
     (one,) = (await listed(client))["rollouts"]
     assert (one["ended"], one["last_step"]) == ("too many to count", 4)
     await client.delete(f"/v1/rollouts/{begun.rollout.id}", headers=bearer("policy"))
-    assert await listed(client) == {"rollouts": [], "num_open": 0}
+    page = await listed(client)
+    assert (page["rollouts"], page["num_open"]) == ([], 0)
+    assert [one["ended"] for one in page["over"]] == ["too many to count"]
 
 
 async def test_the_newest_come_first_and_as_many_as_asked_for(client):

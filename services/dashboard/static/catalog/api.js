@@ -1,20 +1,27 @@
 // Requests to the store and to alignment through the dashboard; refusals become errors with their reason.
 
-import { ask } from "../session.js";
-
-async function read(answer) {
-  if (answer.ok) return answer.json();
-  const problem = await answer.json().catch(() => ({}));
-  throw new Error(problem.detail ?? `The dashboard answered ${answer.status}.`, { cause: answer.status });
-}
+import { element } from "../dom.js";
+import { ask, checked } from "../session.js";
 
 export async function get(path) {
-  return read(await ask(path));
+  return (await checked(await ask(path))).json();
 }
 
 export async function post(path, body) {
   const headers = { "content-type": "application/json" };
-  return read(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }));
+  const answer = await checked(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }));
+  return answer.status === 204 ? null : answer.json();
+}
+
+// Lists of a form's filters, by name and what is chosen; that is listed even where the store does not have it.
+export async function listChoices(form, chosen) {
+  const values = await get("/v1/episode_store/catalog/values").catch(() => ({}));
+  for (const [name, value] of Object.entries(chosen)) {
+    const all = new Set([...(values[`${name}s`] ?? []), value]);
+    all.delete("");
+    form.elements[name].replaceChildren(element("option", { value: "" }, "all"), ...[...all].map((one) => element("option", { value: one }, one)));
+    form.elements[name].value = value;
+  }
 }
 
 // Services that this dashboard was started without are not asked again.

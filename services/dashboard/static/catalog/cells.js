@@ -1,5 +1,6 @@
 // Cells of a row: what is known of an item, as an operator reads it.
 
+import { date } from "../dates.js";
 import { element, levelBadge } from "../dom.js";
 import { number } from "../format.js";
 import { STEPS } from "./stage.js";
@@ -20,29 +21,13 @@ export function under(text, kind = "why") {
   return text ? element("span", { class: kind }, text) : null;
 }
 
-// The year only where it is another one.
-export function day(iso) {
-  if (!iso) return "–";
-  const at = new Date(iso);
-  const year = at.getFullYear() === new Date().getFullYear() ? undefined : "numeric";
-  return at.toLocaleDateString("en-GB", { day: "numeric", month: "short", year });
-}
-
-export function clock(iso) {
-  return iso ? new Date(iso).toLocaleTimeString("en-GB") : "";
-}
-
 export function length(value_s) {
   if (value_s < 60) return `${number(value_s, 1)} s`;
   return `${Math.floor(value_s / 60)}:${String(Math.floor(value_s % 60)).padStart(2, "0")} min`;
 }
 
-export function size(num_bytes) {
-  return num_bytes < 1e6 ? `${Math.ceil(num_bytes / 1e3)} kB` : `${(num_bytes / 1e6).toFixed(1)} MB`;
-}
-
-export function timeCell(item) {
-  return element("td", {}, day(item.at), under(clock(item.at)));
+export function timeCell(at) {
+  return element("td", {}, date(at, "day"), under(at ? date(at, "time") : ""));
 }
 
 export function taskCell(item) {
@@ -81,8 +66,7 @@ export function qualityCell(item) {
 }
 
 export function stageCell(stage) {
-  const badge = stage.label ? levelBadge(stage.level) : null;
-  if (badge) badge.textContent = stage.label;
+  const badge = stage.label ? levelBadge(stage.level, stage.label) : null;
   const steps = stage.done === null ? null : element("span", { class: "steps", title: STEPS.map((step, index) => `${step}${index < stage.done ? " ✓" : ""}`).join(", ") },
     ...STEPS.map((_, index) => element("span", { class: index < stage.done ? "done" : "open" })));
   const share = stage.share === undefined ? null : element("progress", { value: stage.share, max: 1, "aria-label": stage.label });

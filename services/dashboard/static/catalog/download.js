@@ -1,9 +1,9 @@
 // Downloads MCAP files of items through the dashboard, with progress and a way to cancel.
 
-import { element, setText } from "../dom.js";
-import { ask } from "../session.js";
+import { element, say } from "../dom.js";
+import { bytes } from "../format.js";
+import { ask, checked } from "../session.js";
 
-const MEGABYTE = 1e6;
 const BROKE_OFF = "The download broke off; the log of the store says why. Nothing was saved.";
 
 function save(parts, name) {
@@ -13,15 +13,9 @@ function save(parts, name) {
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
-async function reasonOf(answer) {
-  const problem = await answer.json().catch(() => ({}));
-  return problem.detail ?? `The dashboard answered ${answer.status}.`;
-}
-
 async function fetchAll(body, signal, onProgress) {
   const headers = { "content-type": "application/json" };
-  const answer = await ask("/v1/episode_store/downloads", { method: "POST", headers, body: JSON.stringify(body), signal });
-  if (!answer.ok) throw new Error(await reasonOf(answer));
+  const answer = await checked(await ask("/v1/episode_store/downloads", { method: "POST", headers, body: JSON.stringify(body), signal }));
   const expected = Number(answer.headers.get("x-dextouch-estimated-bytes")) || 1;
   const [, name] = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "") ?? [null, "dextouch.mcap"];
   const parts = [];
@@ -46,10 +40,6 @@ export function downloadControl(listed) {
   const note = element("span", { class: "note", role: "status" });
   let aborting = null;
 
-  const say = (text, level = "OK") => {
-    note.dataset.level = level;
-    setText(note, text);
-  };
   const showBusy = (busy) => {
     button.disabled = busy;
     cancel.hidden = bar.hidden = !busy;
@@ -59,18 +49,18 @@ export function downloadControl(listed) {
   button.addEventListener("click", async () => {
     aborting = new AbortController();
     showBusy(true);
-    say("The store makes the files.");
+    say(note, "The store makes the files.");
     try {
       const { parts, name, received } = await fetchAll(await listed(), aborting.signal, (some, expected) => {
         // The estimate is of the stored bytes; the end is known only when it is there.
         bar.value = Math.min(some / expected, 0.99);
-        say(`${(some / MEGABYTE).toFixed(1)} MB of about ${(expected / MEGABYTE).toFixed(1)} MB`);
+        say(note, `${bytes(some)} of about ${bytes(expected)}`);
       });
       save(parts, name);
-      say(`${name}, ${(received / MEGABYTE).toFixed(1)} MB`);
+      say(note, `${name}, ${bytes(received)}`);
     } catch (error) {
-      if (aborting.signal.aborted) say("Cancelled; nothing was saved.", "WARN");
-      else say(error.message, "ERROR");
+      if (aborting.signal.aborted) say(note, "Cancelled; nothing was saved.", "WARN");
+      else say(note, error.message, "ERROR");
     }
     showBusy(false);
   });

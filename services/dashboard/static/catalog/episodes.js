@@ -1,10 +1,9 @@
 // The list of recordings and episodes: filters in the address, rows that move on, deletion in two steps.
 
-import { element, setText } from "../dom.js";
-import { plural } from "../format.js";
+import { element, find, repeat, setText } from "../dom.js";
+import { bytes, plural } from "../format.js";
 import { pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
-import { get, getIfServed, newestJobs, post } from "./api.js";
+import { get, getIfServed, listChoices, newestJobs, post } from "./api.js";
 import * as cells from "./cells.js";
 import { ExportDialog } from "./export.js";
 import { Grid } from "./grid.js";
@@ -17,7 +16,6 @@ const REFRESH_MS = 3000;
 const CONFIRM_MS = 5000;
 const TYPING_MS = 250;
 const MAX_MOVED = 500;
-const find = (id) => document.getElementById(id);
 const form = find("filters");
 let query = readQuery(location.search);
 let rows = new Map();
@@ -33,7 +31,7 @@ function checkbox(name) {
 }
 
 function itemRow({ item, job }) {
-  return element("tr", {}, checkbox(item.id), cells.timeCell(item), cells.taskCell(item), cells.nameCell(item, pagePath(playerPath(item))),
+  return element("tr", {}, checkbox(item.id), cells.timeCell(item.at), cells.taskCell(item), cells.nameCell(item, pagePath(playerPath(item))),
     cells.operatorCell(item), cells.stationCell(item), cells.outcomeCell(item), cells.lengthCell(item), cells.qualityCell(item),
     cells.stageCell(stageOf({ item, job })));
 }
@@ -46,10 +44,9 @@ function uploadRow({ id, task, station, upload }) {
 }
 
 function trashRow(item) {
-  const at = item.deleted_at;
-  return element("tr", {}, checkbox(item.id), element("td", {}, cells.day(at), cells.under(cells.clock(at))),
+  return element("tr", {}, checkbox(item.id), cells.timeCell(item.deleted_at),
     element("td", { class: "item_name_cell" }, element("span", { class: "item_name" }, item.id), cells.under(item.kind)),
-    element("td", { class: "number" }, cells.size(item.num_bytes)));
+    element("td", { class: "number" }, bytes(item.num_bytes)));
 }
 
 // Requests
@@ -90,23 +87,11 @@ async function refresh() {
     grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
     find("empty").hidden = made.length > 0;
     find("empty").replaceChildren(...nothing());
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
     showPager();
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The list is not up to date: ${error.message}`);
-  }
-}
-
-async function showChoices() {
-  const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [], operators: [], stations: [] }));
-  for (const [name, found] of [["task", values.tasks], ["operator", values.operators], ["station", values.stations]]) {
-    const select = form.elements[name];
-    const chosen = query.filters[name];
-    const all = chosen && !found.includes(chosen) ? [...found, chosen] : found;
-    select.replaceChildren(element("option", { value: "" }, "all"), ...all.map((value) => element("option", { value }, value)));
-    select.value = chosen;
   }
 }
 
@@ -258,11 +243,14 @@ function lineageSubject() {
 const exporting = new ExportDialog(find("export_dialog"));
 const grid = new Grid(find("rows"), { onChange: () => showSelection(), onOpen: open });
 let typed = null;
+let changed = {};
 form.addEventListener("input", (event) => {
   clearTimeout(typed);
+  changed[event.target.name] = event.target.value;
   const isTyping = event.target.name === "text";
   typed = setTimeout(() => {
-    go({ filters: { ...query.filters, [event.target.name]: event.target.value } }, { isTyping });
+    go({ filters: { ...query.filters, ...changed } }, { isTyping });
+    changed = {};
   }, isTyping ? TYPING_MS : 0);
 });
 form.addEventListener("submit", (event) => { event.preventDefault(); document.activeElement?.blur(); grid.focus(); });
@@ -273,9 +261,7 @@ for (const head of document.querySelectorAll("[data-sort]")) {
 }
 listen(grid, { form, actions: KEYS, buttons: [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"], ["export", "e"]] });
 window.addEventListener("popstate", () => { query = readQuery(location.search); showQuery(); refresh(); });
-document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
-setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);
-startTheme(find("theme"), () => {});
 showQuery();
-await showChoices();
-await refresh();
+const { task, operator, station } = query.filters;
+await listChoices(form, { task, operator, station });
+await repeat(refresh, REFRESH_MS);

@@ -1,9 +1,7 @@
 // Keys, buttons and selection of a page with a grid, by which the list and the review queue are worked.
 
-import { setText } from "../dom.js";
+import { find, say as note, setText } from "../dom.js";
 import { isFree } from "./grid.js";
-
-const find = (id) => document.getElementById(id);
 
 // `actions` by key, `buttons` as [id, key]; the keys of the grid come first, and Esc leaves a field of `form`.
 export function listen(grid, { form, actions, buttons }) {
@@ -28,6 +26,5 @@ export function showSelected(grid) {
 }
 
 export function say(text, level = "OK") {
-  find("message").dataset.level = level;
-  setText(find("message"), text);
+  note(find("message"), text, level);
 }

@@ -1,17 +1,16 @@
 // Hours of recorded episodes by task, operator, station and day, by what was said of them in review.
 
-import { element, setText } from "../dom.js";
+import { date } from "../dates.js";
+import { element, find, repeat, setText } from "../dom.js";
 import { number, plural } from "../format.js";
 import { pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
-import { get } from "./api.js";
+import { get, listChoices } from "./api.js";
 import { bars, counted, withGoals } from "./hours_rows.js";
 import { readQuery, storeQuery } from "./query.js";
 
 const REFRESH_MS = 30000;
 const FIELDS = ["task", "operator", "station", "day"];
 const NAMES = ["origin", "domain", "task", "operator", "from", "to"];
-const find = (id) => document.getElementById(id);
 const form = find("filters");
 const goals = JSON.parse(find("hours").dataset.goals);
 let asked = 0;
@@ -36,10 +35,10 @@ function bar({ parts, goal }) {
   return node;
 }
 
-function row(data, drawn) {
+function row(field, data, drawn) {
   const cell = (text, name = "number") => element("td", { class: name }, text);
   const goal = data.goal_h === null ? "" : `${Math.round(100 * drawn.reached)} % of ${hours(data.goal_h)}`;
-  const label = data.value ?? "not known";
+  const label = data.value === null ? "not known" : field === "day" ? date(`${data.value}T00:00`, "day") : data.value;
   return element("tr", {}, element("th", { scope: "row", title: label }, element("span", { class: "clipped" }, label)), element("td", { class: "bars" }, bar(drawn)),
     cell(hours(data.accepted_h)), cell(hours(data.not_reviewed_h)), cell(hours(data.rejected_h)), cell(hours(drawn.total_h)),
     cell(String(data.num_episodes)), cell(goal, "number goal"));
@@ -50,7 +49,7 @@ function show(field, rows) {
   const listed = field === "task" ? withGoals(rows, wantedGoals()) : rows.map((one) => ({ ...one, goal_h: null }));
   if (field === "day") listed.reverse();
   const drawn = bars(listed);
-  find(`${field}_rows`).replaceChildren(...listed.map((one, index) => row(one, drawn[index])));
+  find(`${field}_rows`).replaceChildren(...listed.map((one, index) => row(field, one, drawn[index])));
   find(`${field}_empty`).hidden = listed.length > 0;
   return listed;
 }
@@ -88,10 +87,9 @@ async function refresh() {
     const sum = (of) => shown[0].reduce((total, one) => total + of(one), 0);
     const kept = plural(sum((one) => one.num_episodes), "episode");
     setText(find("total"), shown[0].length ? `${hours(sum(counted))} in ${kept}, hours without rejected ones` : "no episodes");
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The hours are not up to date: ${error.message}`);
   }
 }
@@ -103,20 +101,12 @@ function showAddress() {
   form.elements.origin.value = origin === "any" ? "" : origin;
 }
 
-async function showChoices() {
-  const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [], operators: [] }));
-  for (const [name, found] of [["task", values.tasks], ["operator", values.operators]]) {
-    form.elements[name].replaceChildren(element("option", { value: "" }, "all"), ...found.map((value) => element("option", { value }, value)));
-  }
-}
-
 form.addEventListener("input", () => {
   history.replaceState(null, "", pagePath(`${location.pathname}?${address()}`));
   refresh();
 });
 form.addEventListener("submit", (event) => event.preventDefault());
-setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);
-startTheme(find("theme"), () => {});
-await showChoices();
+const { task, operator } = readQuery(location.search).filters;
+await listChoices(form, { task, operator });
 showAddress();
-await refresh();
+await repeat(refresh, REFRESH_MS);

@@ -8,12 +8,13 @@ import { under } from "./cells.js";
 const RELATIONS = [["source", "Made from"], ["self", "This item"], ["product", "Made from this item"]];
 const PLAYED = ["recording", "episode"];
 
-function nodeItem(node) {
+// A line of an item's lineage.
+export function nodeItem(node, relation = "") {
   const name = node.is_stored && PLAYED.includes(node.kind)
     ? element("a", { href: pagePath(`/episodes/${node.kind}/${encodeURIComponent(node.id)}`) }, node.id)
     : element("strong", {}, node.id);
   const known = node.is_stored || !PLAYED.includes(node.kind) ? node.summary : "not in this store: deleted, or elsewhere";
-  return element("li", {}, element("span", { class: "quiet" }, node.kind), name, under(known));
+  return element("li", {}, element("span", { class: "quiet" }, `${relation} ${node.kind} `.trimStart()), name, under(known));
 }
 
 function jobItem(job) {

@@ -1,9 +1,9 @@
 // The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
 
-import { element, setText } from "../dom.js";
+import { element, find, repeat, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
-import { get, getIfServed, post } from "./api.js";
+import { get, getIfServed, listChoices, post } from "./api.js";
 import * as cells from "./cells.js";
 import { Grid } from "./grid.js";
 import { listen, say, showSelected } from "./grid_keys.js";
@@ -14,7 +14,6 @@ import { playerPath, reasonOf, subjectOf } from "./stage.js";
 const REFRESH_MS = 5000;
 const MAX_ROWS = 100;
 const MAX_ITEMS = 500;
-const find = (id) => document.getElementById(id);
 const form = find("filters");
 const dialog = find("reject_dialog");
 const reasons = dialog.querySelector("form").elements;
@@ -27,7 +26,7 @@ function row({ item, job }) {
   const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
   if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, `alignment failed: ${reasonOf(job)}`));
   const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
-  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item), cells.taskCell(item),
+  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item.at), cells.taskCell(item),
     cells.nameCell(item, pagePath(playerPath(item))), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
 }
 
@@ -64,10 +63,9 @@ async function refresh() {
     setText(find("left"), queue.length ? `${queue.length + more} to review${more ? `, the first ${queue.length} listed` : ""}` : "");
     find("empty").hidden = queue.length > 0;
     setText(find("few"), fewWords(groups, { task: form.elements.task.value, origin: form.elements.origin.value }));
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
     if (number !== asked) return;
-    find("list_error").hidden = false;
     setText(find("list_error"), `The queue is not up to date: ${error.message}`);
   }
 }
@@ -155,7 +153,7 @@ listen(grid, { form, actions: KEYS, buttons: [["accept", "a"], ["reject", "r"], 
 form.addEventListener("submit", (event) => event.preventDefault());
 form.addEventListener("input", (event) => {
   if (event.target.name === "reviewer") {
-    localStorage.setItem("reviewer", event.target.value);
+    keep("reviewer", event.target.value);
     return;
   }
   const { task, origin } = form.elements;
@@ -165,12 +163,7 @@ form.addEventListener("input", (event) => {
 });
 
 const given = new URLSearchParams(location.search);
-const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [] }));
-form.elements.task.append(...values.tasks.map((value) => element("option", { value }, value)));
-form.elements.task.value = given.get("task") ?? "";
+await listChoices(form, { task: given.get("task") ?? "" });
 form.elements.origin.value = given.get("origin") === "any" ? "" : given.get("origin") ?? "recorded";
-form.elements.reviewer.value = localStorage.getItem("reviewer") ?? "";
-document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
-setInterval(() => { if (!document.hidden && !dialog.open) refresh(); }, REFRESH_MS);
-startTheme(find("theme"), () => {});
-await refresh();
+form.elements.reviewer.value = kept("reviewer") ?? "";
+await repeat(async () => { if (!dialog.open) await refresh(); }, REFRESH_MS);

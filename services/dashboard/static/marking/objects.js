@@ -1,17 +1,15 @@
 // Mark objects: the first images of a task's episodes one after the other, each click saved at once.
 
 import { get, post } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
+import { element, find, say, setText } from "../dom.js";
 import { unpack } from "../packed.js";
-import { ask, pagePath } from "../session.js";
-import { startTheme } from "../theme.js";
+import { ask, checked, pagePath } from "../session.js";
 import { counts, isDone, nextEpisode, nextOpen, stateOf, withClick, withState } from "./clicks.js";
 import { Stage } from "./stage.js";
 
 const STORE = "/v1/episode_store";
 const ACTIVE = "#ffd24a";
 const OTHER = "#7ddba6";
-const find = (id) => document.getElementById(id);
 const task = find("task");
 const state = { objects: [], episodes: [], current: 0, active: 0, history: [] };
 let saving = Promise.resolve();
@@ -21,11 +19,6 @@ let asked = 0;
 const stage = new Stage(find("image"), (pixel) => change((object, clicks) => withClick(object, clicks, pixel)));
 const episode = () => state.episodes[state.current];
 const clicksOf = (one) => one?.clicks?.objects ?? {};
-
-function say(text, level = "") {
-  setText(find("message"), text);
-  find("message").dataset.level = level;
-}
 
 // What is shown
 
@@ -90,17 +83,17 @@ function save(objects) {
   const one = episode();
   one.clicks = { objects };
   pending += 1;
-  say("Saving …");
+  say(find("message"), "Saving …");
   show();
   saving = saving.then(async () => {
     try {
       const kept = await post(`${STORE}/episodes/${encodeURIComponent(one.episode_id)}/clicks`, { objects });
       Object.assign(one, { kept: objects, boxes: kept.boxes_px });
-      if (pending === 1) say(isDone(state.objects, objects) ? "Saved. Enter goes on." : "Saved.", "OK");
+      if (pending === 1) say(find("message"), isDone(state.objects, objects) ? "Saved. Enter goes on." : "Saved.", "OK");
     } catch (error) {
       one.clicks = { objects: one.kept };
       if (one === episode()) Object.assign(state, { history: [], active: nextOpen(state.objects, one.kept, 0) });
-      say(error.message, "ERROR");
+      say(find("message"), error.message, "ERROR");
     }
     pending -= 1;
     show();
@@ -112,7 +105,7 @@ async function go(index) {
   Object.assign(state, { current: index, history: [] });
   const one = episode();
   stage.show(null);
-  say("");
+  say(find("message"), "");
   state.active = one ? nextOpen(state.objects, clicksOf(one), 0) : 0;
   show();
   if (!one) return;
@@ -121,18 +114,17 @@ async function go(index) {
     const id = encodeURIComponent(one.episode_id);
     const about = await get(`${STORE}/episodes/${id}/clicks`);
     const span = `start_ns=${about.image_t_ns}&stop_ns=${about.image_t_ns + 1}`;
-    const answer = await ask(`${STORE}/playback/episode/${id}/images/camera_head?${span}`);
-    if (!answer.ok) throw new Error(`The image of ${one.episode_id} cannot be read.`);
+    const answer = await checked(await ask(`${STORE}/playback/episode/${id}/images/camera_head?${span}`));
     const { arrays } = unpack(await answer.arrayBuffer());
     const image = await createImageBitmap(new Blob([arrays.data.values], { type: "image/jpeg" }), { imageOrientation: "none" });
     if (number !== asked) return image.close();
     Object.assign(one, { clicks: about.clicks, kept: about.clicks.objects, boxes: about.boxes_px });
     state.active = nextOpen(state.objects, clicksOf(one), 0);
     stage.show(image);
-    if (about.problem) say(about.problem, "ERROR");
+    if (about.problem) say(find("message"), about.problem, "ERROR");
     show();
   } catch (error) {
-    if (number === asked) say(error.message, "ERROR");
+    if (number === asked) say(find("message"), error.message, "ERROR");
   }
 }
 
@@ -146,9 +138,8 @@ async function open(name) {
     const more = queue.num_matching - queue.episodes.length;
     setText(find("more"), more > 0 ? `${more} more could be marked; 10 to 30 are enough to begin with.` : "");
     find("empty").hidden = queue.episodes.length > 0;
-    find("list_error").hidden = true;
+    setText(find("list_error"), "");
   } catch (error) {
-    find("list_error").hidden = false;
     setText(find("list_error"), error.message);
     Object.assign(state, { objects: [], episodes: [] });
   }
@@ -197,7 +188,6 @@ find("limit").addEventListener("change", reopen);
 // A click that is still on its way is not lost.
 window.addEventListener("beforeunload", (event) => { if (pending) event.preventDefault(); });
 
-startTheme(find("theme"), () => {});
 const given = new URLSearchParams(location.search);
 if (given.get("limit")) find("limit").value = given.get("limit");
 await open(given.get("task") ?? "");

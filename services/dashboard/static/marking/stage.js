@@ -1,5 +1,7 @@
 // The image that is clicked in: zoom around the pointer, move by dragging, and the clicks with the boxes that they give.
 
+import { cleared } from "../canvas.js";
+
 const MAX_ZOOM = 40;
 const DRAG_PX = 5;
 // Corners of a box differ in one bit along each of its edges.
@@ -88,12 +90,9 @@ export class Stage {
   draw() {
     // A finger scrolls the page over the whole image, and moves an enlarged one.
     this.canvas.style.touchAction = this.zoom > 1 ? "none" : "pan-y";
-    const ratio = window.devicePixelRatio || 1;
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.round(side * ratio));
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    const context = this.canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
-    if (!this.image) return;
+    const found = cleared(this.canvas);
+    if (!found || !this.image) return;
+    const { context, scale: ratio } = found;
     const scale = this.scale * ratio;
     context.imageSmoothingEnabled = scale < 3 * ratio;
     context.drawImage(this.image, -this.left * scale, -this.top * scale, this.image.width * scale, this.image.height * scale);

@@ -1,27 +1,20 @@
 // The 67-D action at the playhead as bars in its five blocks; commanded values are ticks beside them.
 
 import { cleared, css } from "../canvas.js";
-import { element, setText } from "../dom.js";
+import { setText } from "../dom.js";
+import { componentWords } from "./curves.js";
 import { secondsText, stampOf } from "./times.js";
 
-const POSE = ["x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21"];
-const POSE_UNITS = ["m", "m", "m", "", "", "", "", "", ""];
 // Value at the full height of a bar: metres, entries of a rotation matrix, radians.
 const FULL = { m: 0.5, "": 1, rad: 2 };
 const BLOCKS = [
-  { name: "left wrist", first: 0, count: 9 },
-  { name: "right wrist", first: 9, count: 9 },
-  { name: "left joints", first: 18, count: 20 },
-  { name: "right joints", first: 38, count: 20 },
-  { name: "head", first: 58, count: 9 },
+  { name: "left wrist", first: 0, count: 9, scale: "±0.5 m, ±1" },
+  { name: "right wrist", first: 9, count: 9, scale: "±0.5 m, ±1" },
+  { name: "left joints", first: 18, count: 20, scale: "±2 rad" },
+  { name: "right joints", first: 38, count: 20, scale: "±2 rad" },
+  { name: "head", first: 58, count: 9, scale: "±0.5 m, ±1" },
 ];
 export const ACTION_SIZE = 67;
-
-export function describe(index) {
-  const block = BLOCKS.find(({ first, count }) => index >= first && index < first + count);
-  const place = index - block.first;
-  return block.count === 9 ? { text: `${block.name} ${POSE[place]}`, unit: POSE_UNITS[place] } : { text: `${block.name} ${place}`, unit: "rad" };
-}
 
 export class ActionPane {
   constructor(root, tracks, onPick) {
@@ -30,6 +23,7 @@ export class ActionPane {
     this.canvas = root.querySelector("canvas");
     this.readout = root.querySelector(".readout");
     this.time = root.querySelector(".own_time");
+    this.words = tracks.measured.stream.components.map(componentWords);
     this.values = {};
     this.hovered = null;
     this.canvas.addEventListener("pointermove", (event) => this.hover(this.indexAt(event)));
@@ -73,9 +67,9 @@ export class ActionPane {
     if (!measured) setText(this.readout, "no sample");
     else if (this.hovered === null) setText(this.readout, "Point at a bar to read it, click to plot it");
     else {
-      const { text, unit } = describe(this.hovered);
+      const { text, unit } = this.words[this.hovered];
       const more = commanded ? `, commanded ${commanded[this.hovered].toFixed(4)}` : "";
-      setText(this.readout, `${this.hovered} · ${text}: ${measured[this.hovered].toFixed(4)}${more} ${unit}`);
+      setText(this.readout, `${text}: ${measured[this.hovered].toFixed(4)}${more} ${unit}`);
     }
   }
 
@@ -85,22 +79,23 @@ export class ActionPane {
     const { context, width, height, scale } = found;
     const bar = width / ACTION_SIZE;
     const label_px = 14 * scale;
-    const middle = (height - label_px) / 2;
+    const middle = height / 2, reach = middle - label_px; // names below, scales above the bars
     const quiet = css("--quiet");
     context.font = `${11 * scale}px system-ui, sans-serif`;
-    BLOCKS.forEach(({ name, first, count }, place) => {
+    BLOCKS.forEach(({ name, first, count, scale: full }, place) => {
       context.fillStyle = css(place % 2 ? "--panel" : "--hand");
       context.fillRect(first * bar, 0, count * bar, height - label_px);
       context.fillStyle = quiet;
       context.textAlign = "center";
       context.fillText(name, (first + count / 2) * bar, height - 3 * scale, count * bar);
+      context.fillText(full, (first + count / 2) * bar, 11 * scale, count * bar);
     });
     const draw = (values, colour, paint) => {
       if (!values) return;
       context.fillStyle = colour;
       values.forEach((value, index) => {
-        const share = Math.min(Math.max(value / FULL[describe(index).unit], -1), 1);
-        if (Number.isFinite(share)) paint(index * bar, -share * (middle - 2 * scale));
+        const share = Math.min(Math.max(value / FULL[this.words[index].unit], -1), 1);
+        if (Number.isFinite(share)) paint(index * bar, -share * (reach - 2 * scale));
       });
     };
     draw(this.values.measured, css("--accent"), (x, size) => context.fillRect(x + 0.15 * bar, middle, 0.7 * bar, size || scale));

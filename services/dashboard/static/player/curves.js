@@ -29,6 +29,22 @@ export function signalParts(name) {
   return dot < 0 ? { stream: name, what: "" } : { stream: name.slice(0, dot), what: name.slice(dot + 1) };
 }
 
+// The name of a value with its unit: "l_thumb_mcp_rad" is "left thumb mcp" in rad.
+export function componentWords(name) {
+  const [, text, unit = ""] = /^(.*?)(?:_(m|rad))?$/.exec(name);
+  return { text: text.replace(/^([lr])_/, (_, side) => (side === "l" ? "left " : "right ")).replace(/[._]/g, " "), unit };
+}
+
+// Title and unit of a signal.
+export function signalWords(name, streams) {
+  const { stream, what } = signalParts(name);
+  const { components, unit } = streams.get(stream);
+  if (what === "interval_ms") return { title: `${stream}, time between samples`, unit: "ms" };
+  if (!components[what]) return { title: name, unit };
+  const words = componentWords(components[what]);
+  return { title: `${stream}: ${words.text}`, unit: words.unit };
+}
+
 export function isSignal(name, streams) {
   const { stream, what } = signalParts(name);
   const found = streams.get(stream);

@@ -1,5 +1,6 @@
 // Selections and edits as the store and the command line name them: steps, seconds, shell words.
 
+import { quote } from "../command.js";
 import { secondsText } from "./times.js";
 
 // Steps of an episode at or after the start of a span and before its end: [first, stop]. The last step
@@ -10,12 +11,8 @@ export function stepsOf([from_ns, to_ns], { num_steps, model_rate_hz }) {
   return [step(from_ns), isWhole ? num_steps : step(to_ns)];
 }
 
-function word(text) {
-  return /^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\"'\"'")}'`;
-}
-
 function command(name, kind, ids, options) {
-  const words = Object.entries(options).flatMap(([key, value]) => (value === undefined || value === null || value === false || value === "" ? [] : value === true ? [`--${key}`] : [`--${key}`, ...[value].flat().map((one) => word(String(one)))]));
+  const words = Object.entries(options).flatMap(([key, value]) => (value === undefined || value === null || value === false || value === "" ? [] : value === true ? [`--${key}`] : [`--${key}`, ...[value].flat().map((one) => quote(String(one)))]));
   return ["dextouch store", name, ...ids, ...(kind === "recording" ? ["--kind recording"] : []), ...words].join(" ");
 }
 

@@ -2,25 +2,16 @@
 // Each edit is first shown as the store would do it, with the command that does the same.
 
 import { post } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
+import { element, find, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { pagePath } from "../session.js";
 import { relabelCommand, spanText, stepsOf, trimCommand } from "./edit_spans.js";
 import { fetchFacts } from "./item.js";
 import { after, stampOf } from "./times.js";
 
 const STORE = "/v1/episode_store";
-const OUTCOMES = ["", "keep", "success", "failure", "unknown"];
+const LABELS = ["task", "instruction", "operator"];
 const NOTE_COLOURS = 4;
-const find = (id) => document.getElementById(id);
-
-function field(name, label, input) {
-  input.name = name;
-  return element("label", {}, `${label} `, input);
-}
-
-function choice(options) {
-  return element("select", {}, ...options.map((one) => element("option", { value: one }, one || "as it is")));
-}
 
 export class Editing {
   constructor(player) {
@@ -28,6 +19,7 @@ export class Editing {
     this.item = player.item;
     this.selection = null;
     this.notes = [];
+    this.asked = 0;
     this.path = `${STORE}/notes/${this.item.path}`;
     const { kind, num_steps } = this.item.about;
     find("open_trim").hidden = kind !== "episode" || !num_steps;
@@ -39,7 +31,9 @@ export class Editing {
     click("open_trim", () => this.openTrim());
     click("open_relabel", () => this.openRelabel());
     this.dialog = find("edit_dialog");
-    this.dialog.addEventListener("close", () => this.dialog.replaceChildren());
+    this.form = find("edit_form");
+    this.fields = this.form.elements;
+    for (const button of this.dialog.querySelectorAll("[data-close]")) button.addEventListener("click", () => this.dialog.close());
     document.addEventListener("keydown", (event) => this.pressed(event));
     this.select(null);
     this.load();
@@ -116,16 +110,15 @@ export class Editing {
   openNote() {
     const at = this.player.clock.t_ns;
     const span = this.selection ?? [at, at];
-    const text = element("textarea", { rows: 3, maxlength: 1000, required: "" });
-    const author = element("input", { maxlength: 128, placeholder: "your pseudonym" });
-    author.value = localStorage.getItem("reviewer") ?? "";
-    this.open("Note", [element("p", { class: "quiet" }, spanText(span)), field("text", "Text", text), field("author", "Author", author)], "Add", async () => {
-      localStorage.setItem("reviewer", author.value);
+    const { text, author } = this.fields;
+    this.open("note", { title: "Note", words: spanText(span), verb: "Add" }, async () => {
+      keep("reviewer", author.value);
       const [start_ns, stop_ns] = span.map((t_ns) => stampOf(t_ns, this.item.zero));
       await post(this.path, { start_ns, stop_ns, text: text.value, author: author.value.trim() || null });
       await this.load();
-      this.dialog.close();
+      return () => this.dialog.close();
     });
+    author.value = kept("reviewer") ?? "";
     text.focus();
   }
 
@@ -135,97 +128,88 @@ export class Editing {
     if (!this.selection) return;
     const { id } = this.item.about;
     const [first, stop] = stepsOf(this.selection, this.item.about);
-    const read = (fields) => ({ outcome: fields.outcome.value, keep: fields.keep.checked });
-    this.openEdit("Trim to selection", [element("p", {}, `${spanText(this.selection)}: steps ${first} to ${stop - 1}`)], {
-      command: (fields) => trimCommand(id, [first, stop], read(fields)),
-      send: async (fields, dry_run) => {
-        const { outcome, keep } = read(fields);
-        const body = { first_step: first, stop_step: stop, outcome: outcome || null, keep, dry_run };
-        return post(`${STORE}/episodes/${encodeURIComponent(id)}/trim`, body);
-      },
+    this.openEdit("trim", { title: "Trim to selection", words: `${spanText(this.selection)}: steps ${first} to ${stop - 1}` }, {
+      command: (how) => trimCommand(id, [first, stop], how),
+      send: (how) => post(`${STORE}/episodes/${encodeURIComponent(id)}/trim`, { first_step: first, stop_step: stop, ...how }),
     });
   }
 
   openRelabel() {
     const { about } = this.item;
-    const inputs = ["task", "instruction", "operator"].map((name) => {
-      const input = element(name === "instruction" ? "textarea" : "input", { rows: name === "instruction" ? 2 : null });
-      input.value = about[name] ?? "";
-      return field(name, name[0].toUpperCase() + name.slice(1), input);
-    });
-    const read = (fields) => {
-      const texts = ["task", "instruction", "operator"].map((name) => [name, fields[name].value.trim()]);
-      const changed = texts.filter(([name, text]) => text !== (about[name] ?? "")).map(([name, text]) => [name, text]);
-      return { ...Object.fromEntries(changed), outcome: fields.outcome.value, keep: fields.keep.checked };
-    };
-    this.openEdit("Relabel", inputs, {
-      command: (fields) => relabelCommand(about, read(fields)),
-      send: async (fields, dry_run) => {
-        const { outcome, ...changes } = read(fields);
-        const body = { items: [{ kind: about.kind, id: about.id }], ...changes, outcome: outcome || null, dry_run };
-        const { edited, refused } = await post(`${STORE}/catalog/relabel`, body);
+    const changed = () => Object.fromEntries(LABELS.map((name) => [name, this.fields[name].value.trim()]).filter(([name, text]) => text !== (about[name] ?? "")));
+    const fill = () => LABELS.forEach((name) => { this.fields[name].value = about[name] ?? ""; });
+    this.openEdit("relabel", { title: "Relabel", words: "", fill }, {
+      command: (how) => relabelCommand(about, { ...changed(), ...how }),
+      send: async (how) => {
+        const { edited, refused } = await post(`${STORE}/catalog/relabel`, { items: [{ kind: about.kind, id: about.id }], ...changed(), ...how });
         if (refused.length) throw new Error(refused[0].reason);
         return edited[0];
       },
     });
   }
 
-  openEdit(title, parts, { command, send }) {
-    const preview = element("div", { class: "preview", role: "status" });
-    const code = element("code", {});
-    const keep = element("input", { type: "checkbox" });
-    const kept = element("label", { class: "check" }, keep, "Keep the source, as superseded");
-    keep.name = "keep";
-    let asked = 0;
-    const { form, apply } = this.open(title, [...parts, field("outcome", "Outcome", choice(OUTCOMES)), kept, preview, element("p", { class: "command" }, code)], title, async () => {
-      this.showResult(await send(form.elements, false));
+  openEdit(kind, about, { command, send }) {
+    const { outcome, keep } = this.fields;
+    const how = (dry_run) => ({ outcome: outcome.value || null, keep: keep.checked, dry_run });
+    const apply = this.open(kind, { ...about, verb: about.title }, async () => {
+      const result = await send(how(false));
+      return () => this.showResult(result);
     });
-    const show = async () => {
-      const number = (asked += 1);
+    this.form.onchange = async () => {
+      const number = (this.asked += 1);
       apply.disabled = true;
-      setText(code, command(form.elements));
-      let lines;
-      try {
-        const result = await send(form.elements, true);
-        lines = [`Becomes ${result.id}; the source is then ${result.source_is}.`, ...result.messages];
-        if (number === asked) apply.disabled = false;
-      } catch (error) {
-        lines = [error.message];
-      }
-      if (number === asked) preview.replaceChildren(...lines.map((line) => element("p", {}, line)));
+      setText(find("edit_command"), command({ outcome: outcome.value, keep: keep.checked }));
+      const result = await send(how(true)).catch((error) => error);
+      // Of another dialog, or of fields that changed since.
+      if (number !== this.asked) return;
+      const isRefused = result instanceof Error;
+      apply.disabled = isRefused;
+      const lines = isRefused ? [result.message] : [`Becomes ${result.id}; the source is then ${result.source_is}.`, ...result.messages];
+      find("edit_preview").replaceChildren(...lines.map((line) => element("p", {}, line)));
     };
-    form.addEventListener("change", show);
-    show();
+    this.form.onchange();
   }
 
   showResult({ kind, id, source_id, source_is }) {
-    const link = element("a", { href: pagePath(`/episodes/${kind}/${encodeURIComponent(id)}`), class: "result" }, id);
-    const undo = source_is === "in the trash" ? `To undo this, delete ${id} and restore ${source_id} from the trash.` : `To undo this, delete ${id}.`;
-    const close = element("button", { type: "button" }, "Close");
-    close.addEventListener("click", () => this.dialog.close());
-    this.dialog.replaceChildren(element("h2", {}, "Done"), element("p", {}, "The new item is ", link, "."), element("p", { class: "quiet" }, undo), close);
+    this.form.hidden = true;
+    find("edit_done").hidden = false;
+    setText(find("edit_result"), id);
+    find("edit_result").href = pagePath(`/episodes/${kind}/${encodeURIComponent(id)}`);
+    setText(find("edit_undo"), `To undo this, delete ${id}${source_is === "in the trash" ? ` and restore ${source_id} from the trash` : ""}.`);
   }
 
-  open(title, parts, verb, act) {
+  // Show the parts of the form that are of this kind; gives the button that applies it. `act` gives what shows its result.
+  open(kind, { title, words, verb, fill = () => {} }, act) {
     this.player.clock.pause();
-    const failure = element("p", { class: "note", "data-level": "ERROR", role: "alert", hidden: "" });
-    const apply = element("button", { class: "primary" }, verb);
-    const cancel = element("button", { type: "button" }, "Cancel");
-    cancel.addEventListener("click", () => this.dialog.close());
-    const form = element("form", { class: "edit_form" }, element("h2", {}, title), ...parts, failure, element("div", { class: "edit_buttons" }, apply, cancel));
-    form.addEventListener("submit", async (event) => {
+    this.form.reset();
+    fill();
+    const apply = this.form.querySelector(".primary");
+    for (const part of this.form.querySelectorAll("fieldset")) part.hidden = part.disabled = !part.dataset.of.split(" ").includes(kind);
+    this.form.hidden = false;
+    find("edit_failure").hidden = find("edit_done").hidden = true;
+    setText(find("edit_title"), title);
+    setText(find("edit_words"), words);
+    setText(apply, verb);
+    apply.disabled = false;
+    find("edit_preview").replaceChildren();
+    this.asked += 1;
+    this.form.onchange = null;
+    const submit = async (event) => {
       event.preventDefault();
       apply.disabled = true;
-      try {
-        await act();
-      } catch (error) {
-        failure.hidden = false;
-        setText(failure, error.message);
-      }
+      this.asked += 1;
+      const fail = (error) => () => {
+        find("edit_failure").hidden = false;
+        setText(find("edit_failure"), error.message);
+      };
+      const showEnd = await act().catch(fail);
+      // The dialogs share one form: this one may show another by now.
+      if (this.form.onsubmit !== submit) return;
+      showEnd();
       apply.disabled = false;
-    });
-    this.dialog.replaceChildren(form);
+    };
+    this.form.onsubmit = submit;
     this.dialog.showModal();
-    return { form, apply };
+    return apply;
   }
 }

@@ -1,19 +1,19 @@
 // Facts about the item: what was done by whom, how it ended, its quality, clocks, lineage and exports.
 
 import { downloadControl } from "../catalog/download.js";
+import { nodeItem } from "../catalog/lineage.js";
 import { commandLine } from "../command.js";
+import { date } from "../dates.js";
 import { element, levelBadge } from "../dom.js";
-import { number } from "../format.js";
-import { pagePath } from "../session.js";
+import { number, plural } from "../format.js";
+import { byStage, worstOf } from "./figures.js";
 import { fetchFacts } from "./item.js";
 
+const OPEN_FIGURES = 6;
 const OUTCOMES = { true: ["OK", "success"], false: ["ERROR", "failure"], null: ["STALE", "not judged"] };
 
 export function outcomeBadge(success) {
-  const [level, text] = OUTCOMES[String(success)];
-  const badge = levelBadge(level);
-  badge.textContent = text;
-  return badge;
+  return levelBadge(...OUTCOMES[String(success)]);
 }
 
 function rows(pairs) {
@@ -46,7 +46,7 @@ function about(item, trace_id) {
     ["Outcome", outcomeBadge(facts.success)],
     ["Domain, origin", `${facts.domain}, ${facts.origin}`],
     ["Station", facts.station],
-    ["Time", facts.at ? new Date(facts.at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" }) : null],
+    ["Time", facts.at ? date(facts.at) : null],
     ["Length", `${((item.stop_ns - item.start_ns) / 1e9).toFixed(3)} s`],
     ["Model steps", facts.num_steps ? `${facts.num_steps} at ${facts.model_rate_hz} Hz` : null],
     ["Trace", trace_id ? element("a", { class: "trace", href: `/episodes?text=${trace_id}` }, trace_id) : null],
@@ -55,18 +55,35 @@ function about(item, trace_id) {
   ]));
 }
 
-function clocks(reports) {
+function clocks(item, reports, onSpan) {
+  const worst = ({ stream }) => worstButton(item.streams.has(stream) ? worstOf(item, `${stream}_interval_ms`) : null, `the clock of ${stream}`, onSpan);
   const lines = reports.map((report) => [report.stream, report.method ?? "unknown", number(report.skew_ppm, 2), number(report.latency_ms, 2),
-    number(report.residual_rms_ms, 3), `${report.num_dropped} of ${report.num_samples}`, report.warnings.join(", ") || "none"]);
-  const heads = ["Stream", "Stamps by", "Skew ppm", "Latency ms", "Residual ms", "Dropped", "Warnings"];
+    number(report.residual_rms_ms, 3), `${report.num_dropped} of ${report.num_samples}`, report.warnings.join(", ") || "none", worst(report)]);
+  const heads = ["Stream", "Stamps by", "Skew ppm", "Latency ms", "Residual ms", "Dropped", "Warnings", "Longest interval"];
   if (!lines.length) return null;
   return wideBlock("Clocks", table(heads, lines));
 }
 
-function quality(figures) {
-  const lines = Object.entries(figures ?? {}).map(([name, value]) => [name, String(Number(value.toPrecision(6)))]);
-  if (!lines.length) return null;
-  return block("Quality", element("details", {}, element("summary", {}, `${lines.length} figures`), table(["Figure", "Value"], lines)));
+// A button that goes to the second in which a figure is worst.
+function worstButton(find, text, onSpan) {
+  if (!find) return null;
+  const button = element("button", { type: "button", class: "plain", "aria-label": `Go to the worst second of ${text}` }, "Go");
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    const span = await find().catch((error) => error);
+    button.disabled = false;
+    if (Array.isArray(span)) onSpan(span);
+    else button.replaceWith(element("span", { class: "quiet" }, span?.message ?? "nowhere"));
+  });
+  return button;
+}
+
+function quality(item, figures, onSpan) {
+  const stages = byStage(figures ?? {});
+  if (!stages.length) return null;
+  return wideBlock("Quality", element("div", { class: "stages" }, ...stages.map(([stage, found]) => element("details", { open: found.length <= OPEN_FIGURES ? "" : null },
+    element("summary", {}, `${stage}: ${plural(found.length, "figure")}`),
+    table(["Figure", "Value", "Worst second"], found.map(({ name, text, value }) => [element("span", { title: name }, text), value, worstButton(worstOf(item, name), text, onSpan)]))))));
 }
 
 function ledger(entries) {
@@ -79,10 +96,7 @@ const RELATIONS = { source: "made from", product: "used in" };
 function lineage(nodes) {
   const others = nodes.filter((node) => node.relation !== "self");
   if (!others.length) return null;
-  const link = ({ kind, id, is_stored }) => (is_stored && ["recording", "episode"].includes(kind)
-    ? element("a", { href: pagePath(`/episodes/${kind}/${encodeURIComponent(id)}`) }, id) : element("span", {}, `${id}${is_stored ? "" : " (not in this store)"}`));
-  return block("Lineage", element("ul", { class: "lineage" },
-    ...others.map((node) => element("li", {}, `${RELATIONS[node.relation]} ${node.kind} `, link(node), node.summary ? element("span", { class: "quiet" }, ` ${node.summary}`) : null))));
+  return block("Lineage", element("ul", { class: "lineage" }, ...others.map((node) => nodeItem(node, RELATIONS[node.relation]))));
 }
 
 function exports({ kind, id }) {
@@ -96,7 +110,8 @@ function exports({ kind, id }) {
     commandLine(`${command("rrd")} && rerun ${id}.rrd`).node);
 }
 
-export async function showFacts(root, item) {
+// `onSpan` shows a span of time, [from_ns, to_ns].
+export async function showFacts(root, item, onSpan) {
   const { kind, id } = item.about;
   const path = `${kind}s/${encodeURIComponent(id)}${kind === "recording" ? "/attributes" : ""}`;
   const [detail, found] = await Promise.all([
@@ -104,6 +119,6 @@ export async function showFacts(root, item) {
     fetchFacts(`/catalog/lineage/${item.path}`).catch(() => ({ nodes: [] })),
   ]);
   const attributes = detail.attributes ?? detail;
-  const blocks = [about(item, attributes.trace_id), lineage(found.nodes), clocks(attributes.clocks ?? []), quality(attributes.quality), ledger(attributes.ledger), exports(item.about)];
+  const blocks = [about(item, attributes.trace_id), lineage(found.nodes), clocks(item, attributes.clocks ?? [], onSpan), quality(item, attributes.quality, onSpan), ledger(attributes.ledger), exports(item.about)];
   root.replaceChildren(...blocks.filter((one) => one));
 }

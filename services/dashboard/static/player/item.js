@@ -1,28 +1,23 @@
 // A recording or episode in the store: its facts and streams, and what is read of them.
 
-import { ask } from "../session.js";
+import { ask, checked } from "../session.js";
 import { unpack } from "../packed.js";
 import { after, allAfter, parseExact, stampOf } from "./times.js";
 
 const STORE = "/v1/episode_store";
 const LATEST_BEGIN_NS = 1e9;
-
-async function answered(path, signal) {
-  const answer = await ask(path, { signal });
-  if (answer.ok) return answer;
-  const problem = await answer.json().catch(() => ({}));
-  throw new Error(problem.detail ?? `${path}: status ${answer.status}`);
-}
+const POSE = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"];
 
 // JSON of one of the store's routes.
 export async function fetchFacts(path) {
-  return parseExact(await (await answered(STORE + path)).text());
+  return parseExact(await (await checked(await ask(STORE + path))).text());
 }
 
 function playedStream(stream, zero) {
   const relative = (stamp) => (stamp === null ? null : after(stamp, zero));
   return {
     ...stream,
+    components: stream.kind === "pose" && stream.shape.join() === "7" ? POSE : stream.components ?? [],
     side: stream.side ?? /_(left|right)$/.exec(stream.name)?.[1] ?? null,
     size: stream.shape.reduce((product, axis) => product * axis, 1),
     period_ns: 1e9 / stream.nominal_rate_hz,
@@ -76,7 +71,7 @@ export class Item {
   }
 
   async read(route, query, signal) {
-    const answer = await answered(`${STORE}${route}?${new URLSearchParams(query)}`, signal);
+    const answer = await checked(await ask(`${STORE}${route}?${new URLSearchParams(query)}`, { signal }));
     return unpack(await answer.arrayBuffer());
   }
 

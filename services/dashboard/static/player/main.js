@@ -1,16 +1,15 @@
 // The player of a recording or an episode: all panes show the moment at one playhead.
 
-import { element, setText } from "../dom.js";
+import { element, find, setText } from "../dom.js";
 import { drawScale } from "../hands.js";
 import { ask } from "../session.js";
-import { startTheme } from "../theme.js";
+import { onTheme } from "../theme.js";
 import { Editing } from "./editing.js";
 import { outcomeBadge, showFacts } from "./facts.js";
 import { Item } from "./item.js";
 import { Player } from "./player.js";
 import { parseState } from "./url_state.js";
 
-const find = (id) => document.getElementById(id);
 
 function showTitle({ about }) {
   document.title = `${about.id} · ${document.title}`;
@@ -28,13 +27,16 @@ async function open() {
   const isRaw = item.ofKind("tactile").some((stream) => stream.unit !== "kPa");
   setText(find("scale_end"), isRaw ? "largest count" : `${heatmap.full_scale_kpa} kPa`);
   const player = new Player(item, heatmap, parseState(location.search));
-  showFacts(find("facts"), item);
-  new Editing(player);
+  const editing = new Editing(player);
+  showFacts(find("facts"), item, (span) => {
+    editing.select(span);
+    player.seek(span[0]);
+  });
   return player;
 }
 
 let player = null;
-startTheme(find("theme"), () => player?.recolour());
+onTheme(() => player?.recolour());
 try {
   player = await open();
   find("player").hidden = find("deck").hidden = false;

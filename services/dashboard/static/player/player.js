@@ -1,11 +1,11 @@
 // Panes, timeline, plots and keys around one playhead.
 
-import { element, setText } from "../dom.js";
+import { element, find, setText } from "../dom.js";
 import { withLayout } from "../layouts.js";
 import { pagePath } from "../session.js";
 import { ActionPane, ACTION_SIZE } from "./action_pane.js";
 import { CameraPane } from "./camera_pane.js";
-import { isSignal, signalParts } from "./curves.js";
+import { componentWords, isSignal, signalParts } from "./curves.js";
 import { FetchQueue } from "./fetch_queue.js";
 import { Item } from "./item.js";
 import { PlayClock, SPEEDS } from "./play_clock.js";
@@ -25,7 +25,15 @@ const STEP_NS = 1e9;
 const URL_MS = 400;
 const RETRY_MS = 1000;
 const ACTIONS = { measured: "action", commanded: "action_commanded" };
-const find = (id) => document.getElementById(id);
+
+// A box that is checked while its value is in a set, or is not (`isIn`).
+function bind(box, set, isIn, onChange) {
+  box.checked = set.has(box.value) === isIn;
+  box.addEventListener("change", () => {
+    set[box.checked === isIn ? "add" : "delete"](box.value);
+    onChange();
+  });
+}
 
 export class Player {
   constructor(item, heatmap, state) {
@@ -80,7 +88,7 @@ export class Player {
     const poses = item.ofKind("pose").filter((stream) => stream.shape.at(-1) === 7).map(samples);
     const keypoints = item.ofKind("keypoints").filter((stream) => stream.shape.at(-1) === 3).map(samples);
     find("space").hidden = !(poses.length + keypoints.length + robots.length);
-    this.space = new SpacePane(find("space"), { poses, keypoints, robots }, { hidden: this.hidden, view: state.view, onChange: () => this.noteUrl() });
+    this.space = new SpacePane(find("space"), { poses, keypoints, robots }, { hidden: this.hidden, view: state.view, bones: this.heatmap.bones, onChange: () => this.noteUrl() });
     for (const box of find("layers").querySelectorAll("input")) {
       const has = box.value === "measured_hands" ? keypoints.length : robots.some((track) => track.action_kind === box.value);
       box.closest("label").hidden = !has;
@@ -91,12 +99,7 @@ export class Player {
 
   choice(name, set, onChange) {
     const box = element("input", { type: "checkbox", value: name });
-    box.checked = set.has(name);
-    box.addEventListener("change", () => {
-      if (box.checked) set.add(name);
-      else set.delete(name);
-      onChange();
-    });
+    bind(box, set, true, onChange);
     return element("label", { class: "check" }, box, name);
   }
 
@@ -190,17 +193,11 @@ export class Player {
       this.plots.setRaw(null);
       this.noteUrl();
     });
-    for (const box of find("layers").querySelectorAll("input")) {
-      box.checked = !this.hidden.has(box.value);
-      box.addEventListener("change", () => {
-        if (box.checked) this.hidden.delete(box.value);
-        else this.hidden.add(box.value);
-        this.noteUrl();
-        this.request();
-      });
-    }
+    for (const box of find("layers").querySelectorAll("input")) bind(box, this.hidden, false, () => { this.noteUrl(); this.request(); });
     const stream = find("signal_stream");
     stream.append(...[...this.item.streams.keys()].map((name) => element("option", { value: name }, name)));
+    stream.addEventListener("change", () => this.listValues(stream.value));
+    this.listValues(stream.value);
     find("signal_form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.submitSignal(stream.value, find("signal_value").value.trim());
@@ -212,11 +209,21 @@ export class Player {
     }, RETRY_MS);
   }
 
+  // Values that can be plotted of a stream, by name.
+  listValues(stream) {
+    const { components, kind } = this.item.streams.get(stream);
+    this.named = components.map((name) => componentWords(name).text);
+    find("signal_value").value = "";
+    find("signal_values").replaceChildren(...[...this.named, ...(kind === "image" ? [] : ["sum", "max"]), "interval"].map((value) => element("option", { value })));
+  }
+
   submitSignal(stream, value) {
-    const name = value && value !== "sum" ? `${stream}.${value === "interval" ? "interval_ms" : value}` : stream;
+    const place = this.named.indexOf(value);
+    const what = place >= 0 ? String(place) : value === "interval" ? "interval_ms" : value;
+    const name = what && what !== "sum" ? `${stream}.${what}` : stream;
     const isKnown = isSignal(name, this.item.streams);
     const { size, kind } = this.item.streams.get(stream);
-    const choices = kind === "image" ? "interval" : `sum, max, interval or 0 … ${size - 1}`;
+    const choices = kind === "image" ? "interval" : `${this.named.length ? "a name of the list, " : ""}sum, max, interval or 0 … ${size - 1}`;
     setText(find("signal_note"), isKnown ? "" : `${stream}: got “${value}”, expected ${choices}`);
     if (isKnown) this.addSignal(name);
   }
@@ -235,7 +242,7 @@ export class Player {
     const act = event.key in jumps
       ? () => (event.shiftKey ? this.seek(this.clock.t_ns + jumps[event.key] * STEP_NS) : this.step(jumps[event.key]))
       : Object.hasOwn(acts, event.key) ? acts[event.key] : null;
-    if (!act || (event.key === " " && event.target.closest("input, summary"))) return;
+    if (!act || (event.key === " " && event.target.closest("button, input, summary"))) return;
     event.preventDefault();
     act();
   }

@@ -4,12 +4,13 @@
 import { css } from "../canvas.js";
 import { element, setText } from "../dom.js";
 import uPlot from "../vendor/uplot/uPlot.esm.js";
-import { binCentres, signalParts, withGaps } from "./curves.js";
+import { binCentres, signalParts, signalWords, withGaps } from "./curves.js";
 
 const HEIGHT_PX = 110;
 const MAX_POINTS = 2000;
 const MAX_PER_REQUEST = 16;
 const DELAY_MS = 120;
+const FONT = "11px system-ui";
 
 function sizeOf(root, name) {
   return parseFloat(getComputedStyle(root).getPropertyValue(name));
@@ -45,12 +46,13 @@ export class Plots {
 
   made(name) {
     const note = element("span", { class: "plot_note" });
-    const remove = element("button", { type: "button", class: "plain", title: `Remove the plot of ${name}`, "aria-label": `Remove ${name}` }, "×");
+    const { title } = signalWords(name, this.item.streams);
+    const remove = element("button", { type: "button", class: "plain", title: `Remove the plot of ${title}`, "aria-label": `Remove ${title}` }, "×");
     remove.addEventListener("click", () => this.onRemove(name));
     const head = element("div", { class: "playhead" });
     const body = element("div", { class: "plot_body" });
     const root = element("div", { class: "plot", "data-signal": name, "data-state": "loading" },
-      element("p", { class: "plot_title" }, element("span", { class: "name" }, name), note, remove), body, element("div", { class: "over" }, head));
+      element("p", { class: "plot_title" }, element("span", { class: "name" }, title), note, remove), body, element("div", { class: "over" }, head));
     return { name, root, body, head, note, chart: null };
   }
 
@@ -118,11 +120,6 @@ export class Plots {
     }
   }
 
-  unitOf(item, name) {
-    const { stream, what } = signalParts(name);
-    return what === "interval_ms" ? "ms" : item.streams.get(stream).unit;
-  }
-
   draw(plot, { span, points, own, raw, reason }) {
     const { stream } = signalParts(plot.name);
     const bin_ns = (span.stop_ns - span.start_ns) / points;
@@ -130,12 +127,12 @@ export class Plots {
       const { period_ns } = item.streams.get(stream);
       return [withGaps(low, bin_ns, period_ns), withGaps(high, bin_ns, period_ns)];
     };
-    const unit = this.unitOf(this.item, plot.name);
-    const raw_unit = raw ? this.unitOf(this.raw, plot.name) : "";
+    const { unit } = signalWords(plot.name, this.item.streams);
+    const raw_unit = raw ? signalWords(plot.name, this.raw.streams).unit : "";
     const data = [binCentres(span.start_ns, span.stop_ns, points), ...curves(own, this.item), ...(raw ? curves(raw, this.raw) : [])];
     if (!plot.chart || plot.has_raw !== Boolean(raw)) {
       plot.chart?.destroy();
-      plot.chart = this.chart(plot, data, { has_raw: Boolean(raw), has_own_scale: unit !== raw_unit });
+      plot.chart = this.chart(plot, data, { has_raw: Boolean(raw), has_own_scale: unit !== raw_unit, unit, raw_unit });
       plot.has_raw = Boolean(raw);
     }
     plot.chart.setData(data, false);
@@ -146,10 +143,10 @@ export class Plots {
     setText(plot.note, reason ? `${unit} (raw: ${reason})` : what);
   }
 
-  chart(plot, data, { has_raw, has_own_scale }) {
+  chart(plot, data, { has_raw, has_own_scale, unit, raw_unit }) {
     const curve = (colour, scale, width = 1.25) => ({ scale, stroke: () => css(colour), width, points: { show: false }, spanGaps: false });
     const raw_scale = has_own_scale ? "raw" : "y";
-    const axis = (more) => ({ stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", ...more });
+    const axis = (axis_unit, gutter, more) => ({ values: (_, splits) => splits.map((value) => `${Number(value.toPrecision(6))} ${axis_unit}`), size: sizeOf(this.root, gutter), font: FONT, stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, ...more });
     const right = has_raw && has_own_scale;
     const chart = new uPlot({
       width: this.root.clientWidth,
@@ -159,9 +156,9 @@ export class Plots {
       cursor: { drag: { x: false, y: false }, points: { show: false } },
       scales: { x: { time: false, auto: false }, y: {}, ...(right ? { raw: {} } : {}) },
       axes: [
-        axis({ show: true, size: 0, values: () => [] }),
-        axis({ scale: "y", size: sizeOf(this.root, "--gutter_left") }),
-        ...(right ? [axis({ scale: "raw", side: 1, grid: { show: false }, size: sizeOf(this.root, "--gutter_right") })] : []),
+        axis("", "--gutter_left", { size: 0, values: () => [] }),
+        axis(unit, "--gutter_left", { scale: "y" }),
+        ...(right ? [axis(raw_unit, "--gutter_right", { scale: "raw", side: 1, grid: { show: false } })] : []),
       ],
       series: [{}, curve("--accent", "y"), curve("--accent", "y"),
         ...(has_raw ? [curve("--quiet", raw_scale), curve("--quiet", raw_scale)] : [])],

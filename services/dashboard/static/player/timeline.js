@@ -2,10 +2,13 @@
 // keys, zoomed by wheel and buttons. `range` is the visible part, in nanoseconds of the player.
 
 import { element, setText } from "../dom.js";
+import { keep, kept } from "../kept.js";
 import { clockText, secondsText, ticks, tickText } from "./times.js";
 
 const SHORTEST_RANGE_NS = 1e7;
 const PX_PER_TICK = 110;
+// Where a lane a stream would hide what is played.
+const SMALL = matchMedia("(max-height: 900px), (max-width: 1020px)");
 
 function place(node, from, to) {
   node.style.left = `${100 * from}%`;
@@ -21,6 +24,14 @@ function gapText(stream) {
   return `${stream.num_gaps} gap${stream.num_gaps > 1 ? "s" : ""} ≤ ${longest_s.toFixed(2)} s`;
 }
 
+// All streams as one lane, which stands for theirs while they are folded.
+function together(streams) {
+  const known = streams.filter(({ first_ns }) => first_ns !== null);
+  const sum = (name) => streams.reduce((total, stream) => total + stream[name], 0);
+  return { name: "", label: `${streams.length} streams`, members: streams, num_samples: sum("num_samples"), num_gaps: sum("num_gaps"), gaps_ns: streams.flatMap(({ gaps_ns }) => gaps_ns), interpolated: streams.flatMap(({ interpolated }) => interpolated),
+    first_ns: known.length ? Math.min(...known.map(({ first_ns }) => first_ns)) : null, last_ns: Math.max(...known.map(({ last_ns }) => last_ns)) };
+}
+
 export class Timeline {
   constructor(root, item, { range, onSeek, onRange }) {
     this.root = root;
@@ -32,32 +43,43 @@ export class Timeline {
     this.head = element("div", { class: "playhead" });
     this.over = element("div", { class: "over" }, this.head);
     this.marks = [];
-    this.lanes = [...item.streams.values()].map((stream) => this.lane(stream));
-    root.append(element("div", { class: "lane ruler_row" }, element("span", { class: "lane_name" }), this.ruler, element("span", { class: "lane_note" })),
+    const streams = [...item.streams.values()];
+    this.lanes = [together(streams), ...streams].map((stream) => this.lane(stream));
+    this.fold = element("button", { type: "button", class: "plain lane_name", title: "One line for all streams, or one for each" });
+    // Beside the slider: a slider cannot have controls in it.
+    root.before(this.fold);
+    root.append(element("div", { class: "lane ruler_row" }, element("span"), this.ruler, element("span", { class: "lane_note" })),
       element("div", { class: "lanes" }, ...this.lanes.map(({ row }) => row)), this.over);
     this.listen();
+    this.setFolded((kept("timeline") ?? (SMALL.matches ? "folded" : "open")) === "folded");
     this.setRange(range ?? this.bounds);
   }
 
   lane(stream) {
     const extent = element("i", { class: "extent" });
-    const gaps = stream.gaps_ns.map((gap_ns) => ({
-      gap_ns,
-      node: element("i", { class: "gap", title: `${stream.name}: no sample from ${secondsText(gap_ns[0])} to ${secondsText(gap_ns[1])} s` }),
-    }));
-    for (const { part, span_ns } of stream.interpolated) {
-      const title = `${part}: interpolated from ${secondsText(span_ns[0])} to ${secondsText(span_ns[1])} s`;
-      gaps.push({ gap_ns: span_ns, node: element("i", { class: "gap interpolated", title }) });
-    }
+    const mark = (gap_ns, kind, words) => ({ gap_ns, node: element("i", { class: kind, title: `${words} from ${secondsText(gap_ns[0])} to ${secondsText(gap_ns[1])} s` }) });
+    const gaps = (stream.members ?? [stream]).flatMap((one) => [...one.gaps_ns.map((gap_ns) => mark(gap_ns, "gap", `${one.name}: no sample`)),
+      ...one.interpolated.map(({ part, span_ns }) => mark(span_ns, "gap interpolated", `${part}: interpolated`))]);
     const shown = stream.num_gaps > gaps.length ? `; the ${gaps.length} longest are marked` : "";
     const note = element("span", { class: "lane_note", title: `${stream.num_samples} samples, ${stream.num_gaps} gaps${shown}` }, gapText(stream));
     const row = element("div", { class: "lane", "data-stream": stream.name },
-      element("span", { class: "lane_name", title: stream.name }, stream.name),
+      element("span", { class: "lane_name", title: stream.name }, stream.label ?? stream.name),
       element("span", { class: "lane_bar" }, extent, ...gaps.map(({ node }) => node)), note);
     return { stream, row, extent, gaps };
   }
 
+  setFolded(isFolded) {
+    this.root.classList.toggle("folded", isFolded);
+    setText(this.fold, `${isFolded ? "▸" : "▾"} Streams`);
+    this.fold.setAttribute("aria-expanded", String(!isFolded));
+  }
+
   listen() {
+    this.fold.addEventListener("click", () => {
+      const isFolded = !this.root.classList.contains("folded");
+      this.setFolded(isFolded);
+      keep("timeline", isFolded ? "folded" : "open");
+    });
     const at = (event) => {
       const box = this.over.getBoundingClientRect();
       return this.range[0] + ((event.clientX - box.left) / Math.max(box.width, 1)) * (this.range[1] - this.range[0]);

@@ -1,7 +1,8 @@
 // The audit log: newest entries first, of one action or person if asked for.
 
 import { get } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
+import { date } from "../dates.js";
+import { element, repeat, say } from "../dom.js";
 import { plural } from "../format.js";
 import { result } from "./figures.js";
 
@@ -12,7 +13,7 @@ const MAX_SHOWN = 1000;
 function row(entry) {
   const words = result(entry.status);
   return element("tr", { title: entry.request_id ? `request ${entry.request_id}` : null },
-    element("td", {}, new Date(entry.at).toLocaleString("en-GB")),
+    element("td", {}, date(entry.at)),
     element("td", { class: "name" }, entry.person),
     element("td", {}, entry.action),
     element("td", { class: "target", title: entry.target }, element("span", {}, entry.target || "–")),
@@ -53,11 +54,7 @@ export class AuditTable {
       this.limit = Math.min(this.limit + STEP, MAX_SHOWN);
       this.refresh();
     });
-    const tick = async () => {
-      if (!document.hidden) await this.refresh();
-      setTimeout(tick, PERIOD_MS);
-    };
-    tick();
+    repeat(() => this.refresh(), PERIOD_MS);
   }
 
   async refresh() {
@@ -68,19 +65,12 @@ export class AuditTable {
       const page = await get(`/v1/audit?${query}`);
       if (number === this.asked) this.show(page);
     } catch (error) {
-      this.say(`Audit log: ${error.message}`, "ERROR");
+      say(this.find("audit_note"), `Audit log: ${error.message}`, "ERROR");
     }
   }
 
-  say(text, level) {
-    const note = this.find("audit_note");
-    if (level) note.dataset.level = level;
-    else note.removeAttribute("data-level");
-    setText(note, text);
-  }
-
   show(page) {
-    this.say(notes(page), page.num_lost ? "ERROR" : page.num_damaged || page.folder === null ? "WARN" : null);
+    say(this.find("audit_note"), notes(page), page.num_lost ? "ERROR" : page.num_damaged || page.folder === null ? "WARN" : null);
     const actions = this.filters.elements.action;
     if (actions.options.length === 1) actions.append(...page.actions.map((one) => element("option", {}, one)));
     const known = this.people.size;

@@ -1,23 +1,10 @@
 // Figures of the system page as words, without DOM.
 
-import { number } from "../format.js";
+import { bytes, number } from "../format.js";
 
 const MISSING = "–";
-const UNITS = ["B", "kB", "MB", "GB", "TB", "PB"];
 // A slower change is not the recorder's.
 const STILL_BYTES_PER_S = 1000;
-
-export function bytes(value) {
-  if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
-  let unit = 0;
-  let shown = value;
-  // As it is rounded: 999.6 MB is 1.0 GB.
-  while (unit < UNITS.length - 1 && Number(Math.abs(shown).toFixed(0)) >= 1000) {
-    shown /= 1000;
-    unit += 1;
-  }
-  return `${shown.toFixed(unit < 2 || shown >= 100 ? 0 : 1)} ${UNITS[unit]}`;
-}
 
 // "measuring" while the disk has been watched for too short a time.
 export function filling(rate) {

@@ -1,10 +1,10 @@
 // Alignments that wait or run, which can be cancelled in two steps, and studies that run.
 
 import { get, getIfServed, post } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
+import { element, levelBadge, repeat, say, setText, why } from "../dom.js";
 import { age } from "../format.js";
 import { pagePath } from "../session.js";
-import { badge, progress, why } from "../study_parts.js";
+import { progress } from "../study_parts.js";
 import { twoStep } from "./two_step.js";
 
 const PERIOD_MS = 2000;
@@ -29,22 +29,12 @@ export class Jobs {
   }
 
   start() {
-    const tick = async () => {
-      if (!document.hidden) await this.refresh();
-      setTimeout(tick, PERIOD_MS);
-    };
-    tick();
+    repeat(() => this.refresh(), PERIOD_MS);
   }
 
   showStudies(studies) {
     this.studies = studies.filter((one) => one.is_running);
     this.draw();
-  }
-
-  say(text, level = null) {
-    if (level === null) this.note.removeAttribute("data-level");
-    else this.note.dataset.level = level;
-    setText(this.note, text);
   }
 
   async refresh() {
@@ -56,7 +46,7 @@ export class Jobs {
       this.numHidden = running.num_matching + waiting.num_matching - this.alignments.length;
       this.draw();
     } catch (error) {
-      this.say(`Alignments: ${error.message}`, "ERROR");
+      say(this.note, `Alignments: ${error.message}`, "ERROR");
     }
   }
 
@@ -64,10 +54,10 @@ export class Jobs {
     const path = `/v1/alignment/alignments/${encodeURIComponent(job.alignment_id)}`;
     try {
       await post(`${path}/cancel`, {});
-      this.say(`Alignment of ${job.recording_id} cancelled.`);
+      say(this.note, `Alignment of ${job.recording_id} cancelled.`);
     } catch (error) {
       const now = await get(path).catch(() => null);
-      this.say(`Alignment of ${job.recording_id}: ${error.message}${now ? ` (it is ${now.state})` : ""}`, "ERROR");
+      say(this.note, `Alignment of ${job.recording_id}: ${error.message}${now ? ` (it is ${now.state})` : ""}`, "ERROR");
     }
     await this.refresh();
   }
@@ -85,7 +75,7 @@ export class Jobs {
       element("td", {}, "alignment"), element("td"), element("td", { class: "free" }), element("td", { class: "number" }),
       element("td", { class: "act" }, twoStep("Cancel", () => this.cancel(job)))]);
     const running = job.state === "running";
-    row.cells[0].replaceChildren(badge({ level: running ? "OK" : "STALE", word: job.state }));
+    row.cells[0].replaceChildren(levelBadge(running ? "OK" : "STALE", job.state));
     row.cells[3].replaceChildren(running ? share(job.progress) : "–");
     setText(row.cells[4], [job.stage, job.stream, job.attempts > 1 ? `attempt ${job.attempts}` : null].filter(Boolean).join(" · "));
     setText(row.cells[5], age(job.eta_s));
@@ -94,7 +84,7 @@ export class Jobs {
 
   studyRow(study) {
     const row = this.row(`study ${study.name}`, () => [
-      element("td", {}, badge({ level: "OK", word: "running" })),
+      element("td", {}, levelBadge("OK", "running")),
       element("td", { class: "name" }, element("a", { href: pagePath(`/studies/${encodeURIComponent(study.name)}`) }, study.title || study.name),
         study.title && study.title !== study.name ? why(study.name) : null),
       element("td", {}, "study"), element("td"), element("td", { class: "free" }), element("td", { class: "number" }, "–"), element("td")]);

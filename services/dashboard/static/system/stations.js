@@ -1,8 +1,8 @@
 // Station keys: enrolled stations, a one-time token for another one, and revocation in two steps.
 
 import { getIfServed, post } from "../catalog/api.js";
-import { element, setText } from "../dom.js";
-import { badge } from "../study_parts.js";
+import { date } from "../dates.js";
+import { element, levelBadge, repeat, say, setText } from "../dom.js";
 import { newestOf, since } from "./figures.js";
 import { twoStep } from "./two_step.js";
 
@@ -10,8 +10,6 @@ const PERIOD_MS = 5000;
 const PATH = "/v1/episode_store/enrolments";
 const LEVELS = { waiting: "WARN", expired: "STALE", enrolled: "OK", revoked: "STALE" };
 const NEEDLESS = "The store has no API keys, so stations upload without one. Set api_keys before enrolling stations.";
-
-const local = (at) => new Date(at).toLocaleString("en-GB", { dateStyle: "short", timeStyle: "short" });
 
 export class StationKeys {
   constructor(find) {
@@ -29,11 +27,7 @@ export class StationKeys {
     });
     this.find("enrol_copy").addEventListener("click", () => this.copy());
     this.find("enrol_done").addEventListener("click", () => this.forget());
-    const tick = async () => {
-      if (!document.hidden) await this.refresh();
-      setTimeout(tick, PERIOD_MS);
-    };
-    tick();
+    repeat(() => this.refresh(), PERIOD_MS);
   }
 
   // Under which address the dashboard reaches the store, which may be another one for stations.
@@ -48,13 +42,6 @@ export class StationKeys {
     if (isOpen) this.form.elements.station.focus();
   }
 
-  say(text, level = null) {
-    const note = this.find("stations_note");
-    if (level === null) note.removeAttribute("data-level");
-    else note.dataset.level = level;
-    setText(note, text);
-  }
-
   async enrol() {
     const station = this.form.elements.station.value.trim();
     const url = this.form.elements.url.value.trim().replace(/\/+$/, "");
@@ -63,16 +50,16 @@ export class StationKeys {
     try {
       const { token, expires_at } = await post(PATH, { station });
       this.waitsFor = station;
-      setText(this.find("enrol_text"), `Run this on ${station} before ${new Date(expires_at).toLocaleTimeString("en-GB", { timeStyle: "short" })}. `
+      setText(this.find("enrol_text"), `Run this on ${station} before ${date(expires_at, "minute")}. `
         + "It works once, and is not shown again.");
       setText(this.find("enrol_command"), `dextouch station enrol ${url} ${token}`);
       setText(this.find("enrol_copy"), "Copy");
       this.find("enrol_shown").hidden = false;
       this.open(false);
       this.form.elements.station.value = "";
-      this.say("");
+      say(this.find("stations_note"), "");
     } catch (error) {
-      this.say(`Station ${station}: ${error.message}`, "ERROR");
+      say(this.find("stations_note"), `Station ${station}: ${error.message}`, "ERROR");
     } finally {
       button.disabled = false;
     }
@@ -101,9 +88,9 @@ export class StationKeys {
   async revoke(station) {
     try {
       await post(`${PATH}/${encodeURIComponent(station)}/revoke`, {});
-      this.say(`The key of ${station} is revoked: its takes wait in its spool.`);
+      say(this.find("stations_note"), `The key of ${station} is revoked: its takes wait in its spool.`);
     } catch (error) {
-      this.say(`Station ${station}: ${error.message}`, "ERROR");
+      say(this.find("stations_note"), `Station ${station}: ${error.message}`, "ERROR");
     }
     await this.refresh();
   }
@@ -115,7 +102,7 @@ export class StationKeys {
       if (listed !== null) this.show(listed);
     } catch (error) {
       this.find("stations").hidden = false;
-      this.say(`Station keys: ${error.message}`, "ERROR");
+      say(this.find("stations_note"), `Station keys: ${error.message}`, "ERROR");
     }
   }
 
@@ -127,7 +114,7 @@ export class StationKeys {
     const used = newest.find((one) => one.station === this.waitsFor && one.state === "enrolled");
     if (used) {
       this.forget();
-      this.say(`${used.station} is enrolled.`);
+      say(this.find("stations_note"), `${used.station} is enrolled.`);
     }
     const rows = newest.map((one) => this.row(one));
     for (const [key, row] of this.rows) if (!rows.includes(row)) this.rows.delete(key);
@@ -141,9 +128,9 @@ export class StationKeys {
     if (!this.rows.has(key)) {
       const isValid = ["waiting", "enrolled"].includes(one.state);
       this.rows.set(key, element("tr", { "data-station": one.station },
-        element("td", {}, badge({ level: LEVELS[one.state], word: one.state })),
+        element("td", {}, levelBadge(LEVELS[one.state], one.state)),
         element("td", { class: "name" }, one.station),
-        element("td", {}, local(since(one))),
+        element("td", {}, date(since(one))),
         element("td", { class: "address" }, one.enrolled_from || "–"),
         element("td", {}, one.requested_by),
         element("td", {}, one.revoked_by || "–"),

@@ -1,16 +1,13 @@
 // The page System: state of services, disks and queues; jobs and the audit log have files of their own.
 
-import { element, levelBadge, setText, showChildren } from "../dom.js";
-import { age, count, plural } from "../format.js";
+import { element, find, levelBadge, setText, showChildren, why } from "../dom.js";
+import { age, bytes, count, plural } from "../format.js";
 import { LiveLink } from "../live.js";
-import { badge, why } from "../study_parts.js";
-import { startTheme } from "../theme.js";
 import { AuditTable } from "./audit_table.js";
-import { bytes, cpu, filling, latency, retention } from "./figures.js";
+import { cpu, filling, latency, retention } from "./figures.js";
 import { Jobs } from "./jobs.js";
 import { StationKeys } from "./stations.js";
 
-const find = (id) => document.getElementById(id);
 const LEVELS = { ready: "OK", waiting: "WARN", down: "ERROR" };
 
 function number(text) {
@@ -27,7 +24,7 @@ function serviceRow(service, own) {
   const mark = service.shares_process ? " *" : "";
   const reason = service.state === "waiting" ? `waiting for ${service.waiting_for.join(", ")}` : service.problem;
   return element("tr", { "data-service": service.name, "data-level": service.state === "ready" ? null : LEVELS[service.state] },
-    element("td", {}, badge({ level: LEVELS[service.state], word: service.state })),
+    element("td", {}, levelBadge(LEVELS[service.state], service.state)),
     element("td", { class: "name" }, service.name, why(reason)),
     versionCell(service, own),
     number(age(service.uptime_s)), number(latency(service.latency_s)),
@@ -38,7 +35,7 @@ function serviceRow(service, own) {
 
 function diskRow(disk) {
   return element("tr", { "data-level": disk.level === "OK" ? null : disk.level },
-    element("td", {}, badge({ level: disk.level, word: disk.level === "OK" ? "OK" : "low" })),
+    element("td", {}, levelBadge(disk.level, disk.level === "OK" ? "OK" : "low")),
     element("td", { class: "name" }, disk.name), number(bytes(disk.free_bytes)),
     element("td", { class: "number", title: disk.fill_bytes_per_s === null ? null : `over the last ${age(disk.span_s)}` }, filling(disk.fill_bytes_per_s)),
     number(age(disk.left_s)));
@@ -83,13 +80,9 @@ const link = new LiveLink({
     if (topic === "system") show(data);
     if (topic === "studies") jobs.showStudies(data.studies);
   },
-  onBinary: () => {},
-  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
 });
 link.show("system", true);
 link.show("studies", true);
-document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => {});
 jobs.start();
 stations.start();
 new AuditTable(find).start();

@@ -1,6 +1,8 @@
 // The rating page: plays a rollout, takes marks by mouse or keyboard, and asks for the next one.
 
-const at = (id) => document.getElementById(id);
+import { actionOf, showKeys } from "./keys.js";
+import { at, attempt, request } from "./request.js";
+
 let rater = null;
 let key = "";
 let shown = null;
@@ -10,28 +12,8 @@ let step = 0;
 let playing = true;
 let lastDraw = 0;
 
-async function request(path, options = {}) {
-  const headers = { ...(options.headers ?? {}) };
-  if (key) headers.authorization = `Bearer ${key}`;
-  const answer = await fetch(path, { ...options, headers });
-  if (!answer.ok) {
-    const problem = await answer.json().catch(() => ({}));
-    throw new Error(problem.detail ?? `${answer.status} ${answer.statusText}`);
-  }
-  return answer;
-}
-
-async function attempt(work) {
-  at("problem").textContent = "";
-  try {
-    await work();
-  } catch (error) {
-    at("problem").textContent = error.message;
-  }
-}
-
 async function next() {
-  const answer = await request(`/v1/rating/next?rater=${encodeURIComponent(rater)}`);
+  const answer = await request(`next?rater=${encodeURIComponent(rater)}`, { key });
   if (answer.status === 204) {
     shown = null;
     at("rating").hidden = true;
@@ -58,7 +40,7 @@ async function load(rollout) {
   for (let index = 0; index < rollout.num_steps; index += 1) {
     if (shown !== rollout) return;
     try {
-      const answer = await request(`/v1/rating/rollouts/${rollout.rollout}/steps/${index}.jpg`);
+      const answer = await request(`rollouts/${rollout.rollout}/steps/${index}.jpg`, { key });
       pictures[index] = await createImageBitmap(await answer.blob());
     } catch (error) {
       if (shown === rollout) at("problem").textContent = `step ${index}: ${error.message}`;
@@ -74,8 +56,8 @@ function listCriteria() {
     row.className = "criterion";
     const text = document.createElement("span");
     const hint = document.createElement("kbd");
-    hint.textContent = `${index + 1}`;
-    text.append(hint, ` ${criterion.description}${criterion.latched ? "" : " (at the end)"}`);
+    hint.dataset.action = `${index + 1}`;
+    text.append(index < 9 ? hint : "", ` ${criterion.description}${criterion.latched ? "" : " (at the end)"}`);
     const choice = document.createElement("span");
     choice.className = "choice";
     for (const value of [true, false]) {
@@ -92,6 +74,7 @@ function listCriteria() {
   });
   const legend = at("criteria").firstElementChild;
   at("criteria").replaceChildren(legend, ...rows);
+  showKeys(rows.length);
 }
 
 function set(name, value) {
@@ -150,22 +133,27 @@ async function save(cannotJudge) {
     cannot_judge: cannotJudge,
     comment: at("comment").value,
   };
-  await request("/v1/rating/marks", {
-    method: "POST",
-    headers: { "content-type": "application/json" },
-    body: JSON.stringify(body),
-  });
+  await request("marks", { key, body });
   await next();
 }
 
+async function enter(name, secret) {
+  [rater, key] = [name, secret];
+  await next();
+  at("enter").hidden = true;
+}
+
+// A link of an invitation ends in "#name:secret".
+function enterByLink() {
+  const [, name, secret] = /^#([a-z][a-z0-9_-]*):([\w-]+)$/.exec(location.hash) ?? [];
+  at("enter").hidden = Boolean(name);
+  if (name) void attempt(() => enter(name, secret));
+}
+
+addEventListener("hashchange", enterByLink);
 at("enter").addEventListener("submit", (event) => {
   event.preventDefault();
-  void attempt(async () => {
-    rater = at("rater").value;
-    key = at("key").value;
-    await next();
-    at("enter").hidden = true;
-  });
+  void attempt(() => enter(at("rater").value, at("key").value));
 });
 at("marks").addEventListener("submit", (event) => {
   event.preventDefault();
@@ -177,24 +165,25 @@ at("play").addEventListener("click", () => {
   playing = !playing;
   refresh();
 });
+const BY_KEY = {
+  play: () => at("play").click(),
+  back: () => move(step - 1),
+  forward: () => move(step + 1),
+  inconsistent: () => at("is_inconsistent").click(),
+  cannot: () => at("cannot").click(),
+  save: () => at("save").click(),
+  learned: () => {},
+};
 document.addEventListener("keydown", (event) => {
-  if (!shown || ["INPUT", "TEXTAREA", "SELECT"].includes(event.target.tagName)) {
-    if (event.target.type !== "checkbox" && event.target.type !== "range") return;
-  }
-  if (!shown || event.ctrlKey || event.metaKey || event.altKey) return;
-  const digit = Number(event.key) - 1;
-  if (digit >= 0 && digit < shown.criteria.length) {
-    const { name } = shown.criteria[digit];
-    set(name, !marks[name]);
-  } else if (event.key === " ") {
-    playing = !playing;
-    refresh();
-  } else if (event.key === "ArrowLeft") move(step - 1);
-  else if (event.key === "ArrowRight") move(step + 1);
-  else if (event.key === "i") at("is_inconsistent").checked = !at("is_inconsistent").checked;
-  else if (event.key === "c") at("cannot").click();
-  else if (event.key === "Enter") at("save").click();
-  else return;
+  const { tagName, type } = event.target;
+  const isTyped = ["INPUT", "TEXTAREA", "SELECT"].includes(tagName) && type !== "checkbox" && type !== "range";
+  if (!shown || isTyped || event.ctrlKey || event.metaKey || event.altKey) return;
+  const action = actionOf(event);
+  const criterion = shown.criteria[action - 1];
+  if (criterion) set(criterion.name, !marks[criterion.name]);
+  else if (!BY_KEY[action]) return;
+  else BY_KEY[action]();
   event.preventDefault();
 });
+enterByLink();
 requestAnimationFrame(tick);

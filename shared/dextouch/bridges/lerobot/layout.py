@@ -19,10 +19,10 @@ from dextouch.hands.actions import (
     ACTION_DIM,
     AnchorPoses,
     HandTrajectory,
+    action_names,
     actions_from_poses,
     poses_from_actions,
 )
-from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import ActionKind, EpisodeAttributes
 from dextouch.streams import H264_UNIT
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
@@ -99,20 +99,6 @@ class Sidecar(FrozenModel):
     action_kind: ActionKind
     cameras: dict[str, Literal["remuxed", "encoded"]]
     attributes: EpisodeAttributes
-
-
-def action_names() -> list[str]:
-    """Names of the 67 components of an action or a state, in order.
-
-    A pose is a translation in metres and two columns of the rotation matrix.
-    """
-    rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
-    left, right, head = (
-        [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
-        for name in ("wrist_left", "wrist_right", "camera_head")
-    )
-    joints = [f"{name}_rad" for side in SIDES for name in RobotHand(side).joint_names]
-    return [*left, *right, *joints, *head]
 
 
 def _feature(dtype: str, shape: Sequence[int], names: list[str] | None = None) -> Feature:

@@ -1,4 +1,4 @@
-"""Edits of stored items, each a new item with lineage: trim, relabel, merge of stores."""
+"""Edits of stored items with lineage (trim, relabel, merge of stores), and backups of a store."""
 
 import lazy_loader
 

@@ -1,3 +1,6 @@
+from .backup import BackupReport as BackupReport
+from .backup import back_up as back_up
+from .backup import restore_backup as restore_backup
 from .edits import EditOptions as EditOptions
 from .edits import shifted_notes as shifted_notes
 from .merge import MergeOptions as MergeOptions

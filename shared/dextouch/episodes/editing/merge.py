@@ -9,11 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Literal
 
 from pydantic import BaseModel
 
-from dextouch.episodes.care import DeletionRecords, TakeFacts, open_contents
+from dextouch.episodes.care import Covered, DeletionRecords, TakeFacts, open_contents
 from dextouch.episodes.editing.relabel import with_attributes
 from dextouch.episodes.files import LocalGroup
 from dextouch.episodes.format import (
@@ -178,7 +179,12 @@ class _Merge:
         source, target = self.source, self.target
         reader = source.open_item(kind, name)
         sha256 = reader.content_sha256
-        _check_not_deleted(target, reader)
+        covered = deletion_of(DeletionRecords(target.root), reader.attributes)
+        if covered is not None:
+            raise InvalidInputError(
+                f"{name!r}: it, its recording or its operator was permanently deleted from the "
+                f"target on {covered.deleted_at:%Y-%m-%d}"
+            )
         is_taken = target.exists(name, kind=kind)
         ours = target.open_item(kind, name).content_sha256 if is_taken else None
         remarks = self._remarks(kind, name)
@@ -207,7 +213,7 @@ class _Merge:
             attributes = attributes.model_copy(update=changes)
         if not self.options.dry_run:
             reader.verify()
-            _copy(source, target, reader, attributes, remarks)
+            copy_item(source, target, reader, attributes, remarks)
             copied = target.open_item(kind, new_id).content_sha256
             self._note_results(kind, new_id, copied, remarks)
             if is_taken:
@@ -304,9 +310,8 @@ def _or_these(theirs: ItemNotes, ours: ItemNotes) -> ItemNotes:
     return ours if ours.notes else theirs
 
 
-def _check_not_deleted(target: EpisodeStore, reader: EpisodeReader | RecordingReader) -> None:
-    """Refuse what was permanently deleted from the target, with its operator or its recording."""
-    records, about = DeletionRecords(target.root), reader.attributes
+def deletion_of(records: DeletionRecords, about: Attributes) -> Covered | None:
+    """The permanent deletion that covers an item, its recording or its operator."""
     if isinstance(about, RecordingAttributes):
         takes = [TakeFacts.of(about)]
     else:
@@ -322,23 +327,23 @@ def _check_not_deleted(target: EpisodeStore, reader: EpisodeReader | RecordingRe
             )
             for name in names or [about.episode_id]
         ]
-    for take in takes:
-        covered = records.find(take)
-        if covered is not None:
-            raise InvalidInputError(
-                f"{reader.item_id!r}: it, its recording or its operator was permanently deleted "
-                f"from the target on {covered.deleted_at:%Y-%m-%d}"
-            )
+    return next((found for take in takes if (found := records.find(take)) is not None), None)
 
 
-def _copy(
+def copy_item(
     source: EpisodeStore,
     target: EpisodeStore,
     reader: EpisodeReader | RecordingReader,
-    attributes: Attributes,
-    remarks: Mapping[str, BaseModel | None],
+    attributes: Attributes | None = None,
+    remarks: Mapping[str, BaseModel | None] = MappingProxyType({}),
+    *,
+    replaces: bool = False,
 ) -> None:
-    """Copy a group with what is beside its content, byte for byte unless its attributes change."""
+    """Copy a group with what is beside its content, byte for byte unless its attributes change.
+
+    With `replaces` one of its id is moved to the trash, or deleted in a bucket, once all is copied.
+    """
+    attributes = attributes or reader.attributes
     kind, name = kind_of(attributes), reader.item_id
     files = source.files(name, kind=kind)
     if attributes_id(attributes) == name:
@@ -349,8 +354,10 @@ def _copy(
         raise NotFoundError(f"{kind} {name!r}: was deleted while it was copied")
     # Its streams are files that exist already.
     shell = attributes.model_copy(update={"streams": ()})
-    with target.writer(kind=kind, attributes=shell) as writer:
+    with target.writer(kind=kind, attributes=shell, replaces=replaces) as writer:
         writer.take_files(files, metadata=metadata, commit=commit, link=False)
         for remark, found in remarks.items():
             if found is not None:
                 writer.add_remark(remark, found)
+        if replaces and target.exists(name, kind=kind):
+            target.delete(name, kind=kind)

@@ -313,7 +313,7 @@ async def test_a_take_holds_the_numbers_of_a_bridge(serve, tmp_path):
         ) as client,
     ):
         for step, body in (
-            ("arm", {"task": "stack_bowls", "instruction": "stack the bowls"}),
+            ("arm", {"task": "t", "instruction": "do it", "operator": "p7", "consent": True}),
             ("record", None),
         ):
             answer = await client.post(f"/v1/recorder/{step}", json=body)

@@ -134,13 +134,13 @@ def test_training_resumes_and_continues_from_a_checkpoint_without_the_folder(
         TrainingRun(episodes[:2], settings.model_copy(update={"wan": WanFiles()}))
 
 
-@pytest.mark.parametrize("preset", ["wan22-5b", "wan-tiny"])
+@pytest.mark.parametrize("preset", ["wan22-5b", "wan-tiny", "wan22-5b-lora"])
 def test_presets_name_the_full_size_and_its_miniature(preset):
     given = TrainCommand(preset=preset, episodes="unused")
     assert given.network.video_expert == "wan"
     assert given.network.tactile_tokens == "pad"
     assert given.name == preset
-    full = preset == "wan22-5b"
+    full = preset != "wan-tiny"
     assert (given.network.wan.ffn_width, given.network.num_layers) == (
         (14336, 30) if full else (32, 2)
     )

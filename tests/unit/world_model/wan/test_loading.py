@@ -13,7 +13,8 @@ from dextouch.errors import (
     NonFiniteError,
     NotFoundError,
 )
-from services.networks import weight_files
+from services.networks.weight_files import memory_of
+from services.world_model import pretrained_video
 from services.world_model.network.configuration import WanConfig
 from services.world_model.network.video import empty_autoencoder, empty_transformer
 from services.world_model.pretrained_video import load_weights
@@ -90,7 +91,12 @@ def test_weights_that_do_not_fit_are_refused_before_they_are_read(
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path, max_bytes=needed - 1)
     assert empty.proj_out.weight.is_meta
-    monkeypatch.setattr(weight_files, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(pretrained_video, "available_memory", lambda: needed - 1)
+    with pytest.raises(LimitExceededError, match="GB of memory"):
+        _load(empty, tmp_path)
+    monkeypatch.setattr(pretrained_video, "available_memory", lambda: 2 * needed - 1)
+    # Of several processes on this machine each has its part.
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path)
     _load(empty, tmp_path, max_bytes=needed)
@@ -102,7 +108,7 @@ def test_the_full_size_needs_ten_gigabytes():
     # Two bytes each, and two more for time embedding (256 + 3072 + 2) x 3072, thirty affine norms
     # 2 x 3072, thirty tables 6 x 3072 and the last 2 x 3072.
     kept = (256 + 3072 + 2 + 30 * 2 + 30 * 6 + 2) * 3072
-    assert weight_files.memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
+    assert memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
 
 
 def test_the_published_size_has_its_tensors_and_weights():

@@ -1,17 +1,34 @@
 """The plan of memory and FLOPs, against counts by hand and measurements of real runs."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+from services.networks.weight_files import memory_of
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
-from services.world_model.plan import PeakMemory, plan_of, plan_table
+from services.world_model.paper_settings import LoraSettings, TrainCommand
+from services.world_model.plan import (
+    PeakMemory,
+    _training_plan,
+    plan_of,
+    plan_table,
+    training_plan,
+    training_table,
+)
 from services.world_model.pretrained_video import load_pretrained
 from services.world_model.training.dataset import WindowPosition
+from services.world_model.training.objective import errors, examples_of
+from services.world_model.training.trainer import TrainingRun
+from tests.unit.world_model.wan.test_end_to_end import settings
+from tests.unit.world_model.wan.test_trained_parts import changed
+
+__all__ = ["settings"]
 
 KIB = 1024
 
@@ -58,13 +75,15 @@ def test_a_plan_without_weights_is_what_a_run_measures(
         inputs = build_inputs([_resized(request, config.image_px)], config)
         first = model.first_latents(inputs)
         noise = model.noise(17, torch.Generator().manual_seed(0))
-        context = model.with_clean_tokens(model.context(inputs, first), noise)
+
+        def shared():
+            context = model.context(inputs, first)  # noqa: B023
+            return replace(context, clean=model.clean_tokens(context, noise))  # noqa: B023
+
+        context = shared()
         jobs = {
             "encode the first image": lambda: model.first_latents(inputs),  # noqa: B023
-            "what sampler steps share": lambda: model.with_clean_tokens(  # noqa: B023
-                model.context(inputs, first),  # noqa: B023
-                noise,  # noqa: B023
-            ),
+            "what sampler steps share": shared,
             "one sampler step": lambda: model.denoise(context, noise, torch.ones(1)),  # noqa: B023
             "decode all images": lambda: model.decode(first, noise),  # noqa: B023
         }
@@ -88,9 +107,9 @@ def _resized(request, px):
     return type(request)(**{**vars(request), "first_image": image})
 
 
-def _peak_of_allocator(job):
+def _peak_of_allocator(job, mode=torch.no_grad):
     """Largest sum of allocations less releases that torch's profiler sees."""
-    with torch.no_grad(), profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
+    with mode(), profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
         job()
     now, peak = 0, 0
     events = [e for e in run.profiler.kineto_results.events() if e.name() == "[memory]"]
@@ -126,3 +145,69 @@ def test_the_table_has_both_precisions_of_the_full_size(full_config):
     assert "float32" in table
     assert "bfloat16" in table
     assert "bfloat16" not in plan_table(NetworkConfig())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"recompute": True},
+        {"accumulate": 2},
+        {"recompute": True, "lora": LoraSettings(rank=4)},
+        {"freeze_video": True},
+    ],
+    ids=str,
+)
+def test_a_planned_training_takes_what_the_allocator_sees(settings, large_episode, changes):
+    given = changed(settings, **changes)
+    planned = training_plan(given)
+    run = TrainingRun([large_episode(0)], given)
+    assert planned.weights == memory_of(run.model.state_dict())
+    assert planned.learned == memory_of(run.learned)
+    batch = next(run._batches())
+    run.learn(batch)  # now there are moments and gradients
+    state = [*run.loop.optimizer.state.values()]
+    moments = sum(memory_of({n: t for n, t in one.items() if t.ndim}) for one in state)
+    assert moments + memory_of(run._averages) == planned.copies * planned.learned
+    run.loop.optimizer.zero_grad()
+    num_parts, generator = given.accumulate, torch.Generator().manual_seed(0)
+    examples = examples_of(run.model, batch, generator=generator, num_parts=num_parts)
+
+    def step():
+        for part in examples.parts(num_parts):
+            loss = errors(run.model, part, "float32")
+            torch.autograd.backward(loss.video + loss.tactile)
+
+    with sdpa_kernel(SDPBackend.MATH):
+        measured = _peak_of_allocator(step, torch.enable_grad)
+    assert planned.step == pytest.approx(measured, rel=0.2)
+
+
+@pytest.mark.slow
+def test_plans_of_few_layers_are_those_of_all(settings):
+    wide = changed(settings, recompute=True, lora=LoraSettings(rank=4))
+    for given in (changed(settings), wide):
+        deep = given.model_copy(
+            update={"network": given.network.model_copy(update={"num_layers": 9})}
+        )
+        for count in (1, 2):
+            few, whole = training_plan(deep, count), _training_plan(deep, count, 9)
+            assert replace(few, step=whole.step) == whole
+            assert few.step == pytest.approx(whole.step, rel=0.05)
+
+
+@pytest.mark.slow
+def test_trainings_that_fit_cards_are_named(full_config):
+    full = training_table(TrainCommand(preset="wan22-5b", episodes="unused"), 8)
+    assert "fits 24 GB, in one process: --recompute --network.wan.precision bfloat16 --lora" in full
+    assert "fits 80 GB, in one process: --recompute --network.wan.precision bfloat16\n" in full
+    assert "fits 141 GB, in one process: as given" in full
+    given = TrainCommand(preset="wan22-5b-lora", episodes="unused")
+    lora = training_plan(given)
+    # Adapters of rank 32 beside touch and actions, in float32; all else is frozen.
+    assert lora.learned < 1.5e9
+    assert lora.weights + 4 * lora.learned < lora.peak_bytes < 21e9
+    eight = training_plan(given, 8)
+    shared = (eight.weights - eight.whole + 4 * eight.learned) // 8
+    assert eight.peak_bytes > eight.whole + shared + eight.outer + 3 * eight.layer
+    assert eight.peak_bytes < 8e9

@@ -1,0 +1,162 @@
+"""Policies in two worlds as a picture: imagined over real success, for pages and for papers."""
+
+import io
+from collections.abc import Mapping, Sequence
+from html import escape
+from math import cos, pi, sin
+from typing import Final, Literal, NamedTuple
+
+from PIL import Image, ImageDraw, ImageFont
+
+from services.evaluation.reporting.sections import escape as latex
+
+Format = Literal["svg", "png", "tex"]
+# A success rate with the ends of its interval.
+Rate = tuple[float, float, float]
+# Real and imagined rates of every policy, in the tasks that are shown.
+Pairs = Mapping[str, Sequence[tuple[Rate, Rate]]]
+# Okabe and Ito's colours, which colour-blind readers tell apart; shapes serve prints in gray.
+COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#767676")
+# By their name in pgfplots: corners, angle of the first one and radius in points.
+MARKS: Final = {
+    "*": (24, 0.0, 4.0),
+    "square*": (4, pi / 4, 4.6),
+    "diamond*": (4, 0.0, 5.2),
+    "triangle*": (3, -pi / 2, 5.2),
+}
+# In points; a column of a paper is about as wide.
+LEFT, TOP, SIDE, ROW, WIDTH = 30.0, 38.0, 220.0, 15.0, 260
+INK, QUIET, GRID = "#1b1e24", "#5b6270", "#c9ccd2"
+NAMESPACE: Final = 'xmlns="http://www.w3.org/2000/svg"'
+SHADES: Final = {INK: 1.0, QUIET: 0.7, GRID: 0.25}
+# PNGs have 300 dots an inch, drawn twice as large.
+DOTS, OVERSAMPLING = 300 / 72, 2
+
+
+class _Shape(NamedTuple):
+    """A line, a filled polygon or, with `text`, a text of size `width`; in points from the top."""
+
+    points: Sequence[tuple[float, float]]
+    colour: str
+    width: float = 0.0
+    text: str = ""
+    anchor: Literal["start", "middle", "end"] = "start"
+
+
+def policy_picture(pairs: Pairs, title: str, form: Format) -> bytes:
+    """The picture in one format; policies without rates get neither a mark nor a name."""
+    if form == "tex":
+        return _latex(pairs, title).encode()
+    shapes = _shapes(pairs, title)
+    height = round(TOP + SIDE + 34 + ROW * sum(map(bool, pairs.values())))
+    return _svg(shapes, height).encode() if form == "svg" else _png(shapes, height)
+
+
+def _shapes(pairs: Pairs, title: str) -> list[_Shape]:
+    def at(x: float, y: float) -> tuple[float, float]:
+        return LEFT + SIDE * x, TOP + SIDE * (1 - y)
+
+    bottom = TOP + SIDE
+    shapes = [
+        _Shape([(LEFT, 14.0)], INK, 11.0, title),
+        _Shape([(4.0, 31.0)], INK, 9.0, "imagined success"),
+    ]
+    for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
+        (x, _), (_, y) = at(tick, 0.0), at(0.0, tick)
+        shapes += [
+            _Shape([at(tick, 0.0), at(tick, 1.0)], GRID, 0.6),
+            _Shape([at(0.0, tick), at(1.0, tick)], GRID, 0.6),
+            _Shape([(x, bottom + 12)], QUIET, 8.0, f"{tick:g}", "middle"),
+            _Shape([(LEFT - 5, y + 3)], QUIET, 8.0, f"{tick:g}", "end"),
+        ]
+    shapes.append(_Shape([at(0.0, 0.0), at(1.0, 1.0)], QUIET, 0.8))
+    shapes.append(_Shape([(LEFT + SIDE, bottom + 25)], INK, 9.0, "real success", "end"))
+    row = bottom + 38
+    for index, (name, found) in enumerate(pairs.items()):
+        colour = COLOURS[index % len(COLOURS)]
+        for (x, x_low, x_high), (y, y_low, y_high) in found:
+            shapes.append(_Shape([at(x_low, y), at(x_high, y)], colour, 1.0))
+            shapes.append(_Shape([at(x, y_low), at(x, y_high)], colour, 1.0))
+            shapes.append(_Shape(_corners(index, *at(x, y)), colour))
+        if found:
+            shapes.append(_Shape(_corners(index, LEFT + 5, row), colour))
+            shapes.append(_Shape([(LEFT + 16, row + 3)], INK, 9.0, name))
+            row += ROW
+    return shapes
+
+
+def _corners(index: int, x: float, y: float) -> list[tuple[float, float]]:
+    """The mark of a policy, the same in all pictures of a study."""
+    num, first_rad, radius = list(MARKS.values())[index % len(MARKS)]
+    turns = [first_rad + 2 * pi * k / num for k in range(num)]
+    return [(x + radius * cos(turn), y + radius * sin(turn)) for turn in turns]
+
+
+def _svg(shapes: Sequence[_Shape], height: int) -> str:
+    parts = []
+    for points, colour, width, text, anchor in shapes:
+        # Ink takes the colour of a page that shows the picture.
+        paint = f'currentColor" opacity="{SHADES[colour]:g}"' if colour in SHADES else f'{colour}"'
+        (x, y), corners = points[0], " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
+        if text:
+            parts.append(
+                f'<text x="{x:g}" y="{y:g}" font-size="{width:g}" text-anchor="{anchor}" '
+                f'fill="{paint}>{escape(text)}</text>'
+            )
+        elif width:
+            parts.append(f'<path d="M{corners}" stroke-width="{width:g}" stroke="{paint}/>')
+        else:
+            parts.append(f'<polygon points="{corners}" fill="{paint}/>')
+    return (
+        f'<svg {NAMESPACE} viewBox="0 0 {WIDTH} {height}" fill="none" '
+        f'width="{WIDTH}pt" height="{height}pt" color="{INK}" font-family="sans-serif">'
+        f'<rect class="paper" width="100%" height="100%" fill="#fff"/>{"".join(parts)}</svg>\n'
+    )
+
+
+def _png(shapes: Sequence[_Shape], height: int) -> bytes:
+    scale = DOTS * OVERSAMPLING
+    sheet = Image.new("RGB", (round(WIDTH * scale), round(height * scale)), "white")
+    draw = ImageDraw.Draw(sheet)
+    for points, colour, width, text, anchor in shapes:
+        scaled = [(x * scale, y * scale) for x, y in points]
+        if text:
+            font = ImageFont.load_default(width * scale)
+            place = {"start": "ls", "middle": "ms", "end": "rs"}[anchor]
+            draw.text(scaled[0], text, colour, font, place)
+        elif width:
+            draw.line(scaled, colour, max(1, round(width * scale)))
+        else:
+            draw.polygon(scaled, colour)
+    made = io.BytesIO()
+    smaller = sheet.resize((round(WIDTH * DOTS), round(height * DOTS)), Image.Resampling.LANCZOS)
+    smaller.save(made, "PNG", dpi=(300, 300))
+    return made.getvalue()
+
+
+def _latex(pairs: Pairs, title: str) -> str:
+    lines = [
+        r"% Needs \usepackage{pgfplots} and \pgfplotsset{compat=1.16}.",
+        r"\begin{tikzpicture}",
+        rf"\begin{{axis}}[title={{{latex(title)}}}, xlabel={{real success}},",
+        r"  ylabel={imagined success}, xmin=-0.04, xmax=1.04, ymin=-0.04, ymax=1.04,",
+        r"  width=\linewidth, axis equal image, grid=major, legend pos=outer north east]",
+        r"\addplot[gray, forget plot] coordinates {(0, 0) (1, 1)};",
+    ]
+    for index, (name, found) in enumerate(pairs.items()):
+        if not found:
+            continue
+        colour, mark = COLOURS[index % len(COLOURS)], list(MARKS)[index % len(MARKS)]
+        red, green, blue = bytes.fromhex(colour[1:])
+        lines += [
+            rf"\addplot[only marks, mark={mark}, "
+            rf"color={{rgb,255:red,{red};green,{green};blue,{blue}}}, error bars/.cd,",
+            r"  x dir=both, x explicit, y dir=both, y explicit] coordinates {",
+        ]
+        for (x, x_low, x_high), (y, y_low, y_high) in found:
+            lines.append(
+                f"  ({x:.4f}, {y:.4f}) += ({x_high - x:.4f}, {y_high - y:.4f}) "
+                f"-= ({x - x_low:.4f}, {y - y_low:.4f})"
+            )
+        lines.append(rf"}}; \addlegendentry{{{latex(name)}}}")
+    return "\n".join([*lines, r"\end{axis}", r"\end{tikzpicture}", ""])
