@@ -40,7 +40,7 @@ def serve_people(serve, played):
     """A dashboard of two stations, and the keys of two people."""
     store = serve(create_store(EpisodeStoreSettings(store_url=str(played[0]))))
     keys = [{"name": name, "key": KEYS[name], "scopes": ("operate",)} for name in KEYS]
-    stations = {name: "http://127.0.0.1:9" for name in ("desk_1", "desk_2")}
+    stations = dict.fromkeys(("desk_1", "desk_2"), "http://127.0.0.1:9")
     settings = DashboardSettings(episode_store_url=store, api_keys=keys, stations=stations)
     return serve(create_dashboard(settings))
 
