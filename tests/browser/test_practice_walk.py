@@ -17,7 +17,7 @@ def guided(page, title):
     """Begin the guided run of a row, as it is offered."""
     row = page.locator("#item_rows tr").filter(has_text=title)
     row.get_by_role("button", name="Guided run").click()
-    page.get_by_role("button", name="Begin").click()
+    page.get_by_role("button", name="Begin", exact=True).click()
     return row
 
 
