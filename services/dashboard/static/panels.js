@@ -6,7 +6,7 @@ import { keep, kept } from "./kept.js";
 const main = document.querySelector("main");
 const { person, station, screen } = main.dataset;
 const KEY = `panels ${JSON.stringify([person, station, screen])}`;
-// What says whether something is recorded or played stays.
+// What says whether something is recorded or played, and guided runs, stay as they are.
 const found = [...main.querySelectorAll(".panel[aria-labelledby]:not(.recorder, #begin, #run)")].map((panel) => [panel.getAttribute("aria-labelledby"), panel]);
 const panels = new Map(found.length > 1 ? found : []);
 const nameOf = (panel) => panel.querySelector("h2").textContent || panel.id;
