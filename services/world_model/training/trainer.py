@@ -6,7 +6,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,13 @@ import torch
 from pydantic import JsonValue
 from torch import Tensor
 
-from dextouch.episodes import data_hash, split_by_scene
-from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.schemas import Domain
+from dextouch.episodes import data_hash
+from dextouch.errors import ConflictError
 from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
-from services.world_model.network.configuration import WanFiles, num_latents
+from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel, from_first
 from services.world_model.network.tactile import TactileTokenizer
@@ -36,6 +34,7 @@ from services.world_model.pretrained_video import (
 )
 from services.world_model.training import dataset, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
+from services.world_model.training.episode_split import check_disjoint, load_split
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import (
     LossOptions,
@@ -382,13 +381,9 @@ def train_on(
     if ancestor is not None:
         known_tasks = {*ancestor.metadata.tasks, *checkpoints.learned_tasks(ancestor.metadata.sets)}
     dataset.check_tasks((*trained, *heldout), settings, known_tasks)
-    prints = {episode.fingerprint() for episode in trained}
-    names = {episode.episode_id for episode in trained}
     if ancestor is not None:
         # Episodes that the initial checkpoint was trained on cannot be held out either.
         refuse_trained(heldout, ancestor.metadata.train_fingerprints, "the initial checkpoint")
-        prints |= set(ancestor.metadata.train_fingerprints)
-        names |= set(ancestor.metadata.train_episode_ids)
     run = TrainingRun(trained, settings, processes)
     log = _run_or_resume(run, ancestor, tokenizer, on_progress)
     averaged = run.whole_average()
@@ -397,43 +392,18 @@ def train_on(
     del run
     if averaged is None:
         return None
-    windows = settings.windows
-    dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
-    metadata = checkpoints.CheckpointMetadata(
-        name=settings.name,
-        network=averaged.config,
-        tasks=tuple(sorted({episode.task for episode in trained})),
-        command=command_line(settings),
-        seed=settings.seed,
-        training_steps=budget.step,
-        training_cpu_s=round(budget.cpu_s, 1),
-        train_episode_ids=tuple(sorted(names)),
-        train_fingerprints=tuple(sorted(prints)),
-        data_hash=_data_hash(trained, settings, ancestor),
-        horizon_latents=max(
-            num_latents(max(map(len, trained))) - 1,
-            0 if ancestor is None else ancestor.metadata.horizon_latents,
-        ),
-        heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
-        initialized_from=None if ancestor is None else ancestor.digest,
-        sets=dataset.training_sets(
-            trained,
-            heldout,
-            human_share=settings.share_of_human,
-            image_px=settings.network.image_px,
-            inherited=() if ancestor is None else ancestor.metadata.sets,
-            ancestor=None if ancestor is None else ancestor.digest,
-        ),
-        tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
-        text_dropout=dropped[0],
-        action_dropout=dropped[1],
-    )
+    metadata = _metadata(settings, averaged.config, budget, trained, heldout, ancestor)
+    if tokenizer is not None:
+        metadata = metadata.model_copy(update={"tokenizer_digest": tokenizer.digest})
     checkpoints.write_checkpoint(settings.output, averaged, metadata)
     del averaged
     # Evaluate the weights as stored, then store them again with the results.
     stored = on_device(checkpoints.read_checkpoint(settings.output).model, settings.device)
     metrics = evaluate_prediction(
-        stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride
+        stored,
+        heldout,
+        train_fingerprints=metadata.train_fingerprints,
+        stride=settings.evaluation_stride,
     )
     digest = checkpoints.write_checkpoint(
         settings.output, stored, metadata.model_copy(update={"metrics": metrics})
@@ -451,6 +421,50 @@ def train_on(
         num_heldout_episodes=len(heldout),
         metrics=metrics,
         log=log,
+    )
+
+
+def _metadata(
+    settings: TrainSettings,
+    network: NetworkConfig,
+    budget: optimizer.Budget,
+    trained: Sequence[dataset.TrainingEpisode],
+    heldout: Sequence[dataset.EpisodeArrays],
+    ancestor: checkpoints.Checkpoint | None,
+) -> checkpoints.CheckpointMetadata:
+    """Provenance of a trained model, with that of the checkpoint that it was started from."""
+    before = None if ancestor is None else ancestor.metadata
+    prints = {episode.fingerprint() for episode in trained}
+    names = {episode.episode_id for episode in trained}
+    windows = settings.windows
+    dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
+    return checkpoints.CheckpointMetadata(
+        name=settings.name,
+        network=network,
+        tasks=tuple(sorted({episode.task for episode in trained})),
+        command=command_line(settings),
+        seed=settings.seed,
+        training_steps=budget.step,
+        training_cpu_s=round(budget.cpu_s, 1),
+        train_episode_ids=tuple(sorted(names.union(before.train_episode_ids if before else ()))),
+        train_fingerprints=tuple(sorted(prints.union(before.train_fingerprints if before else ()))),
+        data_hash=_data_hash(trained, settings, ancestor),
+        horizon_latents=max(
+            num_latents(max(map(len, trained))) - 1, before.horizon_latents if before else 0
+        ),
+        heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
+        initialized_from=None if ancestor is None else ancestor.digest,
+        sets=dataset.training_sets(
+            trained,
+            heldout,
+            human_share=settings.share_of_human,
+            image_px=settings.network.image_px,
+            inherited=before.sets if before else (),
+            ancestor=None if ancestor is None else ancestor.digest,
+        ),
+        tokenizer_digest=before.tokenizer_digest if before else None,
+        text_dropout=dropped[0],
+        action_dropout=dropped[1],
     )
 
 
@@ -483,14 +497,6 @@ def _data_hash(
         image_px=settings.network.image_px,
         ancestor=None if ancestor is None else ancestor.metadata.data_hash,
     )
-
-
-def _tokenizer_digest(
-    ancestor: checkpoints.Checkpoint | None, tokenizer: checkpoints.StoredTokenizer | None
-) -> str | None:
-    if tokenizer is not None:
-        return tokenizer.digest
-    return None if ancestor is None else ancestor.metadata.tokenizer_digest
 
 
 def _run_or_resume(
@@ -539,62 +545,3 @@ def _run_or_resume(
 def is_cut_short(settings: TrainSettings, budget: optimizer.Budget) -> bool:
     """Whether time ended a run before its last step, so that `--resume` can go on."""
     return settings.step_limit is not None and budget.step < settings.step_limit
-
-
-def load_split(
-    settings: TrainSettings,
-) -> tuple[Sequence[dataset.TrainingEpisode], list[dataset.EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores; held-out ones are in memory.
-
-    Robot episodes are split before a subset of them is taken, so that every subset has the same
-    held-out episodes. These are never human if human stores are given.
-    """
-    px = settings.network.image_px
-    how = dataset.index_episodes if settings.streaming else dataset.load_episodes
-    read = partial(how, splits=settings.splits, image_px=px)
-    domain: Domain | None = "robot" if settings.human else None
-    trained: Sequence[dataset.TrainingEpisode] = read(settings.episodes, domain=domain)
-    if settings.heldout is not None:
-        heldout = dataset.load_episodes(settings.heldout, domain=domain, image_px=px)
-    else:
-        trained, stored = _split(trained, settings)
-        heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
-    trained = dataset.subset_by_hash(trained, settings.robot_episodes, what="robot")
-    people: list[dataset.TrainingEpisode] = []
-    for url in settings.human if settings.human_episodes != 0 else ():
-        people += read(url, domain="human")
-    together = [*trained, *dataset.subset_by_hash(people, settings.human_episodes, what="human")]
-    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
-    ids = [episode.episode_id for episode in together]
-    dataset.check_stores([settings.episodes, *settings.human], ids, rates_hz)
-    return together, heldout
-
-
-def _split(
-    episodes: Sequence[dataset.E], settings: TrainSettings
-) -> tuple[list[dataset.E], list[dataset.E]]:
-    if settings.tokenizer is None:
-        return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
-    stored = checkpoints.read_tokenizer(settings.tokenizer)
-    return tokenizer_trainer.split_unseen(
-        episodes, stored, heldout_percent=settings.heldout_percent
-    )
-
-
-def check_disjoint(
-    trained: Sequence[dataset.TrainingEpisode], heldout: Sequence[dataset.TrainingEpisode]
-) -> None:
-    """Raise if a held-out episode, or its scene, is also trained on."""
-    prints = {episode.fingerprint() for episode in trained}
-    scenes = {episode.scene for episode in trained}
-    both = [
-        episode.episode_id
-        for episode in heldout
-        if episode.fingerprint() in prints or episode.scene in scenes
-    ]
-    if both:
-        raise InvalidInputError(
-            f"training: {len(both)} held-out episodes are also trained on {both[:3]} (same content "
-            "or same scene); expected disjoint sets",
-            episodes=both,
-        )

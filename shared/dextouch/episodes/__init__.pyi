@@ -50,6 +50,7 @@ from .reader import decode_window as decode_window
 from .reader import encode_window as encode_window
 from .reader import mean_over_ranges as mean_over_ranges
 from .reader import step_ranges as step_ranges
+from .rollout_episode import write_rollout as write_rollout
 from .splits import SPLITS as SPLITS
 from .splits import Split as Split
 from .splits import is_in as is_in
@@ -62,7 +63,6 @@ from .splits import split_of_scene as split_of_scene
 from .stages import DOWNLOADS as DOWNLOADS
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
-from .store import write_rollout as write_rollout
 from .table import TRUE_ORIGINS as TRUE_ORIGINS
 from .table import EpisodeGrid as EpisodeGrid
 from .table import data_hash as data_hash
