@@ -21,18 +21,10 @@ from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.uploader import Uploader
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
+from tests.browser.fake_station import DEVICES
 
 ADVICE = "Close other programs, or set the cameras to smaller or fewer images."
 OVERLOADED = "This computer is overloaded: processors 98 % busy, 5 devices late"
-DEVICES = {
-    "glove_left": ["tactile_left"],
-    "glove_right": ["tactile_right"],
-    "robot": ["joints_measured", "joints_commanded", "wrist_left", "wrist_right"],
-    "tracker_head": ["head"],
-    "camera_head": ["camera_head"],
-    "camera_left": ["camera_wrist_left"],
-    "camera_right": ["camera_wrist_right"],
-}
 SECONDS_SINCE = itertools.count(12)
 LATE = ("tactile_left", "tactile_right", "head", "camera_head", "camera_wrist_left")
 # The colours of the sheet, which rows and small plots must both have.
