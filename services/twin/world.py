@@ -246,5 +246,6 @@ def serve(arguments: list[str]) -> None:
     Raises:
         InvalidInputError: invalid settings.
     """
-    settings = load_settings(TwinServiceSettings, arguments)
-    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin")
+    load = partial(load_settings, TwinServiceSettings, arguments)
+    settings = load()
+    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin", load=load)
