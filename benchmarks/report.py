@@ -57,8 +57,7 @@ def _commit() -> str:
 def refuse_shape_checks() -> None:
     """Refuse to time code with run-time checks of array shapes.
 
-    Raises:
-        ConflictError: the import hook of the tests is active in this process.
+    Raises ConflictError if the import hook of the tests is active in this process.
     """
     if any(type(finder).__module__.startswith("jaxtyping") for finder in sys.meta_path):
         raise ConflictError(

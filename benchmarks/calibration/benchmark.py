@@ -164,8 +164,7 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
 def score(method: Method, scene: Scene) -> Solved:
     """Time (of this thread's processor) and error of one method on one scene.
 
-    Raises:
-        InvalidInputError: the method refuses the scene, or gives no finite mount.
+    Raises InvalidInputError if the method refuses the scene, or gives no finite mount.
     """
     begun_s = time.thread_time()
     answer = method.solve(scene)
@@ -195,10 +194,8 @@ def not_worse_share(
 ) -> tuple[float, float]:
     """Share of seeds with an error of at most the rival's plus a tolerance in our sigmas.
 
-    Returns the share by rotation and that by translation.
-
-    Raises:
-        InvalidInputError: ours has no sigma.
+    Returns the share by rotation and that by translation. Raises InvalidInputError if ours has no
+    sigma.
     """
     if ours.sigma_deg is None or ours.sigma_mm is None:
         raise InvalidInputError(f"{ours.name}: has no sigma to define the tolerance")

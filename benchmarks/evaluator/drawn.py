@@ -21,10 +21,8 @@ from services.evaluation.statistics import Counts, Interval, central_interval, s
 def interval_of_draws(figures: np.ndarray) -> Interval | None:
     """95 % percentile interval of figures [draws] of a bootstrap that are defined, thus not NaN.
 
-    Returns None where more than half are undefined.
-
-    Raises:
-        ShapeError: not one axis with at least one draw.
+    Returns None where more than half are undefined. Raises ShapeError for not one axis with at
+    least one draw.
     """
     if figures.ndim != 1 or len(figures) == 0:
         raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")

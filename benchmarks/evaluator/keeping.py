@@ -58,11 +58,7 @@ class KeptRows:
         return self._rows.get(row_key(about))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Write rows.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Write rows; raises StorageError if the file cannot be written."""
         new = [row for row in rows if row_key(row) not in self._rows]
         text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in new)
         try:
@@ -103,8 +99,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read arrays written by `write_arrays`.
 
-    Raises:
-        CorruptDataError: a file that is not one of ours.
+    Raises CorruptDataError for a file that is not one of ours.
     """
     try:
         with np.load(path, allow_pickle=False) as kept:
@@ -154,8 +149,7 @@ def read_lines(path: Path) -> Earlier:
 def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
     """Difference of each figure that both runs have, with its tolerance.
 
-    Raises:
-        InvalidInputError: no line in common.
+    Raises InvalidInputError without a line in common.
     """
     if not any((line.task, line.what) in earlier for line in lines):
         raise InvalidInputError(

@@ -309,11 +309,7 @@ def policy_figures(
 
 
 def kind_of(one: Rolled) -> str:
-    """The kind of mistake of a rollout.
-
-    Raises:
-        ValueError: a policy without a mistake.
-    """
+    """The kind of mistake of a rollout; raises ValueError for a policy without a mistake."""
     mistake = mistake_of(one.policy)
     if mistake is None:
         raise ValueError(f"got policy {one.policy!r}, expected one with a mistake")

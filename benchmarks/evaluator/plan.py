@@ -104,11 +104,7 @@ class ClonedPolicy:
 
     @classmethod
     def parse(cls, text: str) -> "ClonedPolicy":
-        """A policy from NAME=PATH.
-
-        Raises:
-            InvalidInputError: other text, or no such file.
-        """
+        """A policy from NAME=PATH; raises InvalidInputError for other text, or no such file."""
         name, _, path = text.partition("=")
         if not name or not Path(path).is_file():
             raise InvalidInputError(f"--cloned: got {text!r}, expected NAME=PATH of a checkpoint")
@@ -131,8 +127,7 @@ class OutsidePolicy:
     def parse(cls, text: str) -> "OutsidePolicy":
         """A policy from [NAME=]MODULE:FACTORY.
 
-        Raises:
-            InvalidInputError, NotFoundError, UnknownNameError: it does not load.
+        Raises InvalidInputError, NotFoundError or UnknownNameError if it does not load.
         """
         source = PolicySource.parse(text)
         source.load({})

@@ -216,8 +216,7 @@ def _finite(value: float) -> float | None:
 def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Page]:
     """Tables of an experiment whose steps are done.
 
-    Raises:
-        NotFoundError: the result of a step is missing.
+    Raises NotFoundError if the result of a step is missing.
     """
     makers: dict[Table, Callable[[Path, Experiments], list[Page]]] = {
         "tokenizer": _tokenizer_pages,

@@ -274,8 +274,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
     """The rivals of `--rivals` that are installed, and those that are not.
 
-    Raises:
-        UnknownNameError: a rival that there is not.
+    Raises UnknownNameError for a rival that there is not.
     """
     wanted = list(RIVALS.values())
     if words is not None:

@@ -165,10 +165,8 @@ def set_up(
     """Create a retargeter for the robot hand of one side, with its references.
 
     Keypoints are [T, 25, 3] in wrist coordinates, `scale` is the size of the robot's hand relative
-    to the tracked one, the folder is for the URDF.
-
-    Raises:
-        UnavailableError: its library is not installed.
+    to the tracked one, the folder is for the URDF. Raises UnavailableError if its library is not
+    installed.
     """
     missing = missing_modules(rival)
     if missing:

@@ -242,8 +242,7 @@ class Crowd(NamedTuple):
 def crowd(url: str, world: str, num_rollouts: int, num_chunks: int) -> Crowd:
     """Advance rollouts of a world at the same time; the first chunk of each is not counted.
 
-    Raises:
-        TimeoutError: not done after a minute.
+    Raises TimeoutError if they are not done after a minute.
     """
 
     async def limited() -> Crowd:

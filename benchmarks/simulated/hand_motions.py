@@ -141,10 +141,8 @@ def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> M
     """Robot hand motion: a sum of sines of 0.15 to 1.6 Hz per joint, collision-free.
 
     At least 2 samples at 60 Hz; natural: within the usual range of hands, otherwise the joints'
-    whole range.
-
-    Raises:
-        LimitExceededError: no motion of this seed is slow enough and collision-free.
+    whole range. Raises LimitExceededError if no motion of this seed is slow enough and
+    collision-free.
     """
     hand = twin_hand(side, "robot")
     rng = np.random.default_rng([seed, int(natural), int(side == "right")])
@@ -458,8 +456,7 @@ def people(side: Side, seed: int) -> list[Person]:
 def pinch_motion(person: Person, side: Side) -> PinchMotion:
     """Four consecutive pinches: closing, holding while the tips roll, opening; 440 samples.
 
-    Raises:
-        LimitExceededError: this hand cannot bring a pair of tips together within its limits.
+    Raises LimitExceededError if this hand cannot bring a pair of tips together within its limits.
     """
     relaxed = np.array(_RELAXED_RAD)
     parts = []

@@ -65,10 +65,8 @@ class StandardStreams:
     def flush(self) -> None:
         """Write what waits in buffers.
 
-        Not left to the end of the process, where a failure would be a traceback.
-
-        Raises:
-            OSError: it cannot be written, or something before could not.
+        Not left to the end of the process, where a failure would be a traceback. Raises OSError if
+        it cannot be written, or something before could not.
         """
         for stream in (sys.stdout, sys.stderr):
             stream.flush()

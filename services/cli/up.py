@@ -42,8 +42,7 @@ MAX_TOLD_BYTES: Final = 1000
 def ports_of_up() -> dict[str, int]:
     """Port of each service that `dextouch up` starts, from the environment and dextouch.toml.
 
-    Raises:
-        InvalidInputError: invalid settings.
+    Raises InvalidInputError for invalid settings.
     """
     settings = load_settings(UpSettings, [])
     wanted = _wanted(settings)

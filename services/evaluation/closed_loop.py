@@ -115,8 +115,7 @@ def begin_matched(
 ) -> list[MatchedStart | FailedStart]:
     """Start every task and seed once in the real world.
 
-    Raises:
-        ConflictError: a start was trained on.
+    Raises ConflictError if a start was trained on.
     """
     starts = [
         matched_start(real, task, seed, instruction)
@@ -216,8 +215,7 @@ class RolloutRunner:
     def _begin(self, start: MatchedStart, policy: str, world: str, repeat: int) -> Rollout:
         """Start a rollout from a matched start (by task and seed in the real world).
 
-        Raises:
-            ConflictError: the real world started differently than before.
+        Raises ConflictError if the real world started differently than before.
         """
         address = self.worlds.addresses[world]
         client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras), name=policy)
@@ -315,11 +313,7 @@ class ResultLog:
         self._study = datetime.now(UTC).isoformat(timespec="milliseconds")
 
     def keep(self, outcome: RolloutScore | RolloutFailure) -> None:
-        """Append one row.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Append one row; raises StorageError if the file cannot be written."""
         row = {"study": self._study, **asdict(outcome)}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

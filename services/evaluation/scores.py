@@ -113,10 +113,8 @@ class ClosedLoopReport:
         """Success (1 or 0) of every policy from every start; NaN for failed rollouts.
 
         Rollouts that were repeated count with their share of successes. Undecided ones count with
-        the likelier outcome, or not at all if `only_decided`.
-
-        Raises:
-            InvalidInputError: policies have different starts.
+        the likelier outcome, or not at all if `only_decided`. Raises InvalidInputError if policies
+        have different starts.
         """
         scores: dict[tuple[str, int], list[RolloutScore]] = {}
         for score in self._of(world, task):

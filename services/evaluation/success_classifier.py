@@ -282,8 +282,7 @@ class Verdict:
 class SuccessClassifier:
     """A trained probe.
 
-    Raises:
-        InvalidInputError: the weights do not match the shape in the metadata.
+    Raises InvalidInputError if the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:

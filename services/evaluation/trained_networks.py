@@ -97,8 +97,7 @@ def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
 def load_network(network: nn.Module, checkpoint: Checkpoint) -> None:
     """Load the weights of a checkpoint into its network, for inference.
 
-    Raises:
-        InvalidInputError: missing or unexpected tensors, or wrong shapes.
+    Raises InvalidInputError for missing or unexpected tensors, or wrong shapes.
     """
     where = f"checkpoint of {checkpoint.metadata.kind}"
     load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)

@@ -74,11 +74,7 @@ class Stages:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the demo.
-
-    Returns:
-        0 if every stage ran, whatever the figures in the report.
-    """
+    """Run the demo; returns 0 if every stage ran, whatever the figures in the report."""
     plan = demo_plan(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
     # More threads slow down small networks beside busy services.

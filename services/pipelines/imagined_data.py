@@ -54,8 +54,7 @@ def chosen_episodes(
 ) -> list[EpisodeAttributes]:
     """True robot episodes of these tasks and seeds that can be imagined; None takes all.
 
-    Raises:
-        NotFoundError: there is none.
+    Raises NotFoundError if there is none.
     """
     in_seeds = needs.Need(
         "of other seeds",
@@ -180,8 +179,7 @@ def generate_main(arguments: Sequence[str]) -> int:
 def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """Ids of the robot episodes to imagine, spread evenly over tasks.
 
-    Raises:
-        NotFoundError: there is none.
+    Raises NotFoundError if there is none.
     """
     chosen = chosen_episodes(
         store,
@@ -201,11 +199,7 @@ def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str
 def refuse_trained_episodes(
     store: EpisodeStore, wanted: Sequence[str], checkpoint: Path, *, command: str
 ) -> None:
-    """Refuse episodes that the world model was trained on.
-
-    Raises:
-        ConflictError: there is one.
-    """
+    """Refuse episodes that the world model was trained on; raises ConflictError if there is one."""
     if is_state_checkpoint(checkpoint):
         metadata = read_state_checkpoint(checkpoint).metadata
         trained = [

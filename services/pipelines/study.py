@@ -57,11 +57,7 @@ _CHILD = "services.pipelines.study_world"
 
 
 def main(arguments: list[str]) -> int:
-    """Run `dextouch study COMMAND`.
-
-    Returns:
-        0, or 1 if a rollout failed or has no result yet.
-    """
+    """Run `dextouch study COMMAND`; returns 0, or 1 if a rollout failed or has no result yet."""
     options = study_parser().parse_args(arguments)
     if options.word == "report":
         return _finish(StudyResults.read(options.folder), options.json)
@@ -143,8 +139,7 @@ def _run_on_cluster(
 ) -> None:
     """Run rollouts on the machines of a Ray cluster, which see the study's files.
 
-    Raises:
-        DexTouchError: a block of rollouts failed; those of the others are kept.
+    Raises DexTouchError if a block of rollouts failed; those of the others are kept.
     """
     blocks = blocks_of(definition, missing, results.header, store_url)
     folders = [results.path.parent, *(EpisodeStore(store_url).folders if store_url else ())]
@@ -297,10 +292,8 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
 def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
     """Refuse starts whose task and seed a state model was trained on.
 
-    Content digests miss them where image size or simulator changed since.
-
-    Raises:
-        ConflictError: a start was trained on.
+    Content digests miss them where image size or simulator changed since. Raises ConflictError if a
+    start was trained on.
     """
     metadata = read_state_checkpoint(checkpoint).metadata
     for task in tasks:
@@ -317,8 +310,7 @@ def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Seq
 def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> ReplayPolicy:
     """The twin's demonstrator, planned for all starts without simulation.
 
-    Raises:
-        UnknownNameError: no such script or task.
+    Raises UnknownNameError for an unknown script or task.
     """
     return ReplayPolicy(
         {

@@ -249,8 +249,7 @@ def make_training_data(
         Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
         or the take could not be aligned), and of those made, how many `succeeded`.
 
-    Raises:
-        InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
+    Raises InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
     """
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(

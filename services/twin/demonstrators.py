@@ -132,8 +132,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
     """Commands of a whole take: smoothstep between waypoints, constant before and after them.
 
-    Raises:
-        InvalidInputError: times that do not increase.
+    Raises InvalidInputError for times that do not increase.
     """
     times = np.array([waypoint.time_s for waypoint in waypoints])
     if len(times) < 2 or (np.diff(times) <= 0).any():

@@ -173,11 +173,7 @@ def _attributes(
 
 
 def write_episode(store: EpisodeStore, episode: TruthEpisode) -> str:
-    """Write an episode to a store and return its id.
-
-    Raises:
-        ConflictError: the id exists.
-    """
+    """Write an episode to a store and return its id; raises ConflictError if the id exists."""
     with store.writer(kind="episode", attributes=episode.attributes) as writer:
         for name, stream in episode.streams.items():
             writer.add_stream(stream.descriptor)

@@ -101,10 +101,8 @@ _HUMAN_SHAPE: Final = HandShape(
 class HumanHand(HandModel):
     """A human hand with the robot's kinematic tree and joint order, but human bones and limits.
 
-    `fingers` are a person's finger tables, thumb first; by default those of average size.
-
-    Raises:
-        UnknownNameError: any other side.
+    `fingers` are a person's finger tables, thumb first; by default those of average size. Raises
+    UnknownNameError for any other side.
     """
 
     def __init__(self, side: str, fingers: Sequence[FingerTable] | None = None) -> None:
@@ -177,11 +175,7 @@ class TwinHand:
 
 @lru_cache(maxsize=4)
 def twin_hand(side: Side, domain: Domain) -> TwinHand:
-    """The hand of one side and domain.
-
-    Raises:
-        UnknownNameError: unknown side or domain.
-    """
+    """The hand of one side and domain; raises UnknownNameError for unknown side or domain."""
     if domain not in DOMAINS:
         raise UnknownNameError("domain", domain, list(DOMAINS))
     kinematics: HandModel = RobotHand(side) if domain == "robot" else HumanHand(side)

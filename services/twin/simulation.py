@@ -101,10 +101,8 @@ class Simulation:
         """Simulate one grid interval, moving the command linearly to `target`.
 
         Yields the index of every physics step; poses are current at each step, everything else
-        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE.
-
-        Raises:
-            InvalidInputError: the physics diverged.
+        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE. Raises InvalidInputError
+        if the physics diverged.
         """
         poses, joints_rad = self._interpolated(target)
         for pose, joints in zip(poses, joints_rad, strict=True):

@@ -117,10 +117,7 @@ def read_cloning_episode(
     """Read one robot episode that has what is `IMITATED`.
 
     Only images at decision steps are decoded, and the middle square of larger ones is scaled to
-    `image_px`.
-
-    Raises:
-        InvalidInputError: the outcome is unknown.
+    `image_px`. Raises InvalidInputError if the outcome is unknown.
     """
     grid, about = EpisodeGrid(reader, image_px), reader.attributes
     steps = range(0, len(grid), DECISION_STRIDE)
@@ -154,10 +151,8 @@ def read_cloning_episodes(
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
     `tasks` and `splits` of scenes are empty for all; the middle square of larger images is scaled
-    to `image_px`. With `imagined`, imagined episodes are read instead of true ones.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    to `image_px`. With `imagined`, imagined episodes are read instead of true ones. Raises
+    NotFoundError and ConflictError as `select_episodes`.
     """
     origins: Collection[Origin] = ("imagined",) if imagined else TRUE_ORIGINS
     readers = select_episodes(
@@ -212,10 +207,8 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     """Samples at every eighth step of successful episodes, once as measured and once as imagined.
 
     An imagined world measures no joints and returns the given actions, so each sample is also
-    trained on with the commanded pose in place of the measured one.
-
-    Raises:
-        InvalidInputError: no successful episode is long enough, or image sizes differ.
+    trained on with the commanded pose in place of the measured one. Raises InvalidInputError if no
+    successful episode is long enough, or image sizes differ.
     """
     wanted = [item for item in episodes if item.success and item.decisions()]
     if not wanted:

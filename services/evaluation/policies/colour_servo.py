@@ -147,11 +147,7 @@ class ColourServo:
         self._gave_up = False
 
     def reset(self, start: PolicyStart) -> None:
-        """Start a new rollout.
-
-        Raises:
-            UnknownNameError: a task whose colours are not known.
-        """
+        """Start a new rollout; raises UnknownNameError for a task whose colours are not known."""
         if start.task not in _PLANS:
             raise UnknownNameError("task of the colour servo", start.task, list(_PLANS))
         self._start, self._place_m, self._sent, self._gave_up = start, None, None, False

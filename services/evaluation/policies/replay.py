@@ -58,8 +58,7 @@ class ReplayPolicy:
     def reset(self, start: PolicyStart) -> None:
         """Select the episode of this task and seed.
 
-        Raises:
-            NotFoundError: there is no such episode.
+        Raises NotFoundError if there is no such episode.
         """
         key = (start.task, start.seed)
         if key not in self._actions:

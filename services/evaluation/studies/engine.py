@@ -154,8 +154,7 @@ class _Workers:
     def run(self, cells: Sequence[PlannedRollout], keep: Callable[[Outcome], None]) -> None:
         """Run rollouts; `keep` is called with each outcome.
 
-        Raises:
-            UnavailableError: a world stopped answering.
+        Raises UnavailableError if a world stopped answering.
         """
         by_world: dict[str, list[PlannedRollout]] = {}
         for cell in cells:

@@ -158,8 +158,7 @@ class StudyDefinition(FrozenModel):
 def read_definition(path: Path) -> StudyDefinition:
     """Read a study file.
 
-    Raises:
-        InvalidInputError: it cannot be read, or does not define a study; all problems are listed.
+    Raises InvalidInputError, with all problems, if it cannot be read or defines no study.
     """
     try:
         fields = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -300,8 +299,7 @@ class StudyResults:
     def keep(self, outcome: Outcome) -> None:
         """Append an outcome; it is on the disk when this returns.
 
-        Raises:
-            StorageError: the file cannot be written.
+        Raises StorageError if the file cannot be written.
         """
         try:
             with self.path.open("ab") as file:

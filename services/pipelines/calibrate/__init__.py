@@ -180,8 +180,7 @@ _COMMANDS = {
 def main(argv: Sequence[str]) -> int:
     """Run one calibration, or show the existing ones.
 
-    Returns:
-        0; for `show` 1 if something is missing or wrong (level ERROR).
+    Returns 0; for `show` 1 if something is missing or wrong (level ERROR).
     """
     options = _parser().parse_args(list(argv))
     module, _, function = _COMMANDS[options.word][2].partition(":")

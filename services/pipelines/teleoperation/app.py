@@ -227,11 +227,7 @@ def _sample(value: object, keypoints_m: np.ndarray | None) -> HandSample:
 
 
 def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
-    """Routes of `/v1/teleop/{side}`.
-
-    Raises:
-        InvalidInputError: the calibration cannot be read.
-    """
+    """Routes of `/v1/teleop/{side}`; raises InvalidInputError if the calibration cannot be read."""
     router = APIRouter(prefix="/v1/teleop", tags=["teleoperation"])
     calibration = load_calibration(settings.calibration)
     # Name of the controller's key, and the hand that it controls.

@@ -229,11 +229,9 @@ class HandFollower:
     def check_person(self) -> None:
         """Check unit, side and axes of the first samples, and measure the person; takes 50 ms.
 
-        From then on samples are followed. It may run in another thread than the commands.
-
-        Raises:
-            InvalidInputError: they are not this hand in metres and in the wrist's axes, or do not
-                show every finger; the next samples are checked instead.
+        From then on samples are followed. It may run in another thread than the commands. Raises
+        InvalidInputError if they are not this hand in metres and in the wrist's axes, or do not
+        show every finger; the next samples are checked instead.
         """
         keypoints_m, self._checked = np.stack(self._checked), []
         keypoints_m = hand_axes_check(keypoints_m, self._side, self._calibration)

@@ -58,8 +58,7 @@ class ChildProcess:
     def receive(self) -> dict[str, Any]:
         """Wait for the next response.
 
-        Raises:
-            UnavailableError: the process ended; `details` has its `exit_status`.
+        Raises UnavailableError if the process ended; `details` has its `exit_status`.
         """
         assert self._process.stdout is not None  # noqa: S101 - it is a pipe
         line = self._process.stdout.readline()

@@ -141,10 +141,8 @@ def run_workers(
     """Serve with several processes until SIGINT or SIGTERM.
 
     uvicorn replaces workers that end or hang; on SIGHUP it replaces all, one after another, each
-    once its successor serves. `create_app` is pickled, and called in every worker.
-
-    Raises:
-        UnavailableError: a worker could not start.
+    once its successor serves. `create_app` is pickled, and called in every worker. Raises
+    UnavailableError if a worker could not start.
     """
     config = uvicorn.Config(
         partial(_in_worker, create_app),

@@ -153,8 +153,7 @@ class ReconstructingWorld(World[State], Protocol[State]):
     ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode head images and touch of 1 + 4k consecutive steps.
 
-        Returns:
-            Images and touch of the steps after the first.
+        Returns images and touch of the steps after the first.
         """
         ...
 
