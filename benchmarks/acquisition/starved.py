@@ -195,15 +195,15 @@ def send_both(path: str, master: int, seconds: float) -> None:
     points_m = rng.uniform(-0.1, 0.1, (1, NUM_KEYPOINTS, 3))
     stream = ReplayStream(keypoints_descriptor("left"), np.zeros(1, np.int64), points_m)
     source = FingerTrackerSource(stream, side="left", rng=rng)
-    asked = threading.Event()
+    requested = threading.Event()
 
     def answer(report: bytes) -> list[bytes]:
-        asked.set()
+        requested.set()
         return source.answer(report)
 
     hid = SocketHid(path, answer)
     print("ready", flush=True)
-    while not asked.is_set():
+    while not requested.is_set():
         hid.listen(1.0)
     sent = {"fingers": 0, "glove": 0}
     start_s = time.monotonic() + SETTLE_S

@@ -295,12 +295,12 @@ def _what_it_does(method: Method, scenes: list[Scene]) -> str:
         except InvalidInputError:
             continue
     silent = len(scenes) - len(solved)
-    told = f"no answer in {silent} of {len(scenes)}" if silent else ""
+    unanswered = f"no answer in {silent} of {len(scenes)}" if silent else ""
     if not solved:
-        return told
+        return unanswered
     degrees = np.median([one.error_deg for one in solved])
     millimetres = np.median([one.error_mm for one in solved])
-    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {told}" if told else "")
+    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {unanswered}" if unanswered else "")
 
 
 def _repeating(num_views: int) -> Maker:
@@ -499,15 +499,15 @@ def _mount(ours: MethodResult) -> list[Requirement]:
 
 def notes(results: Results) -> list[str]:
     """Notes on results that the requirements do not show."""
-    told = []
+    texts = []
     for name in (OURS, OURS_POSES, OURS_SIZE_KNOWN):
         rotation, translation = not_worse_share(results[name], results[PARK], tolerance_sigmas=0.0)
-        told.append(
+        texts.append(
             f"{name}: without tolerance its error is at most Park's in {rotation:.0%} of the seeds "
             f"(rotation) and {translation:.0%} (translation). Both use the same noisy data, so "
             "even the better estimator does not have the smaller error in every seed."
         )
-    return told
+    return texts
 
 
 AMOUNTS = Amounts(

@@ -161,11 +161,11 @@ def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
         other = earlier.get((line.task, line.what))
         if other is None or other.value is None or other.unit not in TOLERANCES:
             continue
-        apart = None if line.value is None else abs(line.value - other.value)
+        difference = None if line.value is None else abs(line.value - other.value)
         what = f"{line.task}: {line.what}, apart from {other.value:.3f} before"
         sampling = math.hypot(_half_width(line.interval), _half_width(other.interval))
         bound = max(TOLERANCES[other.unit], sampling)
-        found.append(at_most(what, apart, bound, line.unit))
+        found.append(at_most(what, difference, bound, line.unit))
     return found
 
 

@@ -165,8 +165,8 @@ def trained_seeds(
     Raises:
         InvalidInputError: several judges, but not one for each world; or no world or judge.
     """
-    asked = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
-    for what, paths, least in asked:
+    options = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
+    for what, paths, least in options:
         if not worlds or not (least <= len(paths) <= 1 or len(paths) == len(worlds)):
             raise InvalidInputError(
                 f"evaluator: got {len(paths)} {what} for {len(worlds)} --world, expected one for "

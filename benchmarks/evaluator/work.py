@@ -299,8 +299,8 @@ class PolicyRollout:
         row = self._started.observation.action_reached[-1]
         path = self._path("held_still", self._twin.description.digest)
         if not path.is_file():
-            asked = RolloutStart(self._task, self._seed, self._first.instruction)
-            true = hold_still(self._twin, asked, row)
+            request = RolloutStart(self._task, self._seed, self._first.instruction)
+            true = hold_still(self._twin, request, row)
             write_arrays(path, {"images": true.images})
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)

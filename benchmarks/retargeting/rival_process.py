@@ -74,9 +74,11 @@ def serve(name: str) -> None:
     """Process requests until the end of input, each call of the rival with the timer set."""
     requests, answer = serve_parent(niceness=0)
     with tempfile.TemporaryDirectory(prefix="dextouch-bench-") as folder:
-        for asked in requests:
-            keypoints, side = np.array(asked["keypoints_m"]), asked["side"]
-            setup = set_up(RIVALS[name], keypoints, side, scale=asked["scale"], folder=Path(folder))
+        for request in requests:
+            keypoints, side = np.array(request["keypoints_m"]), request["side"]
+            setup = set_up(
+                RIVALS[name], keypoints, side, scale=request["scale"], folder=Path(folder)
+            )
             try:
                 joints, times = follow(setup)
             except (ValueError, RuntimeError) as error:

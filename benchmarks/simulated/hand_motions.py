@@ -267,8 +267,8 @@ def _person(side: Side, oblique_deg: float, rng: np.random.Generator) -> HandMod
     for finger in human_fingers(side):
         rows = [_tilted(row, oblique_deg, rng) for row in finger.joints]
         if finger.chain == "thumb" and oblique_deg:
-            apart = SADDLE_OFFSET_M * rng.normal(size=3) / np.sqrt(3)
-            rows[1] = rows[1]._replace(position_m=tuple(apart.tolist()))
+            offset_m = SADDLE_OFFSET_M * rng.normal(size=3) / np.sqrt(3)
+            rows[1] = rows[1]._replace(position_m=tuple(offset_m.tolist()))
         fingers.append(finger._replace(joints=tuple(rows)))
     return HandModel(side, fingers, name="person")
 

@@ -31,7 +31,7 @@ from services.evaluation.success_classifier import (
     sigmoid,
 )
 
-NUM_BINS: Final = 10
+NUM_BINS: Final = 10  # chosen; Guo et al. (2017) take 15
 # The undecided band of a classifier alone is at most 5 % … 95 %.
 _WIDEST_BAND: Final = 0.45
 _MAX_NEWTON_STEPS: Final = 50

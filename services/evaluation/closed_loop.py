@@ -282,21 +282,21 @@ class RolloutRunner:
         """
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or images is True or (images and is_last):
-            shown = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
-            yield rollout.step(chunk, selector=shown, validated=True)
+            selector = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
+            yield rollout.step(chunk, selector=selector, validated=True)
             return
         if images:
             newest = ReturnSelector(cameras=cameras, steps="last")
             yield rollout.step(chunk, selector=newest, validated=True)
             return
         # Only the ending is rendered, in a chunk of its own.
-        num_shown = -(-NUM_SEEN_STEPS // multiple) * multiple if is_last else 0
-        num_unseen = max(len(chunk) - num_shown, 0)
-        if num_unseen:
+        num_rendered = -(-NUM_SEEN_STEPS // multiple) * multiple if is_last else 0
+        num_blind = max(len(chunk) - num_rendered, 0)
+        if num_blind:
             blind = ReturnSelector(cameras=())
-            yield rollout.step(chunk[:num_unseen], selector=blind, validated=True)
-        if num_unseen < len(chunk):
-            yield rollout.step(chunk[num_unseen:], validated=True)
+            yield rollout.step(chunk[:num_blind], selector=blind, validated=True)
+        if num_blind < len(chunk):
+            yield rollout.step(chunk[num_blind:], validated=True)
 
 
 class ResultLog:

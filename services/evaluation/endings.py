@@ -36,7 +36,7 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 
 logger = structlog.get_logger(__name__)
 
-NUM_SEEN_STEPS: Final = 3
+NUM_SEEN_STEPS: Final = 3  # chosen: 0.2 s, in which motion shows
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
 UNUSUAL_SIZE: Final = 0.1
 # Each training episode is cut at one early and one middle step, drawn by its scene. Early endings
@@ -359,13 +359,13 @@ def _of_object(Ts_world_object: np.ndarray) -> Float64[np.ndarray, "17"]:
 def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray, "18"]:
     """Second object relative to the first, and their horizontal and vertical distance."""
     T_a_b = invert(T_world_a) @ T_world_b
-    apart_m = T_world_b[:3, 3] - T_world_a[:3, 3]
+    offset_m = T_world_b[:3, 3] - T_world_a[:3, 3]
     return np.concatenate(
         [
             [1.0],
             T_a_b[:3, 3] / _WIDE_M,
             np.arcsinh(T_a_b[:3, 3] / _NEAR_M),
             T_a_b[:3, :3].ravel(),
-            [np.arcsinh(np.linalg.norm(apart_m[:2]) / _NEAR_M), np.arcsinh(apart_m[2] / _NEAR_M)],
+            [np.arcsinh(np.linalg.norm(offset_m[:2]) / _NEAR_M), np.arcsinh(offset_m[2] / _NEAR_M)],
         ]
     )

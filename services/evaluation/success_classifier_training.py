@@ -371,7 +371,7 @@ def _calibrated(
     calibrations = fit_calibrations(probe, development, risk=settings.risk)
     fitted = {
         "calibration": {name: one.model_dump() for name, one in calibrations.items()},
-        "told_milestones": classifiable_milestones(probe, development),
+        "classifiable_milestones": classifiable_milestones(probe, development),
     }
     calibrated = _with(checkpoint, "settings", fitted)
     combinations = fit_combinations(

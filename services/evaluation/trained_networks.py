@@ -21,7 +21,7 @@ from services.networks.weight_files import (
 )
 
 FORMAT_VERSION = 1
-MAX_CHECKPOINT_BYTES = 8 * 2**20
+MAX_CHECKPOINT_BYTES = 8 * 2**20  # chosen: twice what the largest of these networks has
 _METADATA_KEY, _PREFIX = "dextouch", "network."
 
 

@@ -120,7 +120,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             prediction = measure_prediction(models.world_model, scenes, metrics=metrics)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
-            scores, moving = scoring.judge(urls, policies, models, plan)
+            scores, moving = scoring.score_policies(urls, policies, models, plan)
     world = models.world_model.description
     form = "state model" if world.object_names else "paper's form"
     report = {

@@ -54,7 +54,7 @@ from services.twin.episodes import NUM_LAST_SHOWN_STEPS, TruthEpisode, TruthStre
 from services.twin.simulation import MODEL_RATE_HZ
 from services.twin.take_options import TakeOptions
 
-PRESSURES_KPA = (10.0, 20.0, 40.0)
+PRESSURES_KPA = (10.0, 20.0, 40.0)  # chosen: up to the 40 kPa of heat maps
 # A weight on an area is known to about this share.
 PRESSURE_SIGMA = 0.01
 PART_S = 2.0

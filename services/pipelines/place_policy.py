@@ -203,8 +203,8 @@ def _covariance(
     scale: Float64[np.ndarray, " inputs"],
 ) -> Float64[np.ndarray, "n m"]:
     count = max(1, int(np.count_nonzero(scale)))
-    apart = np.square(a[:, None] - b[None]).sum(axis=-1)
-    return _TREND * (a @ b.T) / count + np.exp(-apart / (2 * _LENGTH**2 * count))
+    squares = np.square(a[:, None] - b[None]).sum(axis=-1)
+    return _TREND * (a @ b.T) / count + np.exp(-squares / (2 * _LENGTH**2 * count))
 
 
 class PlacePolicy:

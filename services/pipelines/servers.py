@@ -17,10 +17,10 @@ from fastapi import FastAPI
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.serving import ServiceSettings, bound_socket, server_options
 
-BACKLOG = 128
-START_TIMEOUT_S = 60.0
-START_CHECK_S = 0.01
-GRACE_S = 10
+BACKLOG = 128  # as the kernel's usual somaxconn of before
+START_TIMEOUT_S = 60.0  # chosen: for imports of torch on a busy machine
+START_CHECK_S = 0.01  # chosen: less than anyone notices
+GRACE_S = 10  # chosen: for requests in flight
 
 T = TypeVar("T")
 

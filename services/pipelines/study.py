@@ -38,7 +38,7 @@ from services.evaluation.studies.results import (
     StudyHeader,
     StudyResults,
     WorldChoice,
-    cells_of,
+    planned_rollouts_of,
     read_definition,
 )
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
@@ -78,11 +78,11 @@ def _run(options: argparse.Namespace) -> int:
             digests |= connect(addresses, connections).digests
         header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
         results = StudyResults.create_or_resume(folder, header)
-        num_cells = sum(1 for _ in cells_of(definition))
+        num_planned = sum(1 for _ in planned_rollouts_of(definition))
         if parts.store is not None:
             # What a killed run left unfinished.
             parts.store.sweep()
-        print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
+        print(f"{definition.name}: {len(results.outcomes)} of {num_planned} rollouts have a result")
         if options.ray is None:
             run_study(definition, results, parts, retry_failed=options.retry_failed)
     if options.ray is not None:

@@ -36,7 +36,7 @@ from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
-MAX_LABEL = 32
+MAX_LABEL = 32  # chosen: names stay recognizable in ids
 # Markers of 3 cm are 20 px wide in such images.
 _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104

@@ -31,7 +31,7 @@ from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TA
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
 
-MAX_SNAPSHOT_BYTES: Final = 1 << 20
+MAX_SNAPSHOT_BYTES: Final = 1 << 20  # chosen: refuses what is no state
 
 
 @dataclass(frozen=True)

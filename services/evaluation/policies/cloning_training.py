@@ -210,10 +210,10 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     trained on with the commanded pose in place of the measured one. Raises InvalidInputError if no
     successful episode is long enough, or image sizes differ.
     """
-    wanted = [item for item in episodes if item.success and item.decisions()]
-    if not wanted:
+    demonstrations = [item for item in episodes if item.success and item.decisions()]
+    if not demonstrations:
         raise InvalidInputError("behaviour cloning: no successful demonstration to imitate")
-    sizes = sorted({item.moments[0].image.shape for item in wanted})
+    sizes = sorted({item.moments[0].image.shape for item in demonstrations})
     if len(sizes) > 1:
         raise InvalidInputError(
             f"behaviour cloning: got images of {sizes[0]} and of {sizes[1]}, expected one size"
@@ -223,7 +223,7 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     newest: list[np.ndarray] = []
     frame: list[int] = []
     begins = [0]
-    for item in wanted:
+    for item in demonstrations:
         commanded = in_world(item.commanded, item.anchor)
         for step in item.decisions():
             moment = item.moments[step]
@@ -240,9 +240,9 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
         begins.append(len(inputs))
     counts = torch.tensor(begins).diff()
     return Decisions(
-        torch.from_numpy(np.stack([item.moments[0].image for item in wanted])),
+        torch.from_numpy(np.stack([item.moments[0].image for item in demonstrations])),
         torch.from_numpy(np.stack(newest)),
-        torch.arange(len(wanted)).repeat_interleave(counts),
+        torch.arange(len(demonstrations)).repeat_interleave(counts),
         torch.tensor(frame),
         torch.tensor(begins),
         *cloning_state(inputs, shape),

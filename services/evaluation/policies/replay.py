@@ -73,8 +73,8 @@ class ReplayPolicy:
         if self._playing is None:
             raise InvalidInputError("replay policy: act before reset; call reset with the start")
         step = observation.first_step + len(observation) - 1
-        wanted = np.arange(step, step + CHUNK_STEPS)
-        return self._playing[np.minimum(wanted, len(self._playing) - 1)]
+        rows = np.arange(step, step + CHUNK_STEPS)
+        return self._playing[np.minimum(rows, len(self._playing) - 1)]
 
 
 class HoldPolicy:

@@ -207,8 +207,8 @@ def _parser() -> argparse.ArgumentParser:
     measuring = " ".join(name for name in of if name != "show")
     folder = {"type": Path, "metavar": "FOLDER"}
     add(measuring, "--to", required=True, help="calibration folder; created if new", **folder)
-    shown = "calibration folder or file, or a spooled take"
-    add("show", "folder", type=Path, metavar="PATH", help=shown)
+    source = "calibration folder or file, or a spooled take"
+    add("show", "folder", type=Path, metavar="PATH", help=source)
     add("glove wrist profile", "--side", required=True, choices=("left", "right"), help="hand")
     take = "spool folder, or id of a recording"
     add("wrist profile time latency", "--take", required=True, metavar="TAKE", help=take)

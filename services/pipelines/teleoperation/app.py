@@ -32,9 +32,10 @@ from services.pipelines.teleoperation.hand_follower import Command, HandFollower
 from services.pipelines.teleoperation.settings import TeleoperationSettings
 
 SCOPE: Final = "teleop"
-_REFUSED: Final = 1008
-MAX_REASON_LETTERS: Final = 120
+_REFUSED: Final = 1008  # policy violation (RFC 6455)
+MAX_REASON_LETTERS: Final = 120  # of 123 bytes that a close frame holds
 _FORMS: Final = ("start", "sample", "stop")
+# Buckets around the period of 1/60 s.
 LATENCY_S: Final = (0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.05, 0.1)
 
 

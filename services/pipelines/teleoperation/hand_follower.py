@@ -251,15 +251,15 @@ class HandFollower:
         received_s = self._follow_newest()
         age_s = t_s - self._fresh_s
         status = self._status(age_s)
-        wanted_rad = self._target_rad
+        goal_rad = self._target_rad
         speed_rad_s = self.limits.speed_rad_s
         if status is FollowerStatus.RELAXING:
-            wanted_rad, speed_rad_s = self._relaxed_rad, self.limits.relax_speed_rad_s
+            goal_rad, speed_rad_s = self._relaxed_rad, self.limits.relax_speed_rad_s
         elif status is not FollowerStatus.FOLLOWING:
-            wanted_rad = self._joints_rad
+            goal_rad = self._joints_rad
         reach_rad = speed_rad_s * elapsed_s
-        wanted_rad = np.clip(wanted_rad, self._lower_rad, self._upper_rad)
-        step_rad = np.clip(wanted_rad - self._joints_rad, -reach_rad, reach_rad)
+        goal_rad = np.clip(goal_rad, self._lower_rad, self._upper_rad)
+        step_rad = np.clip(goal_rad - self._joints_rad, -reach_rad, reach_rad)
         self._joints_rad, is_stopped = self._gaps.limited(
             self._joints_rad, step_rad, self.limits.clearance_m
         )

@@ -15,7 +15,7 @@ from typing import Any
 
 from dextouch.errors import UnavailableError
 
-STOP_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 30.0  # chosen: for a child that hangs
 
 Answer = Callable[[Mapping[str, object]], None]
 
