@@ -7,7 +7,7 @@ distortion (`undistorted`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Final
 
@@ -105,7 +105,7 @@ def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64
     )
 
 
-def distortion_of(calibration: Mapping[str, Sequence[Sequence[float]]], camera: str) -> Distortion:
+def distortion_of(calibration: Mapping[str, object], camera: str) -> Distortion:
     """Coefficients of a camera's lens in a calibration; zeros for those that it lacks."""
     known = np.array(calibration.get(f"distortion_{camera}", ()), dtype=np.float64).ravel()
     return np.pad(known, (0, NUM_DISTORTION - len(known)))
