@@ -187,9 +187,8 @@ class DirectJudge:
     def probability(self, start: RolloutStart, actions: Float64[np.ndarray, "steps 67"]) -> float:
         """Calibrated probability that commands (4k steps, relative to the anchor) succeed.
 
-        Raises:
-            UnknownNameError: a task that the judge was not trained for.
-            InvalidInputError: no observation, anchor or K_head.
+        Raises UnknownNameError for a task that the judge was not trained for, and InvalidInputError
+        for no observation, anchor or K_head.
         """
         tasks = self._config.tasks
         seen = observed_start(start, tasks=tasks, image_px=self._config.image_px)

@@ -147,7 +147,7 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
     gc.collect()
     with bar("hand-eye", len(METHODS) * len(scenes)) as step:
         rounds = interleaved(
-            {method.name: partial(_score_at, method, scenes) for method in METHODS},
+            {m.name: partial(lambda m, index: score(m, scenes[index]), m) for m in METHODS},
             len(scenes),
             on_step=step,
         )
@@ -185,10 +185,6 @@ def score(method: Method, scene: Scene) -> Solved:
     )
 
 
-def _score_at(method: Method, scenes: Sequence[Scene], index: int) -> Solved:
-    return score(method, scenes[index])
-
-
 def not_worse_share(
     ours: MethodResult, rival: MethodResult, *, tolerance_sigmas: float
 ) -> tuple[float, float]:
@@ -211,7 +207,6 @@ def not_worse_share(
 
 
 Results = Mapping[str, MethodResult]
-
 
 Maker = Callable[[int], Scene]
 RIVALS = ("tsai", "park", "daniilidis", "li")

@@ -131,9 +131,7 @@ Earlier = Mapping[tuple[str, str], _EarlierLine]
 def read_lines(path: Path) -> Earlier:
     """Lines of the `evaluator.json` of an earlier run, by task and name.
 
-    Raises:
-        NotFoundError: no such file.
-        CorruptDataError: no such report.
+    Raises NotFoundError for no such file, and CorruptDataError for no such report.
     """
     if not path.is_file():
         raise NotFoundError(f"evaluator: no file {path} to compare with; see --repeats")

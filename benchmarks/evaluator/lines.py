@@ -39,12 +39,6 @@ def f1(counts: np.ndarray) -> Float64[np.ndarray, "*batch"]:
     return np.asarray(np.where(total > 0, 2 * both / np.maximum(total, 1), 1.0))
 
 
-def chunk_figures_drawn(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    """All lines of the chunks of one training seed."""
-    contact, images = _contact(sampling, scripts), _images(sampling, scripts)
-    return [*contact, *images, _sharpness(sampling, scripts)]
-
-
 def _contact(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
     """F1 of moving chunks; contacts of all rollouts are pooled by chunk index."""
     names = (f"{_COPY}, {_WHERE}", f"{_CONTEXT}, {_WHERE}")
@@ -449,7 +443,9 @@ class TaskFigures:
             *_decision_figures(sampling, scripts),
             *_policy_figures(sampling, scripts, everything),
             *_idle_figures(sampling, everything),
-            *chunk_figures_drawn(sampling, scripts),
+            *_contact(sampling, scripts),
+            *_images(sampling, scripts),
+            _sharpness(sampling, scripts),
             *_wrong_action_figures(sampling, everything),
             *_still_figures(sampling, everything),
             *rival_figures(sampling, scripts, others),

@@ -54,9 +54,8 @@ class KindsPlan:
     ) -> "KindsPlan | None":
         """The plan of the name of a set, or of NAME,NAME…; None for "none".
 
-        Raises:
-            UnknownNameError: no such set or kind.
-            InvalidInputError: no strengths, or one twice.
+        Raises UnknownNameError for no such set or kind, and InvalidInputError for no strengths, or
+        one twice.
         """
         if text == NONE:
             return None

@@ -187,11 +187,9 @@ def score_bones(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> Bon
         ]
     )
     parts = angles_deg[:, 0], angles_deg[:, 1:]
-    return BoneScore(*(float(of(part)) for part in parts for of in (np.mean, _p95)))
-
-
-def _p95(values: np.ndarray) -> float:
-    return float(np.percentile(values, 95))
+    return BoneScore(
+        *(float(of(part)) for part in parts for of in (np.mean, partial(np.percentile, q=95)))
+    )
 
 
 def score_robot(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> RobotScore:

@@ -43,10 +43,9 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
     def run(self, motion: Motion, scale: float) -> Timed:
         """Joint angles of a motion, sample by sample, from a fresh retargeter.
 
-        Raises:
-            LimitExceededError: a call did not return within 10 s of processor time.
-            InvalidInputError: the rival refuses the keypoints.
-            UnavailableError: its library is not installed, or the process ended by itself.
+        Raises LimitExceededError if a call did not return within 10 s of processor time,
+        InvalidInputError if the rival refuses the keypoints, and UnavailableError if its library is
+        not installed, or the process ended by itself.
         """
         if self._child is None:
             environment = {"OMP_NUM_THREADS": "1"}

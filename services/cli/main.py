@@ -194,7 +194,6 @@ COMMANDS = {
 EXIT_USAGE = 2  # as argparse
 EXIT_REFUSED = 3  # a refusal with a reason, unlike a crash (1)
 
-
 USAGE = """\
 usage: dextouch COMMAND [options]
        dextouch GROUP COMMAND [options]

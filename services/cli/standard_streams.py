@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 EXIT_BROKEN_PIPE: Final = 141
 EXIT_NOT_WRITTEN: Final = 1
 
-
 # Failures to write the standard streams of this process.
 _failures: list[OSError] = []
 

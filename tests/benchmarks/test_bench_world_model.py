@@ -139,8 +139,8 @@ def test_verdicts():
 
 def test_the_state_model_is_judged_by_its_rounds():
     costs = {
-        benchmark.asked_name(asked, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
-        for asked in benchmark.SELECTORS
+        benchmark.cost_name(amount, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
+        for amount in benchmark.SELECTORS
         for batch in benchmark.STATE_BATCHES
     }
     found = benchmark.state_model_requirements(costs)

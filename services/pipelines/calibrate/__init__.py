@@ -130,7 +130,6 @@ Delays are relative to --reference; by default to the stream whose latency is kn
 example:
   dextouch station calibrate time --take spool/shake --to calibration"""
 
-
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
     "camera": (

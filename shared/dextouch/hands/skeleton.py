@@ -22,7 +22,6 @@ CHAINS: Final = ("thumb", "index", "middle", "ring", "little")
 THUMB_JOINTS: Final = ("metacarpal", "proximal", "distal", "tip")
 FINGER_JOINTS: Final = ("metacarpal", "proximal", "intermediate", "distal", "tip")
 
-
 # (chain, joint) of each keypoint. A node sits at the *base* of its bone: "proximal" is the
 # anatomical MCP joint, "intermediate" the PIP, "distal" the DIP (of the thumb: the IP).
 NODES: Final = (

@@ -445,7 +445,9 @@ class RequestMiddleware:
             await self._app(scope, receive, partial(_send_without_trace, scope, send))
             return
         started = time.perf_counter()
-        request_id = _request_id(scope)
+        given = header(scope, b"x-request-id") or ""
+        is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+        request_id = given if is_usable else secrets.token_hex(16)
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
 
@@ -511,13 +513,6 @@ async def _send_without_trace(scope: Scope, send: Send, message: Message) -> Non
     if message["type"] == "lifespan.startup.failed" and scope["app"].state.start_error is not None:
         message = {**message, "message": ""}
     await send(message)
-
-
-def _request_id(scope: Scope) -> str:
-    """The caller's, if it is a valid one, or a new one."""
-    given = header(scope, b"x-request-id") or ""
-    is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
-    return given if is_usable else secrets.token_hex(16)
 
 
 @contextmanager

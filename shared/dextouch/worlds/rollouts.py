@@ -61,7 +61,6 @@ from dextouch.worlds.world import (
 
 logger = structlog.get_logger(__name__)
 
-
 # Opens the world of this name and digest, or returns None where it is not to be had.
 Reopen = Callable[[str, str], World[Any] | None]
 
