@@ -298,8 +298,8 @@ def generate_parser() -> argparse.ArgumentParser:
     add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
     add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")
-    shown = "episodes on that page (%(default)s)"
-    add("--num-strips", type=positive, default=12, metavar="N", help=shown)
+    strips = "episodes on that page (%(default)s)"
+    add("--num-strips", type=positive, default=12, metavar="N", help=strips)
     return parser
 
 

@@ -36,7 +36,7 @@ from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
-MAX_LABEL = 32
+MAX_LABEL = 32  # chosen: names stay recognizable in ids
 # Markers of 3 cm are 20 px wide in such images.
 _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
@@ -249,8 +249,7 @@ def make_training_data(
         Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
         or the take could not be aligned), and of those made, how many `succeeded`.
 
-    Raises:
-        InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
+    Raises InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
     """
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(

@@ -126,11 +126,11 @@ class Observation:
         The last step is an observation of one step that begins where the chunk ends. Touch is
         always kept; whether it is sent is decided by the sender.
         """
-        shown = self.last() if selector.steps == "last" else self
+        chosen = self.last() if selector.steps == "last" else self
         if selector.cameras is None:
-            return shown
-        wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
-        return replace(shown, images=wanted)
+            return chosen
+        images = {camera: rows for camera, rows in chosen.images.items() if selector.wants(camera)}
+        return replace(chosen, images=images)
 
 
 def rollout_uncertainty(observations: Iterable[Observation]) -> RolloutUncertainty:

@@ -13,7 +13,7 @@ from dextouch.tactile import LayoutDescription
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
-MAX_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1  # an int64
 # Of one hand of a `dextouch_v1`.
 _USUAL_TAXELS: Final = 320
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which

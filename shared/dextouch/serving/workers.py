@@ -155,10 +155,8 @@ def run_workers(
 
     uvicorn replaces workers that end or hang; on SIGHUP it replaces all, one after another, each
     once its successor serves. `create_app` is pickled, and called in every worker; at SIGHUP
-    `renewed` gives that of the successors, or None to replace none.
-
-    Raises:
-        UnavailableError: a worker could not start.
+    `renewed` gives that of the successors, or None to replace none. Raises UnavailableError if a
+    worker could not start.
     """
     config = uvicorn.Config(
         partial(_in_worker, create_app),

@@ -61,7 +61,6 @@ from dextouch.worlds.world import (
 
 logger = structlog.get_logger(__name__)
 
-
 # Opens the world of this name and digest, or returns None where it is not to be had.
 Reopen = Callable[[str, str], World[Any] | None]
 
@@ -174,10 +173,15 @@ class RolloutService:
                 ttl_s=self.limits.ttl_s,
             )
             origin = RolloutOrigin(started.anchor, started.K_head)
-            shown = started.observation.selected(selector)
-            parts = await parts_of(info, shown, selector, origin=origin)
+            observation = started.observation.selected(selector)
+            parts = await parts_of(info, observation, selector, origin=origin)
             note = WatchNote(
-                client, owner, time.time_ns(), shown.uncertainty, shown.success, current_trace_id()
+                client,
+                owner,
+                time.time_ns(),
+                observation.uncertainty,
+                observation.success,
+                current_trace_id(),
             )
             # No chunk has this response; it is kept for those who watch.
             record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
@@ -209,9 +213,9 @@ class RolloutService:
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
-            asked = hashlib.sha256(selector_bytes(selector))
-            asked.update(np.ascontiguousarray(checked, dtype="<f8").data)
-            sha256 = asked.hexdigest()
+            digest = hashlib.sha256(selector_bytes(selector))
+            digest.update(np.ascontiguousarray(checked, dtype="<f8").data)
+            sha256 = digest.hexdigest()
             replayed = record.replay(chunk, sha256)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)

@@ -153,8 +153,7 @@ class ReconstructingWorld(World[State], Protocol[State]):
     ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode head images and touch of 1 + 4k consecutive steps.
 
-        Returns:
-            Images and touch of the steps after the first.
+        Returns images and touch of the steps after the first.
         """
         ...
 
@@ -176,8 +175,8 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
     if len(start.observation) != 1:
         raise ShapeError(f"start: observation has {len(start.observation)} steps, expected 1")
     images = start.observation.images
-    wanted = {camera: images[camera] for camera in description.cameras if camera in images}
-    observation = replace(start.observation, images=wanted)
+    used = {camera: images[camera] for camera in description.cameras if camera in images}
+    observation = replace(start.observation, images=used)
     size_px = None if description.scales_images else _size_px(description)
     _check_fits(observation, description, size_px, description.cameras, where="start")
     return replace(start, observation=observation)
