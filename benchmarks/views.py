@@ -44,7 +44,6 @@ _CHUNK, _NUM_STEPS = 16, 49
 _AWAY_RAD: Final = (0.9, 1.2)
 _HELDOUT_SEED: Final = 50_000
 _PARTS: Final = ("whole chunk", "last four images")
-Errors = Float64[np.ndarray, " scenes"]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -199,7 +198,7 @@ def _scene(stage: Stage, seed: int) -> dataset.EpisodeArrays:
         },
         anchor=anchor,
         K_head=stage.rig.K[HEAD_CAMERA],
-        model_rate_hz=MODEL_RATE_HZ,
+        model_rate_hz=float(MODEL_RATE_HZ),
         content_sha256=f"{seed:064x}",
     )
 
