@@ -57,8 +57,7 @@ class ReturnSelector(FrozenModel):
 
     Attributes:
         cameras: names of cameras; if omitted all of the world but the optional ones, an empty list
-            means none. In a
-            query, where an empty list cannot be written, none is `cameras=`.
+            means none. In a query, where an empty list cannot be written, none is `cameras=`.
         steps: all steps of the chunk, or only its last one.
         tactile: whether touch is sent.
         images: how images are sent; JPEG takes a tenth of the bytes, but is not exact.
