@@ -106,7 +106,7 @@ def _played(
         task=attributes.task,
         seed=attributes.seed or 0,
         instruction=attributes.instruction,
-        init=(grid.observation(), grid.anchor, grid.K_head),
+        init=(grid.observation(0, world.optional_cameras), grid.anchor, grid.K_head),
         action_kind=grid.action_kind,
     ) as rollout:
         seen = [

@@ -27,6 +27,7 @@ from services.pipelines.parsers import training_data_parser
 from services.twin.cameras import Markers, marked_objects
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
+from services.twin.names import CAMERAS as ALL_CAMERAS
 from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
 from services.twin.scene import Sizes, object_boxes_m
 from services.twin.settings import TwinSettings
@@ -60,6 +61,7 @@ class Scope:
     path: TakePath | None = None
     varied: float = 0.0
     resized: float = 0.0
+    cameras: tuple[str, ...] = CAMERAS
 
     def path_of(self, domain: Domain) -> TakePath:
         """The path of the takes of a domain."""
@@ -300,7 +302,7 @@ def _orders(
         for task in scope.tasks:
             made = TakeOptions() if policy is not None else options_of(task, seed, mix)
             options = replace(
-                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
+                made, images=scope.cameras, image_every=scope.image_every, streams=scope.streams,
                 varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
                 sizes=_sizes(task, seed, scope),
             )  # fmt: skip
@@ -327,8 +329,9 @@ def main(argv: Sequence[str]) -> int:
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
     tasks = named_tasks(arguments.tasks)
+    cameras = ALL_CAMERAS if arguments.wrist_cameras else CAMERAS
     scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path,
-                  arguments.varied, arguments.resized)  # fmt: skip
+                  arguments.varied, arguments.resized, cameras)  # fmt: skip
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(

@@ -56,8 +56,8 @@ class ReturnSelector(FrozenModel):
     """Requested part of an observation.
 
     Attributes:
-        cameras: names of cameras; all of the world if omitted, an empty list means none. In a
-            query, where an empty list cannot be written, none is `cameras=`.
+        cameras: names of cameras; if omitted all of the world but the optional ones, an empty list
+            means none. In a query, where an empty list cannot be written, none is `cameras=`.
         steps: all steps of the chunk, or only its last one.
         tactile: whether touch is sent.
         images: how images are sent; JPEG takes a tenth of the bytes, but is not exact.

@@ -22,6 +22,7 @@ from dextouch.errors import (
     ConflictError,
     DexTouchError,
     EndedError,
+    InvalidInputError,
     LimitExceededError,
     UnavailableError,
     UnknownNameError,
@@ -53,6 +54,7 @@ from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,
     World,
+    asked_cameras,
     check_answer,
     check_chunk,
     check_selector,
@@ -159,7 +161,16 @@ class RolloutService:
         rollout_id = new_rollout_id(owner)
         async with self._place(rollout_id) as placed:
             started, snapshot = await worker.call(reset)
-            check_answer(started.observation, description, first_step=0, num_steps=1)
+            cameras = asked_cameras(selector, description.cameras)
+            optional = set(cameras) & set(description.optional_cameras)
+            if absent := sorted(optional - set(started.observation.images)):
+                raise InvalidInputError(
+                    f"start: got a request for {', '.join(absent)}, whose images are not in the "
+                    "start; send them with it, or do not ask for them"
+                )
+            returned = selector.model_copy(update={"cameras": cameras})
+            observation = started.observation.selected(returned)
+            check_answer(observation, description, first_step=0, num_steps=1, selector=returned)
             info = RolloutInfo(
                 id=rollout_id,
                 world=world,
@@ -173,7 +184,6 @@ class RolloutService:
                 ttl_s=self.limits.ttl_s,
             )
             origin = RolloutOrigin(started.anchor, started.K_head)
-            observation = started.observation.selected(selector)
             parts = await parts_of(info, observation, selector, origin=origin)
             note = WatchNote(
                 client,
