@@ -125,7 +125,9 @@ def serve_worlds(
         if load is None or not settings.api_keys:
             return factory(settings)
         now = settings_with_keys(load, has_keys=True)
-        return now and factory(settings.model_copy(update={"api_keys": now.api_keys}))
+        if now is None:
+            return None
+        return factory(settings.model_copy(update={"api_keys": now.api_keys}))
 
     if settings.workers == 1:
         app = factory(settings)()
