@@ -13,6 +13,7 @@ from typing import Final, Literal
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
+from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -152,8 +153,12 @@ class PerceptualNetworks:
         return _pretrained(ViTModel, self._folder / "dino")
 
     @cached_property
-    def _aesthetic_head(self) -> dict[str, Tensor]:
-        return _tensors(self._folder / "aesthetic" / "head.safetensors", "")
+    def _aesthetic_head(self) -> nn.Module:
+        projection = self._clip.get_parameter("visual_projection.weight")
+        head = nn.Linear(len(projection), 1)
+        tensors = _tensors(self._folder / "aesthetic" / "head.safetensors", "")
+        load_strictly({"": head}, tensors, where="head.safetensors")
+        return head
 
     @torch.no_grad()
     def perceptual_distance(
@@ -166,12 +171,11 @@ class PerceptualNetworks:
     @torch.no_grad()
     def aesthetic_quality(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, " n"]:
         """Rating of LAION's linear head on normalized CLIP features, divided by ten (VBench)."""
-        head = self._aesthetic_head
         ratings = []
         for part in _batches(images):
             pixels = _scaled(_resized(part), _CLIP_MEAN, _CLIP_STD)
             features = functional.normalize(self._clip(pixel_values=pixels).image_embeds, dim=1)
-            ratings.append(functional.linear(features, head["weight"], head["bias"])[:, 0] / 10)
+            ratings.append(self._aesthetic_head(features)[:, 0] / 10)
         return torch.cat(ratings).numpy()
 
     @torch.no_grad()
@@ -204,10 +208,30 @@ def _tensors(path: Path, prefix: str) -> dict[str, Tensor]:
 
 
 def _pretrained(kind: type, folder: Path) -> nn.Module:
-    network: nn.Module = kind.from_pretrained(  # type: ignore[attr-defined]
-        folder, local_files_only=True, use_safetensors=True
-    )
-    return network.eval().requires_grad_(requires_grad=False)
+    try:
+        network, info = kind.from_pretrained(  # type: ignore[attr-defined]
+            folder,
+            local_files_only=True,
+            use_safetensors=True,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+        )
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InvalidInputError(
+            f"weights: the folder {folder.name} holds no {kind.__name__} that transformers can "
+            f"read ({error}); docs/evaluation.md says how to make it"
+        ) from error
+    # transformers gives these random values. DINO has no pooler, and none is used.
+    mismatched = {name for name, *_ in info["mismatched_keys"]}
+    absent = sorted(mismatched.union(info["missing_keys"]))
+    if absent := [name for name in absent if not name.startswith("pooler.")]:
+        raise InvalidInputError(
+            f"weights: the folder {folder.name} has {len(absent)} tensors of {kind.__name__} "
+            f"missing or of another shape than its config.json says, such as {absent[0]}; convert "
+            "the published file anew"
+        )
+    loaded: nn.Module = network.eval().requires_grad_(requires_grad=False)
+    return loaded
 
 
 def _batches(images: UInt8[np.ndarray, "n h w 3"]) -> tuple[Tensor, ...]:

@@ -8,6 +8,7 @@ from operator import not_
 from pathlib import Path
 from typing import Final
 
+import torch
 from pydantic import Field, model_validator
 
 from dextouch.episodes import Split, scene_fraction, scene_of, split_of_scene
@@ -21,6 +22,7 @@ from services.networks.weight_files import (
     digest_of,
     half_weights,
     load_strictly,
+    memory_of,
     notes_of,
     read_history,
     read_weights,
@@ -144,16 +146,15 @@ def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMet
 def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
     """Load a checkpoint strictly, in evaluation mode.
 
-    By default, a file may have 64 MiB, and one of the full size the memory that is available.
+    By default, a file may have 64 MiB and what its network needs beyond, but of the full size the
+    memory that is available.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
     """
     if max_bytes is None:
-        is_full_size = '"video_expert":"wan"' in notes_of(path).get(METADATA_KEY, "")
-        max_bytes = available_memory() if is_full_size else MAX_FILE_BYTES
-        max_bytes = sys.maxsize if max_bytes is None else max_bytes
+        max_bytes = _default_limit(path)
     tensors, metadata, digest = read_weights(
         path, CheckpointMetadata, METADATA_KEY, max_bytes=max_bytes
     )
@@ -163,6 +164,22 @@ def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
         model.text_features.learn({key.removeprefix(_TEXT): tensors.pop(key) for key in keys})
     load_strictly({"": model}, tensors, where=f"checkpoint {path.name}", later=LATER_STATISTICS)
     return Checkpoint(model, metadata, digest)
+
+
+def _default_limit(path: Path) -> int:
+    """Bytes that a checkpoint may have, by the network of its metadata and the memory."""
+    is_full_size = '"video_expert":"wan"' in notes_of(path).get(METADATA_KEY, "")
+    if not is_full_size and (not path.is_file() or path.stat().st_size <= MAX_FILE_BYTES):
+        return MAX_FILE_BYTES
+    available = available_memory()
+    limit = sys.maxsize if available is None else available
+    if is_full_size:
+        return limit
+    if METADATA_KEY not in notes_of(path):
+        return MAX_FILE_BYTES
+    with torch.device("meta"):
+        network = JointWorldModel(read_metadata(path).network)
+    return min(limit, MAX_FILE_BYTES + memory_of(network.state_dict()))
 
 
 def read_metadata(path: Path) -> CheckpointMetadata:

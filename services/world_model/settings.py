@@ -250,7 +250,9 @@ class Placement(FrozenModel):
         description="text encoder, for instructions that are not in a checkpoint",
     )
     max_file_gb: float | None = Field(
-        default=None, gt=0, description="largest checkpoint; default: 64 MiB, at full size memory"
+        default=None,
+        gt=0,
+        description="largest checkpoint; default: 64 MiB beyond its network, or memory",
     )
     decode_window: int | None = Field(
         default=None,

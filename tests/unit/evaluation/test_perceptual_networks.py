@@ -1,11 +1,13 @@
 """LPIPS, CLIP and DINO metrics with tiny or random weights, against their definitions in numpy."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from services.evaluation.perceptual_networks import NO_WEIGHTS, PerceptualNetworks, heat_maps
 from services.evaluation.prediction import all_metrics
 
@@ -150,6 +152,28 @@ def test_files_that_do_not_fit_are_named(weights, tmp_path):
     save_file({"lin0.model.1.weight": torch.zeros(1)}, tmp_path / "lpips" / "heads.safetensors")
     with pytest.raises(InvalidInputError, match=r"alexnet\.safetensors"):
         PerceptualNetworks(tmp_path).perceptual_distance(image, image)
+
+
+@pytest.mark.parametrize("change", ["absent", "shape", "damaged", "empty"])
+@pytest.mark.parametrize("name", ["clip", "dino", "aesthetic"])
+def test_no_weights_are_made_up(weights, tmp_path, name, change):
+    shutil.copytree(weights, tmp_path / "w")
+    (path,) = (tmp_path / "w" / name).glob("*.safetensors")
+    tensors = load_file(path)
+    first = sorted(tensors)[0]
+    if change == "absent":
+        del tensors[first]
+    elif change == "shape":
+        tensors[first] = torch.zeros(3, 5)
+    save_file(tensors, path, {"format": "pt"})
+    if change == "damaged":
+        path.write_bytes(path.read_bytes()[:-50])
+    elif change == "empty":
+        path.unlink()
+    networks = PerceptualNetworks(tmp_path / "w")
+    measure = networks.subject_consistency if name == "dino" else networks.aesthetic_quality
+    with pytest.raises(DexTouchError, match="head" if name == "aesthetic" else f"folder {name}"):
+        measure(np.zeros((2, 64, 64, 3), dtype=np.uint8))
 
 
 def test_heat_maps_are_large_enough_and_differ_where_touch_does():

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load, load_file, save, save_file
 
 from dextouch.errors import (
     CorruptDataError,
@@ -14,7 +14,7 @@ from dextouch.errors import (
     NotFoundError,
 )
 from services.networks.weight_files import read_weights
-from services.world_model import shipped_checkpoints
+from services.world_model import checkpoints, shipped_checkpoints
 from services.world_model.checkpoints import (
     METADATA_KEY,
     CheckpointMetadata,
@@ -120,6 +120,18 @@ def test_foreign_files_are_refused(path, tiny_model, metadata):
     with path.open("wb") as file:
         file.truncate(64 * 2**20 + 1)
     with pytest.raises(LimitExceededError, match="at most 67108864"):
+        read_checkpoint(path)
+
+
+def test_a_large_network_may_have_a_large_file(path, tiny_model, metadata, monkeypatch):
+    monkeypatch.setattr(checkpoints, "MAX_FILE_BYTES", 1000)
+    write_checkpoint(path, tiny_model, metadata)
+    assert path.stat().st_size > 1000
+    assert read_checkpoint(path).metadata == metadata
+    # More than its network, which is of float32 at most, needs.
+    spare = {**load_file(path), "spare": torch.zeros(3 * path.stat().st_size, dtype=torch.uint8)}
+    save_file(spare, path, {METADATA_KEY: metadata.model_dump_json()})
+    with pytest.raises(LimitExceededError, match="expected at most"):
         read_checkpoint(path)
 
 

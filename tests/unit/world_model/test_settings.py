@@ -1,10 +1,12 @@
 """The command that a checkpoint records repeats its training."""
 
 import pytest
+import torch
 
 from dextouch.errors import UnknownNameError
 from dextouch.serving import load_settings
 from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import TrainCommand, TrainSettings, command_line
 from services.world_model.settings import StateTrainSettings, TrainStateCommand
 from services.world_model.training.state_trainer import _command
@@ -78,3 +80,11 @@ def test_the_default_preset_is_that_of_no_preset():
 def test_one_flag_of_a_group_leaves_its_other_defaults():
     drawing = load_settings(TrainStateCommand, ["--episodes", "s", "--drawing.batch", "3"]).drawing
     assert (drawing.batch, drawing.cpu_budget_s) == (3, 400)
+
+
+@pytest.mark.parametrize(("preset", "billions"), [("100m", 0.1), ("300m", 0.3), ("1b", 1.0)])
+def test_presets_have_the_weights_that_their_names_say(preset, billions):
+    network = load_settings(TrainCommand, ["--episodes", "s", "--preset", preset]).network
+    with torch.device("meta"):
+        model = JointWorldModel(network)
+    assert sum(one.numel() for one in model.parameters()) / 1e9 == pytest.approx(billions, rel=0.1)
