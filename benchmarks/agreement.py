@@ -183,16 +183,12 @@ def coverage_table(name: str, found: Found) -> ResultTable:
     return ResultTable(f"95 % intervals of {name}", ("studies", *columns), rows)
 
 
-def mean_held(found: Found, method: str, name: str) -> float:
-    """Share of all simulated studies whose interval contains the true value."""
-    return float(np.nanmean([tallies[method, name].held for tallies in found.values()]))
-
-
 def requirements(found: Found, times_s: Mapping[str, Figure]) -> list[Requirement]:
     """Requirements on the intervals of an evaluation."""
     what = "studies whose 95 % interval holds the truth"
+    held = {n: float(np.nanmean([one[OURS, n].held for one in found.values()])) for n in MEASURED}
     paper = "hierarchical bootstrap of the paper's largest study, 10,000 draws"
     return [
-        *(at_least(f"{name}: {what}", mean_held(found, OURS, name), 0.92) for name in MEASURED),
+        *(at_least(f"{name}: {what}", share, 0.92) for name, share in held.items()),
         at_most(paper, times_s["bootstrap"].median, 1.0, "s"),
     ]

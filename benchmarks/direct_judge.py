@@ -164,8 +164,7 @@ class DirectNetwork(nn.Module):
 class DirectJudge:
     """A trained direct judge, from `load_checkpoint` or from training.
 
-    Raises:
-        InvalidInputError: the weights do not match the configuration in the metadata.
+    Raises InvalidInputError if the weights do not match the configuration in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -188,9 +187,8 @@ class DirectJudge:
     def probability(self, start: RolloutStart, actions: Float64[np.ndarray, "steps 67"]) -> float:
         """Calibrated probability that commands (4k steps, relative to the anchor) succeed.
 
-        Raises:
-            UnknownNameError: a task that the judge was not trained for.
-            InvalidInputError: no observation, anchor or K_head.
+        Raises UnknownNameError for a task that the judge was not trained for, and InvalidInputError
+        for no observation, anchor or K_head.
         """
         tasks = self._config.tasks
         seen = observed_start(start, tasks=tasks, image_px=self._config.image_px)
@@ -223,8 +221,7 @@ def read_takes(
 ) -> tuple[list[EpisodeGrid], set[str]]:
     """True robot episodes of some stores, and the digests of their first observations.
 
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    Raises NotFoundError and ConflictError as `select_episodes`.
     """
     episodes, starts = [], set()
     stores = [EpisodeStore(url) for url in urls]
@@ -245,10 +242,8 @@ def train_direct_judge(
     """Train a start reader on object poses, then the recurrent network on outcomes.
 
     A share of the scenes is held out for early stopping, calibration and metrics. The digests of
-    the first observations and the command are stored in the checkpoint.
-
-    Raises:
-        InvalidInputError: only one outcome, or too few scenes to hold some out.
+    the first observations and the command are stored in the checkpoint. Raises InvalidInputError
+    for only one outcome, or too few scenes to hold some out.
     """
     share = settings.development_share
     training, apart = split_by_scene(episodes, held_out_share=share, salt="direct judge ")

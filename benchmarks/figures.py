@@ -46,8 +46,7 @@ class Figure:
     def over(self, other: "Figure") -> "Figure":
         """Ratio to another figure round by round, which cancels the load of the machine.
 
-        Raises:
-            InvalidInputError: another number of rounds.
+        Raises InvalidInputError for another number of rounds.
         """
         if len(self.values) != len(other.values):
             raise InvalidInputError(
@@ -120,10 +119,8 @@ def interleaved(
     """Measure all subjects once per round, rotating the first one; returns the results of each.
 
     Other load of the machine and cache effects then affect all subjects alike. A subject is given
-    the round's index, `on_step` its name before it is measured.
-
-    Raises:
-        InvalidInputError: no round.
+    the round's index, `on_step` its name before it is measured. Raises InvalidInputError without a
+    round.
     """
     if num_rounds < 1:
         raise InvalidInputError(f"rounds: got {num_rounds}, expected at least 1")

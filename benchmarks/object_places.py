@@ -57,7 +57,7 @@ class ClickErrors:
 
     off_mm: Float64[np.ndarray, " n"]
     turned_deg: Float64[np.ndarray, " m"]
-    told_mm: Float64[np.ndarray, " n"]
+    reported_mm: Float64[np.ndarray, " n"]
     refused: float
 
 
@@ -150,7 +150,7 @@ def described(
 
 def _click_errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> ClickErrors:
     draw = np.random.default_rng([side_px, noise_px])
-    off, turned, told, num_refused = [], [], [], 0
+    off, turned, reported, num_refused = [], [], [], 0
     for start in starts:
         about, K = start.about(side_px), start.camera(side_px)
         objects = SceneObjects(tasks={start.task: start.objects})
@@ -166,13 +166,13 @@ def _click_errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> Clic
                     continue
                 T = transform_from_pose(found.poses[index])
                 off.append(1e3 * float(np.linalg.norm(T[:3, 3] - true[:3, 3])))
-                told.append(1e3 * float(found.sd_m[index]))
+                reported.append(1e3 * float(found.sd_m[index]))
                 if not one.click.symmetric:
                     axis = "xyz".index(one.click.heading)
                     cosine = float(T[:3, axis] @ true[:3, axis])
                     turned.append(float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
     share = num_refused / (num_refused + len(off))
-    return ClickErrors(np.array(off), np.array(turned), np.array(told), share)
+    return ClickErrors(np.array(off), np.array(turned), np.array(reported), share)
 
 
 def clicked_image(

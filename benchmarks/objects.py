@@ -263,7 +263,7 @@ def _click_table(clicked: Mapping[tuple[int, int], ClickErrors]) -> ResultTable:
             f"{noise_px} px",
             _middle_and_most(one.off_mm),
             _middle_and_most(one.turned_deg),
-            f"{_quantile(one.told_mm):.1f}",
+            f"{_quantile(one.reported_mm):.1f}",
             f"{one.refused:.1%}",
         )
         for (side_px, noise_px), one in clicked.items()

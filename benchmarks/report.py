@@ -57,8 +57,7 @@ def _commit() -> str:
 def refuse_shape_checks() -> None:
     """Refuse to time code with run-time checks of array shapes.
 
-    Raises:
-        ConflictError: the import hook of the tests is active in this process.
+    Raises ConflictError if the import hook of the tests is active in this process.
     """
     if any(type(finder).__module__.startswith("jaxtyping") for finder in sys.meta_path):
         raise ConflictError(
@@ -192,11 +191,11 @@ def _acceptance(report: StageReport) -> ResultTable:
     return ResultTable("Acceptance", ("requirement", "measured", "bound", "verdict"), rows)
 
 
-def _table(shown: ResultTable) -> Table:
-    table = Table(title=shown.title, title_justify="left", header_style="bold")
-    table.show_header = any(shown.columns)
-    for index, column in enumerate(shown.columns):
-        table.add_column(column, justify="left" if index < shown.num_text_columns else "right")
-    for row in shown.rows:
+def _table(content: ResultTable) -> Table:
+    table = Table(title=content.title, title_justify="left", header_style="bold")
+    table.show_header = any(content.columns)
+    for index, column in enumerate(content.columns):
+        table.add_column(column, justify="left" if index < content.num_text_columns else "right")
+    for row in content.rows:
         table.add_row(*row)
     return table

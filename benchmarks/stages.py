@@ -33,8 +33,7 @@ class Amounts:
     def of(self, options: argparse.Namespace, **least: int | float) -> dict[str, Any]:
         """The amounts of a run, those that options set instead of the default ones.
 
-        Raises:
-            InvalidInputError: an option that is less than 1, or than `least` says.
+        Raises InvalidInputError for an option that is less than 1, or than `least` says.
         """
         plan = {}
         for name, default in (self.quick if options.quick else self.usual).items():
@@ -69,11 +68,7 @@ STAGES = _stages()
 
 
 def named(kind: str, known: Mapping[str, T], names: str) -> dict[str, T]:
-    """Those of the comma-separated names.
-
-    Raises:
-        UnknownNameError: a name that there is not.
-    """
+    """Those of the comma-separated names; raises UnknownNameError for a name that there is not."""
     found = [name.strip() for name in names.split(",")]
     for name in found:
         if name not in known:

@@ -157,9 +157,9 @@ class _Judged:
         for before, step in pairwise((0, *STEPS)):
             stepped = twin.step(state, actions[before:step], seed=0, selector=_LAST)
             state = stepped.state
-            shown = stepped.observation
-            image = shown.images[HEAD_CAMERA][-1]
-            later = start_amid(first, image, shown.tactile_kpa[-1], shown.action_reached[-1])
+            newest = stepped.observation
+            image = newest.images[HEAD_CAMERA][-1]
+            later = start_amid(first, image, newest.tactile_kpa[-1], newest.action_reached[-1])
             found[f"at step {step}"] = self._read(later, stage_poses(twin, state))
         return found
 

@@ -33,6 +33,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     init = "state model of other tasks to adapt, such as `evaluator/pretrained/model/"
     add("--init", type=Path, metavar="PATH", help=init + "model.safetensors` of a reproduction")
     add("--clicks", type=int, default=0, help="first images a task that are clicked (%(default)s)")
+    members = "members of the model (as many as the initial model has, or 3)"
+    add("--members", type=int, metavar="N", help=members)
     keep = Path("runs/touch")
     add("--keep", type=Path, default=keep, help="folder of data and results (%(default)s)")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
@@ -61,6 +63,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "tasks": options.tasks,
             "clicks": options.clicks,
             "init": options.init is not None,
+            "members": options.members,
         },
         tables=[_table(trust)],
         requirements=[
@@ -115,11 +118,12 @@ def _strip(keep: Path, num_clicked: int) -> None:
 def _trainings(options: argparse.Namespace, data: Step) -> list[Step]:
     reader, core, judge, drawing_s = _QUICK_STEPS if options.quick else _STEPS
     base = "world-model" if options.init is None else f"adapt --init {options.init.resolve()}"
+    members = "" if options.members is None else f"--num-members {options.members} "
     model = step_with_result(
         "model",
         f"train {base} --episodes {_LAB} --clicks {_OBJECTS} --splits A,B --heldout-share 0.1 "
         f"--reader.num-steps {reader} --core.num-steps {core} --drawing.cpu-budget-s {drawing_s} "
-        f"--jobs {options.jobs} --output model/{_MODEL}",
+        f"{members}--jobs {options.jobs} --output model/{_MODEL}",
         _MODEL,
         needs=(data,),
     )

@@ -179,14 +179,14 @@ def action_chunk_walk(world: World[Any] | None = None) -> Walk:
 
     The default world is the baseline, which computes nothing.
     """
-    shown = world or CopyFirstWorld(tasks=(TASK,))
-    tracer = Tracer(f"action chunk, {shown.description.name}")
-    app = create_world_app({"world": shown}, WorldServiceSettings(), name="world")
+    walked = world or CopyFirstWorld(tasks=(TASK,))
+    tracer = Tracer(f"action chunk, {walked.description.name}")
+    app = create_world_app({"world": walked}, WorldServiceSettings(), name="world")
     with (
         tracer.installed(),
         served({"world": app}) as urls,
         RolloutClient(urls["world"]) as client,
-        _started(client, shown) as rollout,
+        _started(client, walked) as rollout,
     ):
         policy = HoldPolicy()
         policy.reset(PolicyStart(TASK, TASK, 0, rollout.anchor, rollout.K_head))
@@ -194,7 +194,7 @@ def action_chunk_walk(world: World[Any] | None = None) -> Walk:
             answer = ask(policy.act, rollout.observation, where=TASK)
             with tracer.on():
                 # As `services.evaluation.closed_loop` plays it.
-                chunk = action_chunk(answer, shown.description, where=TASK)
+                chunk = action_chunk(answer, walked.description, where=TASK)
                 rollout.step(chunk, validated=True)
     return tracer.walk
 

@@ -106,16 +106,16 @@ def _played(
         task=attributes.task,
         seed=attributes.seed or 0,
         instruction=attributes.instruction,
-        init=(grid.observation(), grid.anchor, grid.K_head),
+        init=(grid.observation(0, world.optional_cameras), grid.anchor, grid.K_head),
         action_kind=grid.action_kind,
     ) as rollout:
         seen = [
             rollout.observation,
             *(
                 rollout.step(
-                    actions[begin:end], selector=None if shown else ReturnSelector(cameras=())
+                    actions[begin:end], selector=None if is_rendered else ReturnSelector(cameras=())
                 )
-                for begin, end, shown in _chunks(len(actions), image_steps)
+                for begin, end, is_rendered in _chunks(len(actions), image_steps)
             ),
         ]
         return seen, rollout.K_head, actions
@@ -134,11 +134,11 @@ def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[i
     chunks: list[tuple[int, int, bool]] = []
     for first in range(1, num_steps, SHORT_CHUNK_STEPS):
         end = min(first + SHORT_CHUNK_STEPS, num_steps)
-        shown = any(first <= step < end for step in image_steps)
-        if chunks and not shown and not chunks[-1][2] and end - chunks[-1][0] <= CHUNK_STEPS:
+        is_rendered = any(first <= step < end for step in image_steps)
+        if chunks and not is_rendered and not chunks[-1][2] and end - chunks[-1][0] <= CHUNK_STEPS:
             chunks[-1] = (chunks[-1][0], end, False)
         else:
-            chunks.append((first, end, shown))
+            chunks.append((first, end, is_rendered))
     return chunks
 
 

@@ -99,12 +99,6 @@ def starved_table(starved: Starved) -> ResultTable:
     )
 
 
-def starved_requirement(starved: Starved) -> Requirement:
-    """Requirement on a HID device that a process of its own reads."""
-    lost = 100 * starved["starved", "process"]["fingers"]
-    return at_most("finger packets lost on a starved computer, reader process", lost, 1.0, "%")
-
-
 def requirements(
     judgements: Sequence[Judgement],
     driver_us: Mapping[str, Figure],
@@ -204,7 +198,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         ],
         requirements=[
             *requirements(judgements, driver_us, splits, share),
-            starved_requirement(starved),
+            at_most(
+                "finger packets lost on a starved computer, reader process",
+                100 * starved["starved", "process"]["fingers"],
+                1.0,
+                "%",
+            ),
         ],
         data={
             "line": LINE,

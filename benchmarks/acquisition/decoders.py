@@ -61,7 +61,6 @@ FULL_SCALE = 4095.0
 TOUCHED_SHARE = 0.3
 NO_CELL_SHARE = 0.3
 
-
 # Decoder that maps the next bytes to the samples (baselines: payloads) of completed packets.
 Feed = Callable[[bytes], Sequence[bytes] | Sequence[Sample]]
 

@@ -116,8 +116,7 @@ class SocketHid:
 def run_starved(load: Load, way: Way, seconds: float) -> dict[str, float]:
     """Read in a fresh process among busy ones: see `read_starved`.
 
-    Raises:
-        DeviceError: the process failed.
+    Raises DeviceError if the process failed.
     """
     num_threads, num_processes = NUM_BUSY[load]
     with contextlib.ExitStack() as stack:
@@ -129,11 +128,7 @@ def run_starved(load: Load, way: Way, seconds: float) -> dict[str, float]:
 
 
 def _read_apart(*words: str) -> dict[str, float]:
-    """What a fresh process of this module prints.
-
-    Raises:
-        DeviceError: the process failed.
-    """
+    """What a fresh process of this module prints; raises DeviceError if the process failed."""
     done = subprocess.run(  # noqa: S603 - this very module
         [sys.executable, "-m", MODULE, *words], capture_output=True, text=True, check=False
     )
@@ -200,15 +195,15 @@ def send_both(path: str, master: int, seconds: float) -> None:
     points_m = rng.uniform(-0.1, 0.1, (1, NUM_KEYPOINTS, 3))
     stream = ReplayStream(keypoints_descriptor("left"), np.zeros(1, np.int64), points_m)
     source = FingerTrackerSource(stream, side="left", rng=rng)
-    asked = threading.Event()
+    requested = threading.Event()
 
     def answer(report: bytes) -> list[bytes]:
-        asked.set()
+        requested.set()
         return source.answer(report)
 
     hid = SocketHid(path, answer)
     print("ready", flush=True)
-    while not asked.is_set():
+    while not requested.is_set():
         hid.listen(1.0)
     sent = {"fingers": 0, "glove": 0}
     start_s = time.monotonic() + SETTLE_S
@@ -272,10 +267,8 @@ WARM_UP_S = 0.5
 def run_ptys(seconds: float) -> dict[str, float]:
     """Read eight gloves in a fresh process: `seconds` measured, `cpu_s` of all readers, and so on.
 
-    `packets` are those that arrived in that time, `errors` those of any kind.
-
-    Raises:
-        DeviceError: the process failed.
+    `packets` are those that arrived in that time, `errors` those of any kind. Raises DeviceError if
+    the process failed.
     """
     return _read_apart("read-all", str(seconds))
 

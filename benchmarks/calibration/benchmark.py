@@ -147,7 +147,7 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
     gc.collect()
     with bar("hand-eye", len(METHODS) * len(scenes)) as step:
         rounds = interleaved(
-            {method.name: partial(_score_at, method, scenes) for method in METHODS},
+            {m.name: partial(lambda m, index: score(m, scenes[index]), m) for m in METHODS},
             len(scenes),
             on_step=step,
         )
@@ -164,8 +164,7 @@ def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
 def score(method: Method, scene: Scene) -> Solved:
     """Time (of this thread's processor) and error of one method on one scene.
 
-    Raises:
-        InvalidInputError: the method refuses the scene, or gives no finite mount.
+    Raises InvalidInputError if the method refuses the scene, or gives no finite mount.
     """
     begun_s = time.thread_time()
     answer = method.solve(scene)
@@ -186,19 +185,13 @@ def score(method: Method, scene: Scene) -> Solved:
     )
 
 
-def _score_at(method: Method, scenes: Sequence[Scene], index: int) -> Solved:
-    return score(method, scenes[index])
-
-
 def not_worse_share(
     ours: MethodResult, rival: MethodResult, *, tolerance_sigmas: float
 ) -> tuple[float, float]:
     """Share of seeds with an error of at most the rival's plus a tolerance in our sigmas.
 
-    Returns the share by rotation and that by translation.
-
-    Raises:
-        InvalidInputError: ours has no sigma.
+    Returns the share by rotation and that by translation. Raises InvalidInputError if ours has no
+    sigma.
     """
     if ours.sigma_deg is None or ours.sigma_mm is None:
         raise InvalidInputError(f"{ours.name}: has no sigma to define the tolerance")
@@ -214,7 +207,6 @@ def not_worse_share(
 
 
 Results = Mapping[str, MethodResult]
-
 
 Maker = Callable[[int], Scene]
 RIVALS = ("tsai", "park", "daniilidis", "li")
@@ -298,12 +290,12 @@ def _what_it_does(method: Method, scenes: list[Scene]) -> str:
         except InvalidInputError:
             continue
     silent = len(scenes) - len(solved)
-    told = f"no answer in {silent} of {len(scenes)}" if silent else ""
+    unanswered = f"no answer in {silent} of {len(scenes)}" if silent else ""
     if not solved:
-        return told
+        return unanswered
     degrees = np.median([one.error_deg for one in solved])
     millimetres = np.median([one.error_mm for one in solved])
-    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {told}" if told else "")
+    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {unanswered}" if unanswered else "")
 
 
 def _repeating(num_views: int) -> Maker:
@@ -502,15 +494,15 @@ def _mount(ours: MethodResult) -> list[Requirement]:
 
 def notes(results: Results) -> list[str]:
     """Notes on results that the requirements do not show."""
-    told = []
+    texts = []
     for name in (OURS, OURS_POSES, OURS_SIZE_KNOWN):
         rotation, translation = not_worse_share(results[name], results[PARK], tolerance_sigmas=0.0)
-        told.append(
+        texts.append(
             f"{name}: without tolerance its error is at most Park's in {rotation:.0%} of the seeds "
             f"(rotation) and {translation:.0%} (translation). Both use the same noisy data, so "
             "even the better estimator does not have the smaller error in every seed."
         )
-    return told
+    return texts
 
 
 AMOUNTS = Amounts(

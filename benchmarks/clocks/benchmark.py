@@ -284,7 +284,6 @@ STAMPLESS: dict[str, Way] = {
     "arrival stamps": ONLINE["arrival stamps"],
 }
 
-
 OURS_ONLINE, OURS_OFFLINE, ARRIVALS = "ours, online", "ours, offline", "arrival stamps"
 COARSE = "stamps of 1 ms"
 

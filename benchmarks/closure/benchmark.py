@@ -243,8 +243,7 @@ class RetargetedTake:
 def retarget_take(episode: TruthEpisode) -> RetargetedTake:
     """Retarget both hands at their keypoint rate and resample everything to the model grid.
 
-    Raises:
-        InvalidInputError: an episode of robot hands, which has no keypoints.
+    Raises InvalidInputError for an episode of robot hands, which has no keypoints.
     """
     if episode.attributes.domain != "human":
         raise InvalidInputError(

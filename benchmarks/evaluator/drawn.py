@@ -21,10 +21,8 @@ from services.evaluation.statistics import Counts, Interval, central_interval, s
 def interval_of_draws(figures: np.ndarray) -> Interval | None:
     """95 % percentile interval of figures [draws] of a bootstrap that are defined, thus not NaN.
 
-    Returns None where more than half are undefined.
-
-    Raises:
-        ShapeError: not one axis with at least one draw.
+    Returns None where more than half are undefined. Raises ShapeError for not one axis with at
+    least one draw.
     """
     if figures.ndim != 1 or len(figures) == 0:
         raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")
@@ -209,16 +207,16 @@ class Sampling:
         mine, success = having(kind, rollouts)
         if not mine:
             return undefined(what, ("at most", bound))
-        told, starts = probabilities(mine, kind), self.starts(mine)
+        estimates, starts = probabilities(mine, kind), self.starts(mine)
         draws = []
         for row in self.counts[:_NUM_CALIBRATION_DRAWS]:
-            chosen = np.repeat(np.arange(len(told)), row[starts].astype(int))
+            chosen = np.repeat(np.arange(len(estimates)), row[starts].astype(int))
             some = len(chosen) > 0
             draws.append(
-                expected_calibration_error(told[chosen], success[chosen]) if some else math.nan
+                expected_calibration_error(estimates[chosen], success[chosen]) if some else math.nan
             )
-        value = expected_calibration_error(told, success)
-        return Drawn(what, value, np.array(draws), len(told), ("at most", bound))
+        value = expected_calibration_error(estimates, success)
+        return Drawn(what, value, np.array(draws), len(estimates), ("at most", bound))
 
     def mean(
         self, what: str, values: np.ndarray, rollouts: Sequence[Rolled], bound: Bound
@@ -256,16 +254,16 @@ def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line
     lines = []
     for same in zip(*by_seed, strict=True):
         values = [one.value for one in same]
-        shown = tuple(value if math.isfinite(value) else None for value in values)
+        known = tuple(value if math.isfinite(value) else None for value in values)
         draws = np.stack(np.broadcast_arrays(*(one.draws for one in same))).mean(axis=0)
-        lines.append(_line(task, same[0], (float(np.mean(values)), draws), shown))
+        lines.append(_line(task, same[0], (float(np.mean(values)), draws), known))
         if same[0].worst is not None and len(same) > 1 and np.isfinite(values).all():
             least = same[0].bound[0] == "at least"
             one = same[int(np.argmin(values) if least else np.argmax(values))]
             about = replace(
                 one, what=f"{one.what}, worst training seed", bound=(one.bound[0], same[0].worst)
             )
-            lines.append(_line(task, about, (one.value, one.draws), shown))
+            lines.append(_line(task, about, (one.value, one.draws), known))
     return lines
 
 

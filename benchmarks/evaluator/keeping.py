@@ -58,11 +58,7 @@ class KeptRows:
         return self._rows.get(row_key(about))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Write rows.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Write rows; raises StorageError if the file cannot be written."""
         new = [row for row in rows if row_key(row) not in self._rows]
         text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in new)
         try:
@@ -103,8 +99,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read arrays written by `write_arrays`.
 
-    Raises:
-        CorruptDataError: a file that is not one of ours.
+    Raises CorruptDataError for a file that is not one of ours.
     """
     try:
         with np.load(path, allow_pickle=False) as kept:
@@ -136,9 +131,7 @@ Earlier = Mapping[tuple[str, str], _EarlierLine]
 def read_lines(path: Path) -> Earlier:
     """Lines of the `evaluator.json` of an earlier run, by task and name.
 
-    Raises:
-        NotFoundError: no such file.
-        CorruptDataError: no such report.
+    Raises NotFoundError for no such file, and CorruptDataError for no such report.
     """
     if not path.is_file():
         raise NotFoundError(f"evaluator: no file {path} to compare with; see --repeats")
@@ -154,8 +147,7 @@ def read_lines(path: Path) -> Earlier:
 def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
     """Difference of each figure that both runs have, with its tolerance.
 
-    Raises:
-        InvalidInputError: no line in common.
+    Raises InvalidInputError without a line in common.
     """
     if not any((line.task, line.what) in earlier for line in lines):
         raise InvalidInputError(
@@ -167,11 +159,11 @@ def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
         other = earlier.get((line.task, line.what))
         if other is None or other.value is None or other.unit not in TOLERANCES:
             continue
-        apart = None if line.value is None else abs(line.value - other.value)
+        difference = None if line.value is None else abs(line.value - other.value)
         what = f"{line.task}: {line.what}, apart from {other.value:.3f} before"
         sampling = math.hypot(_half_width(line.interval), _half_width(other.interval))
         bound = max(TOLERANCES[other.unit], sampling)
-        found.append(at_most(what, apart, bound, line.unit))
+        found.append(at_most(what, difference, bound, line.unit))
     return found
 
 

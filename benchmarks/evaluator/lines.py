@@ -39,12 +39,6 @@ def f1(counts: np.ndarray) -> Float64[np.ndarray, "*batch"]:
     return np.asarray(np.where(total > 0, 2 * both / np.maximum(total, 1), 1.0))
 
 
-def chunk_figures_drawn(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    """All lines of the chunks of one training seed."""
-    contact, images = _contact(sampling, scripts), _images(sampling, scripts)
-    return [*contact, *images, _sharpness(sampling, scripts)]
-
-
 def _contact(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
     """F1 of moving chunks; contacts of all rollouts are pooled by chunk index."""
     names = (f"{_COPY}, {_WHERE}", f"{_CONTEXT}, {_WHERE}")
@@ -136,8 +130,8 @@ def chunk_rows(task: str, scripts: Sequence[Rolled]) -> list[dict[str, Any]]:
         names = ("f1", "f1_of_copy", "f1_with_true_context")
         columns = [f1(counts.sum(axis=0)) for counts in contact_counts_of(mine)]
         for row, share, *values in zip(rows, moving(mine).mean(axis=0), *columns, strict=True):
-            told = dict(zip(names, map(float, values), strict=True))
-            row.update({"moving": float(share)} | (told if share else {}))
+            contact = dict(zip(names, map(float, values), strict=True))
+            row.update({"moving": float(share)} | (contact if share else {}))
     for name in _IMAGES:
         whole, both = image_figures(scripts, name)
         for row, pair in zip(rows, both.mean(axis=0) if whole else [], strict=False):
@@ -213,11 +207,11 @@ class KindFigures:
         found = [group_figures(self._sampling, "", seed) for seed in by_seed]
         means = [float(np.mean([one.value for one in same])) for same in zip(*found, strict=True)]
         first = by_seed[0]
-        told = [[one.rows[IMAGINED]["likely_success"] for one in seed] for seed in by_seed]
+        likely = [[one.rows[IMAGINED]["likely_success"] for one in seed] for seed in by_seed]
         row: dict[str, Any] = {
             "rollouts": len(first),
             "real": float(np.mean([one.success for one in first])),
-            "imagined": float(np.mean(told)),
+            "imagined": float(np.mean(likely)),
             **{
                 name: mean if math.isfinite(mean) else None
                 for name, mean in zip(_COLUMNS, means, strict=True)
@@ -244,7 +238,7 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
     likely = np.array([verdict["likely_success"] for verdict in verdicts], dtype=bool)
     decided = np.array([_is_decided(verdict) for verdict in verdicts], dtype=bool)
     wrong = likely != success
-    told = [one for one, sure in zip(rollouts, decided, strict=True) if sure]
+    decided_rollouts = [one for one, sure in zip(rollouts, decided, strict=True) if sure]
     uncertainty = np.array([uncertainty_of(verdict) for verdict in verdicts])
     too_many: Bound = ("at most", 0.08)
     off = sampling.mean(
@@ -255,7 +249,7 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
         sampling.balanced(f"{each}, balanced accuracy", IMAGINED, rollouts, 0.80),
         Drawn(off.what, abs(off.value), abs(off.draws), off.num, off.bound),
         sampling.mean(
-            f"{what}, wrong among the decided", wrong[decided].astype(float), told,
+            f"{what}, wrong among the decided", wrong[decided].astype(float), decided_rollouts,
             ("at most", 0.10),
         ),
         sampling.mean(f"{what}, decided", decided.astype(float), rollouts, ("at least", 0.60)),
@@ -282,19 +276,19 @@ def policy_figures(
     """
     names = list(dict.fromkeys(map(policy_of, rollouts)))
     shape = (len(names), len(sampling.seeds))
-    count, real, told = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    count, real, imagined = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for one, start in zip(rollouts, sampling.starts(rollouts), strict=True):
         at = names.index(policy_of(one)), start
         count[at] += 1
         real[at] += one.success
-        told[at] += one.rows[IMAGINED]["likely_success"]
+        imagined[at] += one.rows[IMAGINED]["likely_success"]
     about: tuple[tuple[str, Bound], ...] = (
         (f"{what}, Pearson", ("at least", bounds[0])),
         (f"{what}, MMRV with ties", ("at most", bounds[1])),
     )
     if len(names) < 2:
         return [undefined(*each) for each in about]
-    sides = {"real": real, "imagined": told}
+    sides = {"real": real, "imagined": imagined}
     means = {name: rates_of_draws(side, count, sampling.own)[0] for name, side in sides.items()}
     draws = [rates_of_draws(side, count, sampling.counts) for side in sides.values()]
     values = (pearson(**means), mmrv(**means, ties="simpler"))
@@ -309,11 +303,7 @@ def policy_figures(
 
 
 def kind_of(one: Rolled) -> str:
-    """The kind of mistake of a rollout.
-
-    Raises:
-        ValueError: a policy without a mistake.
-    """
+    """The kind of mistake of a rollout; raises ValueError for a policy without a mistake."""
     mistake = mistake_of(one.policy)
     if mistake is None:
         raise ValueError(f"got policy {one.policy!r}, expected one with a mistake")
@@ -453,7 +443,9 @@ class TaskFigures:
             *_decision_figures(sampling, scripts),
             *_policy_figures(sampling, scripts, everything),
             *_idle_figures(sampling, everything),
-            *chunk_figures_drawn(sampling, scripts),
+            *_contact(sampling, scripts),
+            *_images(sampling, scripts),
+            _sharpness(sampling, scripts),
             *_wrong_action_figures(sampling, everything),
             *_still_figures(sampling, everything),
             *rival_figures(sampling, scripts, others),

@@ -54,9 +54,8 @@ class KindsPlan:
     ) -> "KindsPlan | None":
         """The plan of the name of a set, or of NAME,NAME…; None for "none".
 
-        Raises:
-            UnknownNameError: no such set or kind.
-            InvalidInputError: no strengths, or one twice.
+        Raises UnknownNameError for no such set or kind, and InvalidInputError for no strengths, or
+        one twice.
         """
         if text == NONE:
             return None
@@ -104,11 +103,7 @@ class ClonedPolicy:
 
     @classmethod
     def parse(cls, text: str) -> "ClonedPolicy":
-        """A policy from NAME=PATH.
-
-        Raises:
-            InvalidInputError: other text, or no such file.
-        """
+        """A policy from NAME=PATH; raises InvalidInputError for other text, or no such file."""
         name, _, path = text.partition("=")
         if not name or not Path(path).is_file():
             raise InvalidInputError(f"--cloned: got {text!r}, expected NAME=PATH of a checkpoint")
@@ -131,8 +126,7 @@ class OutsidePolicy:
     def parse(cls, text: str) -> "OutsidePolicy":
         """A policy from [NAME=]MODULE:FACTORY.
 
-        Raises:
-            InvalidInputError, NotFoundError, UnknownNameError: it does not load.
+        Raises InvalidInputError, NotFoundError or UnknownNameError if it does not load.
         """
         source = PolicySource.parse(text)
         source.load({})
@@ -170,8 +164,8 @@ def trained_seeds(
     Raises:
         InvalidInputError: several judges, but not one for each world; or no world or judge.
     """
-    asked = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
-    for what, paths, least in asked:
+    options = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
+    for what, paths, least in options:
         if not worlds or not (least <= len(paths) <= 1 or len(paths) == len(worlds)):
             raise InvalidInputError(
                 f"evaluator: got {len(paths)} {what} for {len(worlds)} --world, expected one for "

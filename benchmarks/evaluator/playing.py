@@ -138,7 +138,7 @@ def play_in_imagination(
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
     uses_images = _begin(policy, start)
-    shown: list[Observation] = []
+    observed: list[Observation] = []
     for at in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, at, world)
         if uses_images == "all" or at + CHUNK_STEPS == NUM_STEPS:
@@ -152,14 +152,14 @@ def play_in_imagination(
             images.append(last.observation.images[HEAD_CAMERA][-1])
         state, seen = step.state, last.observation
         touch.append(step.observation.tactile_kpa)
-        shown.append(seen)
+        observed.append(seen)
     poses = seen.object_poses
     return ImaginedRollout(
         np.concatenate(touch),
         _stacked(images, seen),
         seen.images[HEAD_CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
-        rollout_uncertainty(shown),
+        rollout_uncertainty(observed),
     )
 
 
@@ -213,10 +213,10 @@ def start_in_twin(
     twin: TwinWorld, task: str, seed: int, instruction: str
 ) -> tuple[StartedRollout[TwinState], RolloutStart, PolicyStart]:
     """Start of a rollout in the twin, and the same start for an imagined world and a policy."""
-    asked = RolloutStart(task=task, seed=seed, instruction=instruction)
-    started = twin.reset(asked)
+    request = RolloutStart(task=task, seed=seed, instruction=instruction)
+    started = twin.reset(request)
     imagined = replace(
-        asked, observation=started.observation, anchor=started.anchor, K_head=started.K_head
+        request, observation=started.observation, anchor=started.anchor, K_head=started.K_head
     )
     return started, imagined, PolicyStart(task, instruction, seed, started.anchor, started.K_head)
 
@@ -420,8 +420,8 @@ def hold_still(
     chunk = np.repeat(row[None], CHUNK_STEPS, axis=0)
     for index in range(1, STILL_CHUNKS + 1):
         if index % STILL_SHOWN_EVERY == 0:
-            shown = world.step(state, chunk, seed=index, selector=_LAST_HEAD_IMAGE)
-            images.append(shown.observation.images[HEAD_CAMERA][-1])
+            observed = world.step(state, chunk, seed=index, selector=_LAST_HEAD_IMAGE)
+            images.append(observed.observation.images[HEAD_CAMERA][-1])
         step = world.step(state, chunk, seed=index, selector=_NO_IMAGES)
         greatest = max(greatest, float(step.observation.tactile_kpa.max()))
         state = step.state

@@ -115,8 +115,7 @@ def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
 def refuse_unequal_rivals(members: Sequence[Member]) -> None:
     """Refuse baselines of the training seeds that were not trained on the same tasks.
 
-    Raises:
-        InvalidInputError: direct judges, or worlds without touch, of different tasks.
+    Raises InvalidInputError for direct judges, or worlds without touch, of different tasks.
     """
     refuse_unequal_tasks("--direct", [m.direct.metadata.tasks for m in members if m.direct])
     worlds = [m.untouched.description.tasks for m in members if m.untouched]
@@ -126,8 +125,7 @@ def refuse_unequal_rivals(members: Sequence[Member]) -> None:
 def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
     """Refuse networks of several training seeds that were trained on different tasks.
 
-    Raises:
-        InvalidInputError: different tasks.
+    Raises InvalidInputError for different tasks.
     """
     if any(set(tasks) != set(known[0]) for tasks in known):
         raise InvalidInputError(
@@ -139,8 +137,7 @@ def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
 def write_single_members(world: Path | None, folder: Path) -> list[Path]:
     """Write a checkpoint of every member of a state model's ensemble (None: the package's own).
 
-    Raises:
-        CorruptDataError: not a state model.
+    Raises CorruptDataError if it is none.
     """
     whole = read_state_checkpoint(world or default_checkpoint())
     folder.mkdir(parents=True, exist_ok=True)
@@ -302,8 +299,8 @@ class PolicyRollout:
         row = self._started.observation.action_reached[-1]
         path = self._path("held_still", self._twin.description.digest)
         if not path.is_file():
-            asked = RolloutStart(self._task, self._seed, self._first.instruction)
-            true = hold_still(self._twin, asked, row)
+            request = RolloutStart(self._task, self._seed, self._first.instruction)
+            true = hold_still(self._twin, request, row)
             write_arrays(path, {"images": true.images})
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
@@ -424,8 +421,7 @@ class Study:
     def rows(self, task: str, seed: int, missing: Missing) -> Iterator[Row]:
         """Roll out and judge; rollouts with kept arrays are not repeated.
 
-        Raises:
-            ConflictError: a judge or cloned policy was trained on this start.
+        Raises ConflictError if a judge or cloned policy was trained on this start.
         """
         self._refuse_training_start(task, seed)
         for policy, names in missing.items():

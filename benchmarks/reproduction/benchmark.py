@@ -64,12 +64,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             except NotFoundError as error:
                 notes.append(f"{table}: no table; {error.message}")
     data = data_table(keep, steps)
-    shown = [table for page in pages for table in page.tables()]
+    of_pages = [table for page in pages for table in page.tables()]
     report = StageReport(
         stage="reproduction",
         packages=("numpy", "torch", "mujoco-core"),
         options={"tables": tables, "seeds": options.seeds, "sizes": sizes.model_dump(mode="json")},
-        tables=[_step_table(steps, keep)] if options.list else [*shown, data],
+        tables=[_step_table(steps, keep)] if options.list else [*of_pages, data],
         requirements=[Requirement("steps that fail", float(len(failed)), "at most", 0.0)],
         data={
             "tables": [page.to_json() for page in pages],

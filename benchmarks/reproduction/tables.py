@@ -165,7 +165,7 @@ class Page:
     def tables(self) -> list[ResultTable]:
         """The table without the rows that have no figure, and the differences."""
         columns = list(self.rows[0].cells)
-        shown = [row for row in self.rows if row.is_available]
+        available = [row for row in self.rows if row.is_available]
         beside = [one for one in REFERENCES_SHOWN if one in self.rows[0].references]
         head = ("", *columns, *(REFERENCES_SHOWN[one] for one in beside))
         rows = [
@@ -174,13 +174,13 @@ class Page:
                 *map(row.text, columns),
                 *(Measured((row.references.get(one, math.nan),)).text() for one in beside),
             )
-            for row in shown
+            for row in available
         ]
         found = [ResultTable(self.title, head, rows)]
         if self.base is not None:
             others = [one for one in columns if one != self.base]
             differences = []
-            for row in shown:
+            for row in available:
                 cells = (row.cells[one].less(row.cells[self.base]) for one in others)
                 differences.append((row.name, *(cell.text(signed=True) for cell in cells)))
             title = f"{self.title}: difference from {self.base}, seed by seed"
@@ -216,8 +216,7 @@ def _finite(value: float) -> float | None:
 def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Page]:
     """Tables of an experiment whose steps are done.
 
-    Raises:
-        NotFoundError: the result of a step is missing.
+    Raises NotFoundError if the result of a step is missing.
     """
     makers: dict[Table, Callable[[Path, Experiments], list[Page]]] = {
         "tokenizer": _tokenizer_pages,

@@ -274,32 +274,31 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
     """The rivals of `--rivals` that are installed, and those that are not.
 
-    Raises:
-        UnknownNameError: a rival that there is not.
+    Raises UnknownNameError for a rival that there is not.
     """
-    wanted = list(RIVALS.values())
+    selected = list(RIVALS.values())
     if words is not None:
-        wanted = [] if words == _NONE else list(named("rival", RIVALS, words).values())
-    left_out = [rival for rival in wanted if missing_modules(rival)]
-    return [rival for rival in wanted if rival not in left_out], left_out
+        selected = [] if words == _NONE else list(named("rival", RIVALS, words).values())
+    left_out = [rival for rival in selected if missing_modules(rival)]
+    return [rival for rival in selected if rival not in left_out], left_out
 
 
 def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
     """Notes on how methods were run, and why some were skipped."""
-    told = [
+    texts = [
         f"{OURS_EXACT} is without temporal regularization; times assume a known profile of the "
         "person, errors a profile measured from the same samples"
     ]
     if chosen:
-        told.append(
+        texts.append(
             "other libraries run in separate processes, sample by sample, without their low-pass "
             f"filter, and after {NUM_WARM_UP} warm-up calls with the first sample; their keypoints "
             "are scaled by the lengths of the fingers; ours has a cold start"
         )
     if left_out:
         missing = sorted({module for rival in left_out for module in missing_modules(rival)})
-        told.append(
+        texts.append(
             f"{', '.join(rival.name for rival in left_out)} not measured: "
             f"{', '.join(missing)} not installed; {INSTALL}"
         )
-    return told
+    return texts

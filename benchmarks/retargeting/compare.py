@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -178,12 +178,7 @@ def bone_angles_deg(
 
 
 def score_bones(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> BoneScore:
-    """Score the directions of bones of the answers [T, 20].
-
-    Raises:
-        InvalidInputError: no motion, or answers of another length.
-        NonFiniteError: an answer holds NaN or infinity.
-    """
+    """Score the directions of bones of the answers [T, 20]; raises as `_check`."""
     _check(motions, answers)
     angles_deg = np.concatenate(
         [
@@ -192,20 +187,13 @@ def score_bones(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> Bon
         ]
     )
     parts = angles_deg[:, 0], angles_deg[:, 1:]
-    return BoneScore(*(float(of(part)) for part in parts for of in (np.mean, _p95)))
-
-
-def _p95(values: np.ndarray) -> float:
-    return float(np.percentile(values, 95))
+    return BoneScore(
+        *(float(of(part)) for part in parts for of in (np.mean, partial(np.percentile, q=95)))
+    )
 
 
 def score_robot(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> RobotScore:
-    """Errors of the answers [T, 20] to motions of the robot's own hand.
-
-    Raises:
-        InvalidInputError: no motion, or answers of another length.
-        NonFiniteError: an answer holds NaN or infinity.
-    """
+    """Errors of the answers [T, 20] to motions of the robot's own hand; raises as `_check`."""
     _check(motions, answers)
     tips, joints = [], []
     for motion, answer in zip(motions, answers, strict=True):
@@ -227,9 +215,7 @@ def score_robot(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> Rob
 def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray]) -> PinchScore:
     """Score the answers [T, 20] to motions of pinching people.
 
-    Raises:
-        InvalidInputError: no motion, no sample with a pinch, or answers of another length.
-        NonFiniteError: an answer holds NaN or infinity.
+    Raises InvalidInputError if no sample has a pinch, and as `_check`.
     """
     _check(motions, answers)
     gaps, angles = [], []
@@ -267,6 +253,7 @@ def _num_outside(motions: Sequence[Any], answers: Sequence[np.ndarray]) -> int:
 
 
 def _check(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> None:
+    """Raise InvalidInputError without motions or for other lengths, NonFiniteError for NaN."""
     lengths = [len(motion) for motion in motions], [len(answer) for answer in answers]
     if not motions or lengths[0] != lengths[1]:
         raise InvalidInputError(
@@ -320,6 +307,7 @@ class Speed:
 
 Rivals = Mapping[str, RivalProcess]
 RobotScores = dict[str, dict[str, RobotScore]]
+Score = TypeVar("Score")
 
 
 def robot_sets(effort: Effort) -> dict[str, list[Motion]]:
@@ -342,53 +330,51 @@ def pinch_set(effort: Effort) -> list[PinchMotion]:
     return [motion for side in SIDES for motion in motions[side]]
 
 
+def compare(
+    what: str,
+    sets: Mapping[Any, Sequence[Motion]],
+    score: Callable[[Any, Sequence[np.ndarray]], Score],
+    names: Sequence[str],
+    rivals: Rivals,
+    bar: Bar,
+) -> dict[Any, dict[str, Score]]:
+    """Every method on every set of motions: set → method → score."""
+    scores: dict[Any, dict[str, Score]] = {key: {} for key in sets}
+    with bar(what, len(names) * len(sets)) as step:
+        for key, motions in sets.items():
+            for name in names:
+                step(f"{key}, {name}")
+                with suppress(LimitExceededError):
+                    answers = [_answer(name, motion, rivals) for motion in motions]
+                    scores[key][name] = score(motions, answers)
+    return scores
+
+
 def compare_robot(sets: Mapping[str, Sequence[Motion]], rivals: Rivals, bar: Bar) -> RobotScores:
     """Every method on every set: set → method → score."""
     names = [OURS, OURS_EXACT, *rivals]
-    scores: RobotScores = {name: {} for name in sets}
-    with bar("robot motions", len(names) * len(sets)) as step:
-        for set_name, motions in sets.items():
-            for name in names:
-                step(f"{set_name}, {name}")
-                with suppress(LimitExceededError):
-                    answers = [_answer(name, motion, rivals) for motion in motions]
-                    scores[set_name][name] = score_robot(motions, answers)
-    return scores
+    return compare("robot motions", sets, score_robot, names, rivals, bar)
 
 
 def compare_pinches(
     motions: Sequence[PinchMotion], rivals: Rivals, bar: Bar
 ) -> dict[str, PinchScore]:
     """Every method on people's pinches."""
-    names = [OURS, *rivals]
-    scores = {}
-    with bar("pinches", len(names)) as step:
-        for name in names:
-            step(name)
-            with suppress(LimitExceededError):
-                answers = [_answer(name, motion, rivals) for motion in motions]
-                scores[name] = score_pinches(motions, answers)
-    return scores
+    sets = {PINCH_INPUT: motions}
+    return compare("pinches", sets, score_pinches, [OURS, *rivals], rivals, bar)[PINCH_INPUT]
 
 
 def compare_axes(effort: Effort, rivals: Rivals, bar: Bar) -> dict[float, dict[str, BoneScore]]:
     """Every method on gestures of people with other axes than the robot's: degrees → method."""
-    names = [OURS, *rivals]
-    scores: dict[float, dict[str, BoneScore]] = {}
-    with bar("oblique axes", len(names) * len(OBLIQUE_DEG)) as step:
-        for oblique_deg in OBLIQUE_DEG:
-            motions: list[Motion] = [
-                oblique_motion(side, oblique_deg, effort.num_samples, effort.seed + index)
-                for side in SIDES
-                for index in range(effort.num_people)
-            ]
-            scores[oblique_deg] = {}
-            for name in names:
-                step(f"{oblique_deg:g} degrees, {name}")
-                with suppress(LimitExceededError):
-                    answers = [_answer(name, motion, rivals) for motion in motions]
-                    scores[oblique_deg][name] = score_bones(motions, answers)
-    return scores
+    sets = {
+        oblique_deg: [
+            oblique_motion(side, oblique_deg, effort.num_samples, effort.seed + index)
+            for side in SIDES
+            for index in range(effort.num_people)
+        ]
+        for oblique_deg in OBLIQUE_DEG
+    }
+    return compare("oblique axes", sets, score_bones, [OURS, *rivals], rivals, bar)
 
 
 def compare_speed(effort: Effort, rivals: Rivals, bar: Bar) -> list[Speed]:

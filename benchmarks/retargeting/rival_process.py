@@ -43,10 +43,9 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
     def run(self, motion: Motion, scale: float) -> Timed:
         """Joint angles of a motion, sample by sample, from a fresh retargeter.
 
-        Raises:
-            LimitExceededError: a call did not return within 10 s of processor time.
-            InvalidInputError: the rival refuses the keypoints.
-            UnavailableError: its library is not installed, or the process ended by itself.
+        Raises LimitExceededError if a call did not return within 10 s of processor time,
+        InvalidInputError if the rival refuses the keypoints, and UnavailableError if its library is
+        not installed, or the process ended by itself.
         """
         if self._child is None:
             environment = {"OMP_NUM_THREADS": "1"}
@@ -74,9 +73,11 @@ def serve(name: str) -> None:
     """Process requests until the end of input, each call of the rival with the timer set."""
     requests, answer = serve_parent(niceness=0)
     with tempfile.TemporaryDirectory(prefix="dextouch-bench-") as folder:
-        for asked in requests:
-            keypoints, side = np.array(asked["keypoints_m"]), asked["side"]
-            setup = set_up(RIVALS[name], keypoints, side, scale=asked["scale"], folder=Path(folder))
+        for request in requests:
+            keypoints, side = np.array(request["keypoints_m"]), request["side"]
+            setup = set_up(
+                RIVALS[name], keypoints, side, scale=request["scale"], folder=Path(folder)
+            )
             try:
                 joints, times = follow(setup)
             except (ValueError, RuntimeError) as error:

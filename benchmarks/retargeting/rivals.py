@@ -165,10 +165,8 @@ def set_up(
     """Create a retargeter for the robot hand of one side, with its references.
 
     Keypoints are [T, 25, 3] in wrist coordinates, `scale` is the size of the robot's hand relative
-    to the tracked one, the folder is for the URDF.
-
-    Raises:
-        UnavailableError: its library is not installed.
+    to the tracked one, the folder is for the URDF. Raises UnavailableError if its library is not
+    installed.
     """
     missing = missing_modules(rival)
     if missing:
@@ -179,14 +177,14 @@ def set_up(
     config = {"urdf_path": str(path), **_config(rival.objective), "low_pass_alpha": -1.0}
     config["target_joint_names"] = list(hand.joint_names)
     config["scaling_factor"] = scale
-    wanted = references(rival, keypoints_m, scale)
+    targets = references(rival, keypoints_m, scale)
     if rival.library == DEX:
         importlib.import_module("torch").set_num_threads(1)
         module = importlib.import_module("dex_retargeting.retargeting_config")
         built = module.RetargetingConfig.from_dict(config).build()
-        return Setup(list(wanted), built.retarget, list(built.joint_names))
+        return Setup(list(targets), built.retarget, list(built.joint_names))
     built = importlib.import_module("dexi_rs").load_config(config).build()
-    flat = wanted.reshape(len(wanted), -1).tolist()
+    flat = targets.reshape(len(targets), -1).tolist()
     return Setup(flat, built.retarget, list(built.joint_names))
 
 

@@ -62,17 +62,17 @@ async def answer_messages(connection: ServerConnection) -> None:
     with suppress(ConnectionClosed):
         while True:
             message = await connection.recv(decode=False)
-            asked = msgpack.unpackb(message, object_hook=_decoded)
-            actions, selector = asked["actions"], selectors[asked["steps"]]
+            request = msgpack.unpackb(message, object_hook=_decoded)
+            actions, selector = request["actions"], selectors[request["steps"]]
             stepped = world.step(state, actions, seed=0, selector=selector)
             state, seen = stepped.state, stepped.observation
-            shown = {
+            fields = {
                 "first_step": seen.first_step,
                 "tactile_kpa": seen.tactile_kpa,
                 "action_reached": seen.action_reached,
                 **{f"image/{camera}": images for camera, images in seen.images.items()},
             }
-            await connection.send(msgpack.packb(shown, default=_encoded))
+            await connection.send(msgpack.packb(fields, default=_encoded))
 
 
 @contextmanager

@@ -129,10 +129,10 @@ class BatchDevice(Device):
     ) -> list[SteppedRollout[int]]:
         """See BatchWorld."""
         time.sleep(DEVICE_S * (FIXED_SHARE + (1 - FIXED_SHARE) * len(states)))
-        asked = [EVERYTHING] * len(states) if selectors is None else selectors
+        requested = [EVERYTHING] * len(states) if selectors is None else selectors
         return [
             StillWorld.step(self, state, chunk, seed=seed, selector=selector)
-            for state, chunk, seed, selector in zip(states, actions, seeds, asked, strict=True)
+            for state, chunk, seed, selector in zip(states, actions, seeds, requested, strict=True)
         ]
 
 
@@ -169,8 +169,8 @@ def opened(urls: Mapping[str, str], way: Way) -> Iterator[Chunk]:
         address = urls[way.server].replace("http", "ws") + "/v1/openpi"
         with connect(address, compression=None, proxy=None) as socket:
             socket.recv()
-            wanted = way.selector.model_dump(mode="json")
-            socket.send(pack_openpi({"start": start, "return": wanted}))
+            returned = way.selector.model_dump(mode="json")
+            socket.send(pack_openpi({"start": start, "return": returned}))
             unpack_openpi(_bytes(socket.recv()), max_bytes=MAX_BYTES)
             yield partial(_exchanged, socket, pack_openpi({"actions": actions}))
         return
@@ -242,8 +242,7 @@ class Crowd(NamedTuple):
 def crowd(url: str, world: str, num_rollouts: int, num_chunks: int) -> Crowd:
     """Advance rollouts of a world at the same time; the first chunk of each is not counted.
 
-    Raises:
-        TimeoutError: not done after a minute.
+    Raises TimeoutError if they are not done after a minute.
     """
 
     async def limited() -> Crowd:

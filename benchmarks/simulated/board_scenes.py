@@ -82,8 +82,7 @@ def board_points() -> Float64[np.ndarray, "k 3"]:
 def make_scene(seed: int, motion: Motion | None = None) -> Scene:
     """Simulate views of a board by a moving camera.
 
-    Raises:
-        LimitExceededError: the board is rarely inside the image.
+    Raises LimitExceededError if the board is rarely inside the image.
     """
     motion = motion or Motion()
     rng = np.random.default_rng(seed)

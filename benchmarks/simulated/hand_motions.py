@@ -141,10 +141,8 @@ def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> M
     """Robot hand motion: a sum of sines of 0.15 to 1.6 Hz per joint, collision-free.
 
     At least 2 samples at 60 Hz; natural: within the usual range of hands, otherwise the joints'
-    whole range.
-
-    Raises:
-        LimitExceededError: no motion of this seed is slow enough and collision-free.
+    whole range. Raises LimitExceededError if no motion of this seed is slow enough and
+    collision-free.
     """
     hand = twin_hand(side, "robot")
     rng = np.random.default_rng([seed, int(natural), int(side == "right")])
@@ -269,8 +267,8 @@ def _person(side: Side, oblique_deg: float, rng: np.random.Generator) -> HandMod
     for finger in human_fingers(side):
         rows = [_tilted(row, oblique_deg, rng) for row in finger.joints]
         if finger.chain == "thumb" and oblique_deg:
-            apart = SADDLE_OFFSET_M * rng.normal(size=3) / np.sqrt(3)
-            rows[1] = rows[1]._replace(position_m=tuple(apart.tolist()))
+            offset_m = SADDLE_OFFSET_M * rng.normal(size=3) / np.sqrt(3)
+            rows[1] = rows[1]._replace(position_m=tuple(offset_m.tolist()))
         fingers.append(finger._replace(joints=tuple(rows)))
     return HandModel(side, fingers, name="person")
 
@@ -458,8 +456,7 @@ def people(side: Side, seed: int) -> list[Person]:
 def pinch_motion(person: Person, side: Side) -> PinchMotion:
     """Four consecutive pinches: closing, holding while the tips roll, opening; 440 samples.
 
-    Raises:
-        LimitExceededError: this hand cannot bring a pair of tips together within its limits.
+    Raises LimitExceededError if this hand cannot bring a pair of tips together within its limits.
     """
     relaxed = np.array(_RELAXED_RAD)
     parts = []

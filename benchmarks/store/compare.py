@@ -88,10 +88,8 @@ def compare(
 ) -> dict[str, DesignResult]:
     """Write and read one take with every design in each round.
 
-    A design that reads another's files requires that other; each has a subfolder.
-
-    Raises:
-        CorruptDataError: a design returned other values than were written.
+    A design that reads another's files requires that other; each has a subfolder. Raises
+    CorruptDataError if a design returned other values than were written.
     """
     written = _write_rounds(designs, workload, folder, effort.num_rounds, bar)
     readers = {d.name: d.open(folder / (d.reads or d.name)) for d in designs}
@@ -129,8 +127,7 @@ def image_psnr(
 ) -> dict[str, float]:
     """Mean PSNR of each camera over spans of the take; numeric values must be exact.
 
-    Raises:
-        CorruptDataError: other values, or images of another shape, than were written.
+    Raises CorruptDataError for other values, or images of another shape, than were written.
     """
     spans = np.linspace(0, workload.num_starts - 1, num_spans + 2).astype(int)[1:-1]
     psnr_db = {}

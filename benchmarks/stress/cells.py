@@ -157,8 +157,7 @@ class StageCells:
     def row(self) -> list[Cell | Exemption]:
         """Every hazard in the order of the matrix.
 
-        Raises:
-            UnknownNameError: a hazard of the matrix has neither a check nor a reason.
+        Raises UnknownNameError if a hazard of the matrix has neither a check nor a reason.
         """
         missing = [hazard for hazard in HAZARDS if hazard not in self.cells]
         if missing:

@@ -79,8 +79,8 @@ def _precision(check: Check) -> None:
     device, host = _take(2000, 35.0)
     shift = 2**62 + 12_345
     near, far = fit_clock(device, host), fit_clock(device + shift, host + shift)
-    apart = far.to_host_ns(device + shift) - shift - near.to_host_ns(device)
-    check.at_most("dates change by", np.abs(apart).max(), 0, "ns")
+    difference = far.to_host_ns(device + shift) - shift - near.to_host_ns(device)
+    check.at_most("dates change by", np.abs(difference).max(), 0, "ns")
     live = _live(device[:500], host[:500])
     moved = _live(device[:500] + shift, host[:500] + shift) - shift - live
     check.at_most("live dates change by", np.abs(moved).max(), 0, "ns")

@@ -39,10 +39,10 @@ def _rotations(check: Check) -> None:
     R = rotation_from_vector(vectors)
     found = vector_from_rotation(R)
     # At π both signs of the axis are the same rotation.
-    apart, opposite = (np.linalg.norm(found - sign * vectors, axis=1) for sign in (1, -1))
+    same, opposite = (np.linalg.norm(found - sign * vectors, axis=1) for sign in (1, -1))
     is_half_turn = np.linalg.norm(vectors, axis=1) > 3.1415926
-    apart = np.where(is_half_turn, np.minimum(apart, opposite), apart)
-    check.at_most("there and back", apart.max(), 1e-7, "rad")
+    same = np.where(is_half_turn, np.minimum(same, opposite), same)
+    check.at_most("there and back", same.max(), 1e-7, "rad")
     far = rotation_from_vector((np.array(_BEYOND_RAD)[:, None, None] * _AXES).reshape(-1, 3))
     beyond = rotation_angle(far).reshape(len(_BEYOND_RAD), -1)
     expected = np.abs((np.array(_BEYOND_RAD) + np.pi) % (2 * np.pi) - np.pi)

@@ -177,9 +177,9 @@ STAGE.does_not_apply(
 @cache
 def _episode() -> EpisodeArrays:
     """A static scene of the twin with a moving hand and some touch."""
-    shown = demonstration(_PX)
-    start, observation = shown.policy_start, shown.observation
-    rows = np.concatenate([observation.action_reached, shown.actions[: _STEPS - 1]])
+    take = demonstration(_PX)
+    start, observation = take.policy_start, take.observation
+    rows = np.concatenate([observation.action_reached, take.actions[: _STEPS - 1]])
     touch = np.random.default_rng(0).uniform(0, 20, (_STEPS, 2, 320)).astype(np.float32)
     return EpisodeArrays(
         episode_id="stress",

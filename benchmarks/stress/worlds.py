@@ -197,8 +197,8 @@ def there_and_back(actions: np.ndarray) -> Sequence[np.ndarray]:
     """63 chunks that play a demonstration forward and backward repeatedly."""
     whole = actions[: len(actions) // CHUNK_STEPS * CHUNK_STEPS]
     rounds = np.concatenate([whole, whole[::-1]])
-    wanted = np.arange(NUM_CHUNKS * CHUNK_STEPS) % len(rounds)
-    return [rounds[wanted[k : k + CHUNK_STEPS]] for k in range(0, len(wanted), CHUNK_STEPS)]
+    rows = np.arange(NUM_CHUNKS * CHUNK_STEPS) % len(rounds)
+    return [rounds[rows[k : k + CHUNK_STEPS]] for k in range(0, len(rows), CHUNK_STEPS)]
 
 
 def check_answer(check: Check, observation: Observation) -> None:

@@ -39,11 +39,11 @@ async def answer_samples(connection: ServerConnection) -> None:
             since_s = 1 / 60 if last_ns is None else max(now_ns - last_ns, 1) * 1e-9
             joints = retargeter.step(arrays["keypoints_m"], since_s).joints_rad[0]
             last_ns = now_ns
-            shown = {
+            answer = {
                 "joints_rad": dict(zip(names, joints.tolist(), strict=True)),
                 "t_device_ns": now_ns,
             }
-            await connection.send(pack(shown, {}))
+            await connection.send(pack(answer, {}))
 
 
 @contextmanager

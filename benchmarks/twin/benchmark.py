@@ -73,7 +73,6 @@ class TimedChunk:
 
 AS_SERVED: Final = "as served"
 
-
 # Options of MuJoCo that differ from the twin's.
 SOLVERS: Final[Mapping[str, Mapping[str, int]]] = {
     AS_SERVED: {},

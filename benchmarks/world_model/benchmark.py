@@ -196,19 +196,19 @@ def error_table(
     )
 
 
-def asked_name(asked: str, batch: int) -> str:
+def cost_name(amount: str, batch: int) -> str:
     """Name of the figure for requested images and a batch size."""
-    return f"{asked}, batch of {batch}"
+    return f"{amount}, batch of {batch}"
 
 
 def state_model_table(costs_ms: Mapping[str, Figure], name: str) -> ResultTable:
     """Time and image rate of the state model by requested images and batch size."""
     rows = []
     for batch in STATE_BATCHES:
-        for asked, num_images in IMAGES_PER_CHUNK.items():
-            figure = costs_ms[asked_name(asked, batch)]
+        for amount, num_images in IMAGES_PER_CHUNK.items():
+            figure = costs_ms[cost_name(amount, batch)]
             rate = f"{1e3 * num_images / figure.median:.0f}" if num_images else ""
-            rows.append((asked, str(batch), figure.text(), rate))
+            rows.append((amount, str(batch), figure.text(), rate))
     return ResultTable(
         f"State model {name}: a chunk of one rollout, by requested images and batch size",
         ("requested", "batch", "ms a chunk", "images a second"),
@@ -220,11 +220,11 @@ def state_model_requirements(costs_ms: Mapping[str, Figure]) -> list[Requirement
     """Requirements on single rollouts, and on batches compared with them."""
     chunks = [
         at_most(
-            f"state model, a chunk, {asked}", costs_ms[asked_name(asked, 1)].median, bound_ms, "ms"
+            f"state model, a chunk, {amount}", costs_ms[cost_name(amount, 1)].median, bound_ms, "ms"
         )
-        for asked, bound_ms in MAX_STATE_CHUNK_MS.items()
+        for amount, bound_ms in MAX_STATE_CHUNK_MS.items()
     ]
-    single, batch = (costs_ms[asked_name("all images", count)] for count in (1, 16))
+    single, batch = (costs_ms[cost_name("all images", count)] for count in (1, 16))
     speedup = single.over(batch).median
     what = "state model, all images, throughput of a batch of 16 over single rollouts"
     return [*chunks, at_least(what, speedup, MIN_BATCH_SPEEDUP)]
@@ -347,7 +347,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         data={
             "chunk_ms": times_ms,
             "errors": errors,
-            "asked_ms": costs_ms,
+            "requested_ms": costs_ms,
             "state_model_ms": state_ms,
         },
         notes=[
@@ -385,8 +385,8 @@ def _costs_ms(
 ) -> dict[str, Figure]:
     """Milliseconds per chunk of one rollout, by requested images and batch size."""
     imagining = {
-        asked_name(asked, count): partial(imagine_together, world, episodes, count, selector)
+        cost_name(amount, count): partial(imagine_together, world, episodes, count, selector)
         for count in batches
-        for asked, selector in SELECTORS.items()
+        for amount, selector in SELECTORS.items()
     }
     return _times_ms(imagining, "requested images and batch sizes", num_rounds, bar)

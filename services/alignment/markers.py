@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import apply, invert, transform, transform_from_pose
+from dextouch.geometry import Distortion, apply, invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector, vector_from_rotation
 from dextouch.schemas import MarkerDictionary, ObjectMarker, SceneObject, SceneObjects
 
@@ -133,7 +133,7 @@ class MarkerTracker:
         objects: Sequence[SceneObject],
         dictionary: MarkerDictionary,
         K: Float64[np.ndarray, "3 3"],
-        distortion: Float64[np.ndarray, "5"],
+        distortion: Distortion,
     ) -> None:
         self._objects = [one for one in objects if one.markers]
         self._lens = (K, distortion)

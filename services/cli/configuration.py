@@ -58,11 +58,7 @@ class Setting(NamedTuple):
 
 
 def settings_class(section: str) -> type[serving.CommandSettings]:
-    """Settings class of a section.
-
-    Raises:
-        UnknownNameError: no such section.
-    """
+    """Settings class of a section; raises UnknownNameError if there is none."""
     if section not in SECTIONS:
         raise UnknownNameError("section", section, list(SECTIONS))
     module, _, name = SECTIONS[section].partition(":")
@@ -76,9 +72,7 @@ def apply_configuration() -> None:
     """Use the data folder of the configuration file, and refuse sections that no command has.
 
     The folder is relative to the file; the environment variable DEXTOUCH_DATA comes before it.
-
-    Raises:
-        InvalidInputError: an unknown section, or an unreadable file.
+    Raises InvalidInputError for an unknown section, or an unreadable file.
     """
     path = serving.configuration_path()
     if path is None:
@@ -96,8 +90,7 @@ def apply_configuration() -> None:
 def effective_settings(section: str) -> list[Setting]:
     """Settings of a section as a command without flags would get them.
 
-    Raises:
-        InvalidInputError: an invalid or unknown setting; lines of the file are named.
+    Raises InvalidInputError for an invalid or unknown setting; lines of the file are named.
     """
     kind = settings_class(section)
     try:

@@ -75,10 +75,10 @@ DEVICE_KINDS: Final = {
     "USB devices": ("bus/usb/*/*",),
     "cameras": ("video*",),
 }
-MAX_LATENCY_TIMER_MS = 1
-MIN_MEMORY_BYTES = 2 * 10**9
+MAX_LATENCY_TIMER_MS = 1  # the least that FTDI chips take
+MIN_MEMORY_BYTES = 2 * 10**9  # chosen: a warning, nothing is refused
 NVIDIA, DISPLAY_CLASS = "0x10de", "0x03"
-COMMAND_TIMEOUT_S = 5.0
+COMMAND_TIMEOUT_S = 5.0  # chosen: for local commands
 
 
 @dataclass(frozen=True)
@@ -193,11 +193,13 @@ class Machine:
 
     def _clock(self) -> Finding:
         """Whether something keeps the wall clock right, which names and dates the takes."""
-        shown = self.output_of(["timedatectl", "show", "--property=NTPSynchronized", "--value"])
+        synchronized = self.output_of(
+            ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
+        )
         tracking = self.output_of(["chronyc", "-n", "tracking"]) or ""
-        if (shown or "").strip() == "yes" or ": Normal" in tracking:
+        if (synchronized or "").strip() == "yes" or ": Normal" in tracking:
             return Finding("wall clock", "synchronized")
-        known = shown is not None or tracking
+        known = synchronized is not None or tracking
         found = "not synchronized" if known else "unknown: neither timedatectl nor chronyc answers"
         do = "sudo apt-get install chrony && sudo systemctl enable --now chrony"
         return _advice("wall clock", found, do)
@@ -311,14 +313,14 @@ def opencv_findings() -> list[Finding]:
     ours = _DISTRIBUTIONS["cv2"]
     kept = f"{ours}=={installed[ours]}" if ours in installed else f"{ours}>=4.14,<5"
     do = pip_install("--force-reinstall", "--no-deps", kept)
-    told = ", ".join(f"{name} {version}" for name, version in installed.items())
+    versions = ", ".join(f"{name} {version}" for name, version in installed.items())
     loaded = _loaded_opencv()
     if loaded is None:
-        return [_advice("module cv2", f"damaged; {told} bring it", do)]
+        return [_advice("module cv2", f"damaged; {versions} bring it", do)]
     if loaded == (ours, installed.get(ours)):
-        also = f"; installed with it: {told}" if len(installed) > 1 else ""
+        also = f"; installed with it: {versions}" if len(installed) > 1 else ""
         return [Finding("module cv2", f"of {ours} {loaded[1]}{also}")]
-    found = f"of {loaded[0]} {loaded[1]}; installed: {told}"
+    found = f"of {loaded[0]} {loaded[1]}; installed: {versions}"
     return [_advice("module cv2", found, do)]
 
 
@@ -361,11 +363,11 @@ def _outdated() -> list[Finding]:
     try:
         from packaging.requirements import Requirement
 
-        asked = importlib.metadata.requires("dextouch-wm") or []
+        declared = importlib.metadata.requires("dextouch-wm") or []
     except (ModuleNotFoundError, importlib.metadata.PackageNotFoundError):
         return []
     wrong = []
-    for requirement in map(Requirement, sorted(set(asked))):
+    for requirement in map(Requirement, sorted(set(declared))):
         # What is installed counts, whichever extra brought it.
         try:
             version = importlib.metadata.version(requirement.name)

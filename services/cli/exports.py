@@ -93,14 +93,14 @@ def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    wanted = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
-    if options.ids and wanted:
-        raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
+    criteria = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
+    if options.ids and criteria:
+        raise InvalidInputError(f"got ids and filters {sorted(criteria)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
         raise InvalidInputError("got an id twice; expected every id once")
     if options.ids:
         return list(options.ids)
-    matching = _matching(store, options.kind, wanted)
+    matching = _matching(store, options.kind, criteria)
     found = matching
     if not options.with_rejected and options.review is None:
         about = ((name, store.open_item(options.kind, name).attributes) for name in matching)
@@ -108,9 +108,9 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     num_rejected = len(matching) - len(found)
     left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
-        shown = {key: str(value) for key, value in wanted.items()}
+        named = {key: str(value) for key, value in criteria.items()}
         raise NotFoundError(
-            f"{options.store}: no {options.kind} matches {shown or 'anything'}"
+            f"{options.store}: no {options.kind} matches {named or 'anything'}"
             f"{f' ({left_out})' if num_rejected else ''}; `dextouch store list` shows its contents"
         )
     if num_rejected:
@@ -118,7 +118,7 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     return found
 
 
-def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> list[str]:
+def _matching(store: EpisodeStore, kind: Kind, criteria: Mapping[str, object]) -> list[str]:
     from services.episode_store.catalog import Catalog
     from services.episode_store.filters import ItemFilter
 
@@ -131,7 +131,7 @@ def _matching(store: EpisodeStore, kind: Kind, wanted: Mapping[str, object]) -> 
     named = {"after": "created_after", "before": "created_before"}
     try:
         query = ItemFilter.model_validate(
-            {"kind": kind} | {named.get(key, key): value for key, value in wanted.items()}
+            {"kind": kind} | {named.get(key, key): value for key, value in criteria.items()}
         )
     except ValidationError as error:
         raise InvalidInputError(f"filters: {first_problems(error)}") from error
@@ -144,11 +144,11 @@ def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
         lost = reader.damaged_images(name).tolist()
         if lost:
             damaged.setdefault(reader.item_id, {})[name] = lost
-            shown = ", ".join(map(str, lost[:MAX_NAMED])) + ", …" * (len(lost) > MAX_NAMED)
+            steps = ", ".join(map(str, lost[:MAX_NAMED])) + ", …" * (len(lost) > MAX_NAMED)
             print(
                 f"{reader.item_id}: {name}: {len(lost)} of {reader.num_samples(name)} images "
                 "cannot be decoded and are left out; where a data set needs one for a step, the "
-                f"nearest other stands (images {shown})",
+                f"nearest other stands (images {steps})",
                 file=sys.stderr,
             )
 
@@ -179,17 +179,17 @@ def _export(options: argparse.Namespace) -> Report:
     ids = _ids(store, options)
     damaged: DamagedImages = {}
     report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
-    shown = progress(ids, f"export {form}", len(ids))
+    tracked = progress(ids, f"export {form}", len(ids))
     if form in JOINT_FORMATS:
         left_out: list[str] = []
-        done = _export_all(_episodes(store, shown, damaged, left_out), options)
+        done = _export_all(_episodes(store, tracked, damaged, left_out), options)
         num_new = len(ids) - len(left_out) - len(done.get("present", []))
         print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
         return report | done | {"path": str(to), "left_out": left_out}
     paths = _paths(ids, options)
     files: list[dict[str, object]] = []
     exported: list[Attributes] = []
-    for item_id in shown:
+    for item_id in tracked:
         reader = store.open_item(options.kind, item_id)
         _note_damaged(reader, damaged)
         count = _export_one(reader, paths[item_id], options)

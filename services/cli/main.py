@@ -94,7 +94,7 @@ COMMANDS = {
         "pipelines.teleoperation.app:main",
         "teleoperation",
     ),
-    "train": Command("train the world model, its judge of success, or a policy"),
+    "train": Command("train the world model, its success classifier, or a policy"),
     "train data": Command(
         "record training episodes in the twin",
         "pipelines.training_data:main",
@@ -131,7 +131,7 @@ COMMANDS = {
         "evaluation_train_policy",
     ),
     "train judge": Command(
-        "train the judge of success on true and imagined episodes",
+        "train the success classifier on true and imagined episodes",
         "evaluation.command_line:run_train_judge",
         "evaluation_train_probe",
     ),
@@ -191,9 +191,8 @@ COMMANDS = {
     "completion": Command("print the completion script of a shell", "cli.completion:main"),
 }
 
-EXIT_USAGE = 2
-EXIT_REFUSED = 3
-
+EXIT_USAGE = 2  # as argparse
+EXIT_REFUSED = 3  # a refusal with a reason, unlike a crash (1)
 
 USAGE = """\
 usage: dextouch COMMAND [options]
@@ -294,8 +293,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], has_failed: Callable[[], bool]) -> int:
     if not words or words[0] in {"-h", "--help", "help"}:
-        shown = {name: command.does for name, command in COMMANDS.items() if " " not in name}
-        print(USAGE.format(rows="\n".join(f"  {name:<19}{does}" for name, does in shown.items())))
+        top_level = {name: command.does for name, command in COMMANDS.items() if " " not in name}
+        print(
+            USAGE.format(rows="\n".join(f"  {name:<19}{does}" for name, does in top_level.items()))
+        )
         return 0
     if words[0] == "--version":
         print(f"dextouch {__version__}")

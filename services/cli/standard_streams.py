@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 EXIT_BROKEN_PIPE: Final = 141
 EXIT_NOT_WRITTEN: Final = 1
 
-
 # Failures to write the standard streams of this process.
 _failures: list[OSError] = []
 
@@ -65,10 +64,8 @@ class StandardStreams:
     def flush(self) -> None:
         """Write what waits in buffers.
 
-        Not left to the end of the process, where a failure would be a traceback.
-
-        Raises:
-            OSError: it cannot be written, or something before could not.
+        Not left to the end of the process, where a failure would be a traceback. Raises OSError if
+        it cannot be written, or something before could not.
         """
         for stream in (sys.stdout, sys.stderr):
             stream.flush()

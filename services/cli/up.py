@@ -36,22 +36,21 @@ NEEDED = ("episode_store", "acquisition", "dashboard")
 # Makes the app of one service from the settings and the addresses of all services.
 Builder = Callable[[UpSettings, Mapping[str, str]], FastAPI]
 LOCK_FILE: Final = "up.lock"
-MAX_TOLD_BYTES: Final = 1000
+MAX_HOLDER_BYTES: Final = 1000
 
 
 def ports_of_up() -> dict[str, int]:
     """Port of each service that `dextouch up` starts, from the environment and dextouch.toml.
 
-    Raises:
-        InvalidInputError: invalid settings.
+    Raises InvalidInputError for invalid settings.
     """
     settings = load_settings(UpSettings, [])
-    wanted = _wanted(settings)
+    enabled = _enabled(settings)
     fields = (name for name in UpSettings.model_fields if name.endswith("_port"))
     return {
         name: getattr(settings, field)
         for field in fields
-        if (name := field.removesuffix("_port")) in wanted
+        if (name := field.removesuffix("_port")) in enabled
     }
 
 
@@ -67,7 +66,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
     if stop is None:
         stop = asyncio.Event()
         stop_on_signals(stop)
-    builders = _wanted(settings)
+    builders = _enabled(settings)
     with ExitStack() as held:
         tell = held.enter_context(held_data_folder(settings.data))
         # Explicit ports first, so that no default takes one of them.
@@ -108,7 +107,7 @@ def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
         raise refusal from error
 
 
-def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
+def _enabled(settings: UpSettings) -> Mapping[str, Builder]:
     optional = [name for name in BUILDERS if name not in NEEDED]
     for name in settings.without:
         if name not in optional:
@@ -254,11 +253,11 @@ def held_data_folder(folder: Path) -> Iterator[Callable[[str], None]]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            told = os.pread(descriptor, MAX_TOLD_BYTES, 0).decode(errors="replace")
+            holder = os.pread(descriptor, MAX_HOLDER_BYTES, 0).decode(errors="replace")
             raise ConflictError(
                 f"the data folder {folder.resolve()} is in use by another `dextouch up` "
-                f"({told or 'which is just starting'}); stop that one with Ctrl-C or kill, or give "
-                "this one a folder of its own with --data"
+                f"({holder or 'which is just starting'}); stop that one with Ctrl-C or kill, or "
+                "give this one a folder of its own with --data"
             ) from error
         tell = partial(_tell, descriptor)
         tell("an address that is not known yet")

@@ -54,8 +54,7 @@ def checkpoint_of(name: str, given: Path | None = None) -> Path | None:
 def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
     """Create a bundled policy, with other weights if they are given.
 
-    Raises:
-        NotFoundError, CorruptDataError: a checkpoint that cannot be read.
+    Raises NotFoundError or CorruptDataError for a checkpoint that cannot be read.
     """
     make = _imported(BUNDLED[name].factory)
     path = checkpoint_of(name, checkpoint)
@@ -66,8 +65,7 @@ def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
 def trained_policy(path: Path) -> "Policy":
     """Load a policy of `dextouch train policy`, of any kind.
 
-    Raises:
-        NotFoundError, CorruptDataError, InvalidInputError: a file that is no such policy.
+    Raises NotFoundError, CorruptDataError or InvalidInputError for a file that is no such policy.
     """
     from services.evaluation.trained_networks import load_checkpoint
 

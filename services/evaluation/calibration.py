@@ -31,7 +31,7 @@ from services.evaluation.success_classifier import (
     sigmoid,
 )
 
-NUM_BINS: Final = 10
+NUM_BINS: Final = 10  # chosen; Guo et al. (2017) take 15
 # The undecided band of a classifier alone is at most 5 % … 95 %.
 _WIDEST_BAND: Final = 0.45
 _MAX_NEWTON_STEPS: Final = 50
@@ -48,10 +48,8 @@ def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -
     """Mean distance of predicted and true success rates over bins of equal width (Guo et al. 2017).
 
     Bins are weighted by their number of endings. Even a perfectly calibrated classifier has an
-    error of about √(p(1−p)/n) in a bin of n.
-
-    Raises:
-        InvalidInputError: no endings, or arrays of different lengths.
+    error of about √(p(1−p)/n) in a bin of n. Raises InvalidInputError without endings, or for
+    arrays of different lengths.
     """
     predicted, outcomes = _pair(probabilities, success)
     bins = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
@@ -62,8 +60,7 @@ def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -
 def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
     """Mean squared difference of probability and outcome (Brier 1950).
 
-    Raises:
-        InvalidInputError: no endings, or arrays of different lengths.
+    Raises InvalidInputError without endings, or for arrays of different lengths.
     """
     predicted, outcomes = _pair(probabilities, success)
     return float(np.mean((predicted - outcomes) ** 2))
@@ -77,10 +74,8 @@ def fit_calibration(
     Platt scaling with his targets (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit finite
     for endings that are separated without error (Platt 1999), and a weak prior towards the
     network's own odds for small samples. `log_odds` [n] are those of the network, `success` [n] the
-    outcomes; `risk` is the allowed share of errors among the decided endings.
-
-    Raises:
-        InvalidInputError: only one outcome, or a risk outside 0 … 1.
+    outcomes; `risk` is the allowed share of errors among the decided endings. Raises
+    InvalidInputError for only one outcome, or a risk outside 0 … 1.
     """
     odds, outcomes = np.asarray(log_odds, dtype=np.float64), np.asarray(success, dtype=bool)
     if odds.shape != outcomes.shape or outcomes.all() or not outcomes.any() or not 0 < risk < 1:
@@ -114,10 +109,8 @@ def fit_combination(
 
     `probe` [n] are calibrated probabilities of the classifier, `world` [n] the world's own, and
     `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings, and
-    `margin` that of `Combination`.
-
-    Raises:
-        InvalidInputError: no endings, or arrays of different lengths.
+    `margin` that of `Combination`. Raises InvalidInputError without endings, or for arrays of
+    different lengths.
     """
     of_probe, outcomes = _pair(probe, success)
     estimated, _ = _pair(world, success)
@@ -275,10 +268,8 @@ def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
     """Share of correct decisions over all tasks, and metrics of true and imagined endings by task.
 
     True endings are given without object poses, which a real robot does not have; `poses` are true
-    endings with poses and touch but no image; `imagined` endings are given as they are.
-
-    Raises:
-        InvalidInputError: a task has only one outcome.
+    endings with poses and touch but no image; `imagined` endings are given as they are. Raises
+    InvalidInputError if a task has only one outcome.
     """
     figures: Figures = {}
     right: list[bool] = []

@@ -115,8 +115,7 @@ def begin_matched(
 ) -> list[MatchedStart | FailedStart]:
     """Start every task and seed once in the real world.
 
-    Raises:
-        ConflictError: a start was trained on.
+    Raises ConflictError if a start was trained on.
     """
     starts = [
         matched_start(real, task, seed, instruction)
@@ -216,8 +215,7 @@ class RolloutRunner:
     def _begin(self, start: MatchedStart, policy: str, world: str, repeat: int) -> Rollout:
         """Start a rollout from a matched start (by task and seed in the real world).
 
-        Raises:
-            ConflictError: the real world started differently than before.
+        Raises ConflictError if the real world started differently than before.
         """
         address = self.worlds.addresses[world]
         client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras), name=policy)
@@ -284,21 +282,21 @@ class RolloutRunner:
         """
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or images is True or (images and is_last):
-            shown = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
-            yield rollout.step(chunk, selector=shown, validated=True)
+            selector = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
+            yield rollout.step(chunk, selector=selector, validated=True)
             return
         if images:
             newest = ReturnSelector(cameras=cameras, steps="last")
             yield rollout.step(chunk, selector=newest, validated=True)
             return
         # Only the ending is rendered, in a chunk of its own.
-        num_shown = -(-NUM_SEEN_STEPS // multiple) * multiple if is_last else 0
-        num_unseen = max(len(chunk) - num_shown, 0)
-        if num_unseen:
+        num_rendered = -(-NUM_SEEN_STEPS // multiple) * multiple if is_last else 0
+        num_blind = max(len(chunk) - num_rendered, 0)
+        if num_blind:
             blind = ReturnSelector(cameras=())
-            yield rollout.step(chunk[:num_unseen], selector=blind, validated=True)
-        if num_unseen < len(chunk):
-            yield rollout.step(chunk[num_unseen:], validated=True)
+            yield rollout.step(chunk[:num_blind], selector=blind, validated=True)
+        if num_blind < len(chunk):
+            yield rollout.step(chunk[num_blind:], validated=True)
 
 
 class ResultLog:
@@ -315,11 +313,7 @@ class ResultLog:
         self._study = datetime.now(UTC).isoformat(timespec="milliseconds")
 
     def keep(self, outcome: RolloutScore | RolloutFailure) -> None:
-        """Append one row.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Append one row; raises StorageError if the file cannot be written."""
         row = {"study": self._study, **asdict(outcome)}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

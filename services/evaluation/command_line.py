@@ -117,8 +117,7 @@ def keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
 def run_evaluation(arguments: list[str]) -> int:
     """Score every policy in every world; print the results and write the requested files.
 
-    Returns:
-        0, or 1 if a rollout failed.
+    Returns 1 if a rollout failed, otherwise 0.
     """
     settings = load_settings(RunSettings, arguments)
     probe = SuccessClassifier.load(settings.probe)
@@ -178,8 +177,7 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
 def instructions_for(tasks: Sequence[str], known: Mapping[str, str]) -> dict[str, str]:
     """Instructions of the given tasks, or of all known tasks if none is given.
 
-    Raises:
-        UnknownNameError: a task that the success classifier does not know.
+    Raises UnknownNameError for a task that the success classifier does not know.
     """
     for task in tasks:
         if task not in known:

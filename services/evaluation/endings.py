@@ -36,7 +36,7 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 
 logger = structlog.get_logger(__name__)
 
-NUM_SEEN_STEPS: Final = 3
+NUM_SEEN_STEPS: Final = 3  # chosen: 0.2 s, in which motion shows
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
 UNUSUAL_SIZE: Final = 0.1
 # Each training episode is cut at one early and one middle step, drawn by its scene. Early endings
@@ -114,9 +114,7 @@ class Ending:
         """Ending shown by the last observation of a rollout.
 
         `uncertainty` is that of the whole rollout; None if it has no observation but this one.
-
-        Raises:
-            InvalidInputError: fewer than three steps.
+        Raises InvalidInputError for fewer than three steps.
         """
         if len(observation) < NUM_SEEN_STEPS:
             raise InvalidInputError(
@@ -193,9 +191,7 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
     """Endings of one stored robot episode that has what is `JUDGED`.
 
     Only the steps shown are decoded; the middle square of larger images is scaled to `image_px`.
-
-    Raises:
-        InvalidInputError: the outcome is unknown.
+    Raises InvalidInputError if the outcome is unknown.
     """
     grid, about = EpisodeGrid(reader, image_px), reader.attributes
     last, touch_kpa = len(grid) - 1, grid.touch()[0]
@@ -256,10 +252,8 @@ def read_ending_episodes(
     """Read the robot episodes of some stores that can be judged, with their endings.
 
     True and imagined episodes may be mixed. `tasks` and `splits` of scenes are empty for all; the
-    middle square of larger images is scaled to `image_px`.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    middle square of larger images is scaled to `image_px`. Raises NotFoundError and ConflictError
+    as `select_episodes`.
     """
     readers = select_episodes(
         stores, domain="robot", tasks=tasks, splits=splits, origins=(), needs=JUDGED
@@ -316,8 +310,7 @@ def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
             being the current one. An object with a non-finite number or a zero quaternion counts as
             absent.
 
-    Raises:
-        ShapeError: other shapes, or more objects.
+    Raises ShapeError for other shapes, or more objects.
     """
     poses = np.asarray(object_poses, dtype=np.float64)
     if poses.ndim != 3 or poses.shape[2] != 7 or not 0 < poses.shape[1] <= MAX_OBJECTS:
@@ -366,13 +359,13 @@ def _of_object(Ts_world_object: np.ndarray) -> Float64[np.ndarray, "17"]:
 def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray, "18"]:
     """Second object relative to the first, and their horizontal and vertical distance."""
     T_a_b = invert(T_world_a) @ T_world_b
-    apart_m = T_world_b[:3, 3] - T_world_a[:3, 3]
+    offset_m = T_world_b[:3, 3] - T_world_a[:3, 3]
     return np.concatenate(
         [
             [1.0],
             T_a_b[:3, 3] / _WIDE_M,
             np.arcsinh(T_a_b[:3, 3] / _NEAR_M),
             T_a_b[:3, :3].ravel(),
-            [np.arcsinh(np.linalg.norm(apart_m[:2]) / _NEAR_M), np.arcsinh(apart_m[2] / _NEAR_M)],
+            [np.arcsinh(np.linalg.norm(offset_m[:2]) / _NEAR_M), np.arcsinh(offset_m[2] / _NEAR_M)],
         ]
     )

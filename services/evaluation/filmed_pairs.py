@@ -43,11 +43,11 @@ def film(
         name, instruction = pair[0].policy, plan.instructions[task]
         start = matched_start(real, task, pair[0].seed, instruction)
         played = [runner.run(start, policies[name], name, one)[1] for one in (REAL, world)]
-        shown = [one for one in played if one is not None]
-        if len(shown) == 2:
+        finished = [one for one in played if one is not None]
+        if len(finished) == 2:
             description = worlds.descriptions[REAL]
             layout = TactileLayout.of(description.tactile_layout) or DEXTOUCH_V1
-            found.append(_played_pair(pair, shown, description.model_rate_hz, layout))
+            found.append(_played_pair(pair, finished, description.model_rate_hz, layout))
     return tuple(found)
 
 

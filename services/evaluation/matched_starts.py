@@ -102,8 +102,7 @@ class StudyWorlds:
 def check_judged_touch(worlds: Mapping[str, WorldDescription]) -> None:
     """Refuse worlds, by name, whose touch success classifiers cannot judge.
 
-    Raises:
-        InvalidInputError: the glove of a world is another one than `dextouch_v1`.
+    Raises InvalidInputError if the glove of a world is another one than `dextouch_v1`.
     """
     found = {
         name: TactileLayout.of(one.tactile_layout) or DEXTOUCH_V1 for name, one in worlds.items()
@@ -159,8 +158,7 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
 def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str], what: str) -> None:
     """Refuse an evaluation whose starts have digests of starts that a network was trained on.
 
-    Raises:
-        ConflictError: there are such starts; `what` is the network.
+    Raises ConflictError if there are such starts; `what` is the network.
     """
     shared = sorted(set(digests) & set(trained_on))
     if shared:

@@ -180,10 +180,8 @@ def measure_prediction(
 ) -> PredictionResult:
     """Errors of predicted futures of scenes that the world was not trained on.
 
-    `metrics` are some of `METRICS` or `all_metrics`, and `baselines` names of `BASELINES`.
-
-    Raises:
-        InvalidInputError: no scene.
+    `metrics` are some of `METRICS` or `all_metrics`, and `baselines` names of `BASELINES`. Raises
+    InvalidInputError without a scene.
     """
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")

@@ -30,6 +30,8 @@ MIN_PIXELS: Final = 3
 TOLERANCE: Final = 0.05
 # A body that moves less than this over a scene has no trajectory to compare.
 MIN_PATH_PX: Final = 2.0
+# World models may begin from these, too.
+_WRISTS: Final = ("camera_wrist_left", "camera_wrist_right")
 _NO_IMAGE = ReturnSelector(cameras=())
 _LAST_STEP = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")
 
@@ -235,7 +237,7 @@ def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: in
         about.seed or 0,
         about.instruction,
         kind,
-        observation=grid.observation(first_step),
+        observation=grid.observation(first_step, _WRISTS),
         anchor=reader.anchor(first_step),
         K_head=grid.K_head,
     )

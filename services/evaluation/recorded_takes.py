@@ -72,10 +72,7 @@ def read_takes(
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
 
     `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
-    read, None for all.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    read, None for all. Raises NotFoundError and ConflictError as `select_episodes`.
     """
     readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
     takes: list[RecordedTake] = []

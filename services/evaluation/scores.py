@@ -113,10 +113,8 @@ class ClosedLoopReport:
         """Success (1 or 0) of every policy from every start; NaN for failed rollouts.
 
         Rollouts that were repeated count with their share of successes. Undecided ones count with
-        the likelier outcome, or not at all if `only_decided`.
-
-        Raises:
-            InvalidInputError: policies have different starts.
+        the likelier outcome, or not at all if `only_decided`. Raises InvalidInputError if policies
+        have different starts.
         """
         scores: dict[tuple[str, int], list[RolloutScore]] = {}
         for score in self._of(world, task):
@@ -506,12 +504,12 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
     sentences = []
     for verb, sign in (("overrates", 1), ("underrates", -1)):
         low, high = ("real", "imagined") if sign > 0 else ("imagined", "real")
-        apart = [r for r in rows if r[f"{low}_interval"][1] < r[f"{high}_interval"][0]]
-        if apart:
-            row = max(apart, key=lambda r: abs(r["imagined"] - r["real"]))
+        separated = [r for r in rows if r[f"{low}_interval"][1] < r[f"{high}_interval"][0]]
+        if separated:
+            row = max(separated, key=lambda r: abs(r["imagined"] - r["real"]))
             sentences.append(
-                f"Over all completed rollouts, {world} {verb} {len(apart)} of {len(rows)} policies "
-                "beyond chance (95 % intervals do not overlap), most of all "
+                f"Over all completed rollouts, {world} {verb} {len(separated)} of {len(rows)} "
+                "policies beyond chance (95 % intervals do not overlap), most of all "
                 f"{row['policy']!r}: {row['real']:.2f} real, {row['imagined']:.2f} imagined."
             )
     return sentences

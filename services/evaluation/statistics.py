@@ -42,10 +42,7 @@ class Interval:
 def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
     """Probability that a success scores above a failure, by scores and outcomes [n].
 
-    Ties count half.
-
-    Raises:
-        InvalidInputError: only successes, or only failures.
+    Ties count half. Raises InvalidInputError for only successes, or only failures.
     """
     positive, negative = _by_outcome(scores, success)
     return float((np.sign(positive[:, None] - negative[None, :]).mean() + 1) / 2)
@@ -54,8 +51,7 @@ def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
 def balanced_accuracy(decisions: np.ndarray, success: np.ndarray) -> float:
     """Mean of the shares of successes and of failures that were classified correctly.
 
-    Raises:
-        InvalidInputError: only successes, or only failures.
+    Raises InvalidInputError for only successes, or only failures.
     """
     positive, negative = _by_outcome(np.asarray(decisions, dtype=bool), success)
     return float((positive.mean() + (~negative).mean()) / 2)
@@ -74,10 +70,8 @@ def _by_outcome(values: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np
 def wilson_interval(successes: int | float, trials: int) -> Interval:
     """95 % Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
 
-    A trial that was repeated counts as one, with its share of successes.
-
-    Raises:
-        InvalidInputError: no trials, or more successes than trials.
+    A trial that was repeated counts as one, with its share of successes. Raises InvalidInputError
+    without trials, or for more successes than trials.
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise InvalidInputError(

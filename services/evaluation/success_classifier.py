@@ -27,8 +27,8 @@ from services.evaluation.endings import (
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, load_network
 
 NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
-_CHANNELS = (24, 32, 48, 48)
-_OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
+_CHANNELS = (24, 32, 48, 48)  # chosen: trains within `max_cpu_s` a task
+_OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32  # chosen: an object adds fewer features than the image
 # Pose features are clipped to this many standard deviations.
 _FARTHEST = 5.0
 # The band within which everything is undecided.
@@ -282,8 +282,7 @@ class Verdict:
 class SuccessClassifier:
     """A trained probe.
 
-    Raises:
-        InvalidInputError: the weights do not match the shape in the metadata.
+    Raises InvalidInputError if the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -299,7 +298,9 @@ class SuccessClassifier:
             name: Combination.model_validate(values)
             for name, values in settings.get("combination", {}).items()
         }
-        self._classifiable: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
+        self._classifiable: Mapping[str, Sequence[str]] = settings.get(
+            "classifiable_milestones", settings.get("told_milestones", {})
+        )
         self._network = ClassifierNetwork(self.shape)
         load_network(self._network, checkpoint)
 

@@ -113,10 +113,8 @@ def labelled_endings(
 
     Every episode contributes its end and the step before; an early ending, as a failure with a
     tenth of the weight of all failures; and a middle ending where its milestones are known.
-    `imagined_share` is the weight of a task's imagined endings relative to its true ones.
-
-    Raises:
-        InvalidInputError: a task has only one outcome.
+    `imagined_share` is the weight of a task's imagined endings relative to its true ones. Raises
+    InvalidInputError if a task has only one outcome.
     """
     examples = [example for item in episodes for example in _examples(item, shape)]
     weight = _weights(examples, imagined_share)
@@ -220,8 +218,7 @@ class ClassifierSets:
     ) -> "ClassifierSets":
         """The given sets; missing ones are taken from a share of the scenes of `episodes`.
 
-        Raises:
-            ConflictError: a held-out or development episode starts like a training episode.
+        Raises ConflictError if a held-out or development episode starts like a training episode.
         """
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
@@ -246,8 +243,7 @@ class ClassifierSets:
     def check_measurable(self) -> None:
         """Check before training that every task can be measured.
 
-        Raises:
-            InvalidInputError: the held-out true takes of a task have one outcome only.
+        Raises InvalidInputError if the held-out true takes of a task have one outcome only.
         """
         for task in sorted({e.task for e in self.training}):
             outcomes = [e.success for e in self.held_out if e.task == task and not e.imagined]
@@ -375,7 +371,7 @@ def _calibrated(
     calibrations = fit_calibrations(probe, development, risk=settings.risk)
     fitted = {
         "calibration": {name: one.model_dump() for name, one in calibrations.items()},
-        "told_milestones": classifiable_milestones(probe, development),
+        "classifiable_milestones": classifiable_milestones(probe, development),
     }
     calibrated = _with(checkpoint, "settings", fitted)
     combinations = fit_combinations(

@@ -21,7 +21,7 @@ from services.networks.weight_files import (
 )
 
 FORMAT_VERSION = 1
-MAX_CHECKPOINT_BYTES = 8 * 2**20
+MAX_CHECKPOINT_BYTES = 8 * 2**20  # chosen: twice what the largest of these networks has
 _METADATA_KEY, _PREFIX = "dextouch", "network."
 
 
@@ -97,8 +97,7 @@ def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
 def load_network(network: nn.Module, checkpoint: Checkpoint) -> None:
     """Load the weights of a checkpoint into its network, for inference.
 
-    Raises:
-        InvalidInputError: missing or unexpected tensors, or wrong shapes.
+    Raises InvalidInputError for missing or unexpected tensors, or wrong shapes.
     """
     where = f"checkpoint of {checkpoint.metadata.kind}"
     load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)

@@ -184,12 +184,12 @@ def load_strictly(
             f"unexpected {foreign[:3]}; expected exactly those of its own network settings"
         )
     for name, tensor in found.items():
-        wanted = expected[name]
-        kinds = tensor.is_floating_point(), wanted.is_floating_point()
-        if tensor.shape != wanted.shape or kinds[0] != kinds[1]:
+        parameter = expected[name]
+        kinds = tensor.is_floating_point(), parameter.is_floating_point()
+        if tensor.shape != parameter.shape or kinds[0] != kinds[1]:
             raise InvalidInputError(
                 f"{where}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected "
-                f"{'floating point' if kinds[1] else wanted.dtype} {tuple(wanted.shape)}"
+                f"{'floating point' if kinds[1] else parameter.dtype} {tuple(parameter.shape)}"
             )
     for prefix, model in models.items():
         own = {name: found[prefix + name] for name in model.state_dict()}

@@ -74,11 +74,7 @@ class Stages:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the demo.
-
-    Returns:
-        0 if every stage ran, whatever the figures in the report.
-    """
+    """Run the demo; returns 0 if every stage ran, whatever the figures in the report."""
     plan = demo_plan(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
     # More threads slow down small networks beside busy services.
@@ -124,7 +120,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             prediction = measure_prediction(models.world_model, scenes, metrics=metrics)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
-            scores, moving = scoring.judge(urls, policies, models, plan)
+            scores, moving = scoring.score_policies(urls, policies, models, plan)
     world = models.world_model.description
     form = "state model" if world.object_names else "paper's form"
     report = {

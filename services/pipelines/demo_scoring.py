@@ -123,7 +123,7 @@ def _scripts(plan: DemoPlan) -> tuple[str, ...]:
     return tuple(script_name(level) for level in plan.levels_mm)
 
 
-def judge(
+def score_policies(
     urls: Mapping[str, str], policies: Mapping[str, Policy], models: Models, plan: DemoPlan
 ) -> tuple[dict[str, Any], tuple[PredictionPicture, ...]]:
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
@@ -185,14 +185,14 @@ def mistake_rows(scores: Iterable[RolloutScore], plan: DemoPlan) -> list[dict[st
 def mistake_comment(task: str, rows: Iterable[Mapping[str, Any]]) -> str:
     """How many rollouts of a task are judged wrongly, without and with mistakes."""
     mine = [row for row in rows if row["task"] == task]
-    told = []
+    shares = []
     for is_ladder in (True, False):
         group = [row for row in mine if (row["mistake"] == LADDER) == is_ladder]
         wrong, rollouts = (sum(row[name] for row in group) for name in ("wrong", "rollouts"))
-        told.append(f"{wrong} of {rollouts}")
+        shares.append(f"{wrong} of {rollouts}")
     names = ", ".join(row["mistake"] for row in mine if row["mistake"] != LADDER)
     return (
-        f"Imagined outcomes differ from the real ones in {told[0]} rollouts of scripts that err in "
-        f"position only, and in {told[1]} with mistakes of kinds that no training data contain "
-        f"({names})."
+        f"Imagined outcomes differ from the real ones in {shares[0]} rollouts of scripts that err "
+        f"in position only, and in {shares[1]} with mistakes of kinds that no training data "
+        f"contain ({names})."
     )

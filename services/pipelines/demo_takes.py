@@ -63,8 +63,7 @@ class Take:
 def make_truth(plan: DemoPlan, store_folder: Path) -> tuple[list[str], list[str]]:
     """Record the true episodes in the twin, on all cores.
 
-    Returns:
-        Ids of the two takes, and of demonstrations to predict.
+    Returns the ids of the two takes, and of demonstrations to predict.
     """
     store = str(store_folder)
     takes = [
@@ -94,10 +93,8 @@ def record_take(
 ) -> tuple[MockTake, list[dict[str, Any]]]:
     """Replay the truth through all mock devices, with the faults of an ordinary station.
 
-    The gloves are calibrated first, by a take of their own.
-
-    Returns:
-        The take in the spool, and for every device the mock's ledger beside the health counters.
+    The gloves are calibrated first, by a take of their own. Returns the take in the spool, and for
+    every device the mock's ledger beside the health counters.
     """
     attributes, streams = truth.attributes, replay_streams(truth)
     with tempfile.TemporaryDirectory(prefix="dextouch-calibration-") as folder:
@@ -134,8 +131,7 @@ def _device_row(take: MockTake, counters: dict[str, Any]) -> dict[str, Any]:
 def forget_take(store: EpisodeStore, recording_id: str) -> None:
     """Delete a take of an earlier run, complete or partial, and its derived episodes.
 
-    Raises:
-        ConflictError: another station's take has this id; nothing is removed.
+    Raises ConflictError if another station's take has this id; nothing is removed.
     """
     half_sent = store.root / UPLOADS / recording_id
     if half_sent.exists():

@@ -64,15 +64,15 @@ def prediction_main(arguments: Sequence[str]) -> int:
     readers = select_episodes(
         [store], domain="robot", tasks=tasks, needs=(needs.EVERY_PART, needs.IMAGES)
     )
-    wanted = [reader.item_id for reader in readers]
-    refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
+    ids = [reader.item_id for reader in readers]
+    refuse_trained_episodes(store, ids, path, command="evaluate prediction")
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
     measured = [metrics[name] for name in chosen]
     result["metrics"] = described(measured)
     result["baselines"] = {name: BASELINES[name] for name in options.baselines}
     result["missing_baselines"] = {}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
-        scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
+        scenes = [scene for one in ids for scene in _HORIZONS[horizon](store.open(one))]
         if set(chosen) & set(GEOMETRY):
             # Replaying recorded takes, in this module, too, needs no twin.
             from services.pipelines.twin_geometry import TwinGeometry
@@ -83,7 +83,7 @@ def prediction_main(arguments: Sequence[str]) -> int:
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes
         result["missing_baselines"][horizon] = dict(found.missing)
-        print(f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes")
+        print(f"\n{horizon}: {found.num_scenes} from {len(ids)} episodes")
         print(_prediction_table(found, metrics))
     write_result(options.json, result, allow_nan=False)
     return 0
@@ -121,9 +121,9 @@ def recorded_main(arguments: Sequence[str]) -> int:
     stores = [EpisodeStore(url) for url in options.episodes]
     splits = (options.split,) if options.split else ()
     takes = read_takes(stores, tasks=options.tasks, splits=splits, most=options.count)
-    wanted = {take.episode_id for take in takes}
+    ids = {take.episode_id for take in takes}
     for store in stores:
-        own = sorted(wanted & set(store.list()))
+        own = sorted(ids & set(store.list()))
         refuse_trained_episodes(store, own, options.checkpoint, command="evaluate recorded")
     policies = _policies(options)
     probe = SuccessClassifier.load(options.probe)

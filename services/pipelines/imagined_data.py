@@ -54,8 +54,7 @@ def chosen_episodes(
 ) -> list[EpisodeAttributes]:
     """True robot episodes of these tasks and seeds that can be imagined; None takes all.
 
-    Raises:
-        NotFoundError: there is none.
+    Raises NotFoundError if there is none.
     """
     in_seeds = needs.Need(
         "of other seeds",
@@ -63,9 +62,9 @@ def chosen_episodes(
         lambda reader: seeds is None or reader.attributes.seed in seeds,
         is_choice=True,
     )
-    wanted = (in_seeds, needs.EVERY_PART, needs.IMAGES, *also)
+    episode_ids = (in_seeds, needs.EVERY_PART, needs.IMAGES, *also)
     readers = select_episodes(
-        [store], domain="robot", tasks=tasks or (), splits=splits, needs=wanted
+        [store], domain="robot", tasks=tasks or (), splits=splits, needs=episode_ids
     )
     return [reader.attributes for reader in readers]
 
@@ -112,7 +111,9 @@ def judged_steps(episode: EpisodeReader) -> set[int]:
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 
-def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: bool) -> list[str]:
+def imagine(
+    options: argparse.Namespace, episode_ids: Sequence[str], *, only_judged: bool
+) -> list[str]:
     """Imagine these episodes with the options of `parsers.imagined_parser`; returns the new ids."""
     part = partial(
         imagine_all,
@@ -123,10 +124,10 @@ def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: 
     )
     workers = Workers(options.jobs, options.ray)
     # Each part opens the model once.
-    num_parts = -(-len(wanted) // _IN_A_JOB) if workers.ray_address else 4 * options.jobs
-    parts = [wanted[first::num_parts] for first in range(min(num_parts, len(wanted)))]
+    num_parts = -(-len(episode_ids) // _IN_A_JOB) if workers.ray_address else 4 * options.jobs
+    parts = [episode_ids[first::num_parts] for first in range(min(num_parts, len(episode_ids)))]
     made = list[str]()
-    with Progress("imagined episodes", len(wanted)) as progress:
+    with Progress("imagined episodes", len(episode_ids)) as progress:
         jobs = run_jobs(part, parts, workers, folders=EpisodeStore(options.store).folders)
         for ids in results_of(jobs):
             made += ids
@@ -142,8 +143,8 @@ def imagined_main(argv: Sequence[str]) -> int:
     chosen = chosen_episodes(
         EpisodeStore(options.episodes), options.tasks, options.seeds, splits=splits
     )
-    wanted = [about.episode_id for about in chosen]
-    count = len(imagine(options, wanted, only_judged=True))
+    episode_ids = [about.episode_id for about in chosen]
+    count = len(imagine(options, episode_ids, only_judged=True))
     print(f"{count} imagined")
     write_result(options.json, {"imagined": count})
     return 0
@@ -153,11 +154,11 @@ def generate_main(arguments: Sequence[str]) -> int:
     """Run `dextouch generate`."""
     options = generate_parser().parse_args(list(arguments))
     source = EpisodeStore(options.episodes)
-    wanted = chosen_sources(source, options)
+    episode_ids = chosen_sources(source, options)
     # What a killed run left unfinished.
     EpisodeStore(options.store).sweep()
-    refuse_trained_episodes(source, wanted, options.checkpoint, command="generate")
-    made = imagine(options, wanted, only_judged=False)
+    refuse_trained_episodes(source, episode_ids, options.checkpoint, command="generate")
+    made = imagine(options, episode_ids, only_judged=False)
     target = EpisodeStore(options.store)
     num_bytes = sum(target.open(one).verify().num_bytes for one in made)
     print(
@@ -180,8 +181,7 @@ def generate_main(arguments: Sequence[str]) -> int:
 def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """Ids of the robot episodes to imagine, spread evenly over tasks.
 
-    Raises:
-        NotFoundError: there is none.
+    Raises NotFoundError if there is none.
     """
     chosen = chosen_episodes(
         store,
@@ -199,30 +199,27 @@ def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str
 
 
 def refuse_trained_episodes(
-    store: EpisodeStore, wanted: Sequence[str], checkpoint: Path, *, command: str
+    store: EpisodeStore, episode_ids: Sequence[str], checkpoint: Path, *, command: str
 ) -> None:
-    """Refuse episodes that the world model was trained on.
-
-    Raises:
-        ConflictError: there is one.
-    """
+    """Refuse episodes that the world model was trained on; raises ConflictError if there is one."""
     if is_state_checkpoint(checkpoint):
         metadata = read_state_checkpoint(checkpoint).metadata
         trained = [
-            one for one in wanted if metadata.may_have_seen_episode(store.open(one).attributes)
+            one for one in episode_ids if metadata.may_have_seen_episode(store.open(one).attributes)
         ]
     else:
         about = read_checkpoint(checkpoint).metadata
         prints, px = set(about.train_fingerprints), about.network.image_px
         trained = [
             one
-            for one in wanted
+            for one in episode_ids
             if read_episode(store.open(one), image_px=px).fingerprint() in prints
         ]
     if trained:
         raise ConflictError(
             f"{command}: {checkpoint.name} was trained on the scenes of {len(trained)} of "
-            f"{len(wanted)} episodes, such as {trained[0]!r}; choose another --split or --seeds",
+            f"{len(episode_ids)} episodes, such as {trained[0]!r}; choose another --split or "
+            "--seeds",
             episodes=trained,
         )
 

@@ -54,7 +54,7 @@ from services.twin.episodes import NUM_LAST_SHOWN_STEPS, TruthEpisode, TruthStre
 from services.twin.simulation import MODEL_RATE_HZ
 from services.twin.take_options import TakeOptions
 
-PRESSURES_KPA = (10.0, 20.0, 40.0)
+PRESSURES_KPA = (10.0, 20.0, 40.0)  # chosen: up to the 40 kPa of heat maps
 # A weight on an area is known to about this share.
 PRESSURE_SIGMA = 0.01
 PART_S = 2.0
@@ -94,10 +94,8 @@ def play_take(
 ) -> tuple[MockTake, Sequence[DeviceHealth]]:
     """Play a take through all mock devices, with the faults of an ordinary station.
 
-    The clock is virtual, so that equal plans give equal takes.
-
-    Returns:
-        The take in the spool, and the health counters of every device.
+    The clock is virtual, so that equal plans give equal takes. Returns the take in the spool, and
+    the health counters of every device.
     """
     with MockStation(
         plan.streams,
@@ -136,8 +134,7 @@ def measure_gloves(
         seed: of the mock station, whose gloves differ by seed, and of the errors of the pressures.
         clock: of the station.
 
-    Raises:
-        UnavailableError: a glove's path delay could not be measured in several takes.
+    Raises UnavailableError if a glove's path delay could not be measured in several takes.
     """
     gloves = {side: s for s in streams for side in SIDES if s.descriptor.name == f"tactile_{side}"}
     if not gloves:
@@ -262,8 +259,7 @@ def _aligned(
 ) -> tuple[EpisodeAttributes, list[TruthStream], int]:
     """Play a take through a mock station and align its recording.
 
-    Returns:
-        Attributes and streams of the episode, and its time 0 (ns) on the axis of the truth.
+    Returns attributes and streams of the episode, and its time 0 (ns) on the axis of the truth.
     """
     about = truth.attributes
     if about.seed is None:

@@ -254,6 +254,8 @@ def training_data_parser() -> argparse.ArgumentParser:
     add("--policy-arguments", type=_keywords, default={}, help=arguments)
     images = "images of every N-th step (%(default)s)"
     add("--images", type=int, default=1, metavar="N", help=images)
+    wrists = "the wrist cameras, too, for --network.further-views (in a store without such takes)"
+    add("--wrist-cameras", action="store_true", help=wrists)
     looks = "share of scenes with other colours, light and head camera (%(default)s)"
     add("--varied", type=float, default=0.0, metavar="SHARE", help=looks)
     sizes = "share of takes whose objects are wider, narrower, higher or lower (%(default)s)"
@@ -298,8 +300,8 @@ def generate_parser() -> argparse.ArgumentParser:
     add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
     add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")
-    shown = "episodes on that page (%(default)s)"
-    add("--num-strips", type=positive, default=12, metavar="N", help=shown)
+    strips = "episodes on that page (%(default)s)"
+    add("--num-strips", type=positive, default=12, metavar="N", help=strips)
     return parser
 
 

@@ -178,8 +178,7 @@ class Motion:
     def from_tensors(cls, tensors: dict[str, torch.Tensor]) -> "Motion":
         """Inverse of `tensors`.
 
-        Raises:
-            InvalidInputError: missing tensors, or shapes that do not fit together.
+        Raises InvalidInputError for missing tensors, or shapes that do not fit together.
         """
         names = ("mean", "scale", "known", "weights", "components", "mean_motion")
         if set(tensors) == {*names, "turned"} and tensors["turned"].shape == (1,):
@@ -204,15 +203,14 @@ def _covariance(
     scale: Float64[np.ndarray, " inputs"],
 ) -> Float64[np.ndarray, "n m"]:
     count = max(1, int(np.count_nonzero(scale)))
-    apart = np.square(a[:, None] - b[None]).sum(axis=-1)
-    return _TREND * (a @ b.T) / count + np.exp(-apart / (2 * _LENGTH**2 * count))
+    squares = np.square(a[:, None] - b[None]).sum(axis=-1)
+    return _TREND * (a @ b.T) / count + np.exp(-squares / (2 * _LENGTH**2 * count))
 
 
 class PlacePolicy:
     """Sends the motion of a whole take, in chunks of 16 actions.
 
-    Raises:
-        InvalidInputError: weights that do not fit the configuration in the metadata.
+    Raises InvalidInputError for weights that do not fit the configuration in the metadata.
     """
 
     # Images after the first one are of no use to it.
@@ -242,11 +240,7 @@ class PlacePolicy:
         return cls(load_checkpoint(path, kind=KIND))
 
     def reset(self, start: PolicyStart) -> None:
-        """Start a new rollout.
-
-        Raises:
-            UnknownNameError: a task without demonstrations.
-        """
+        """Start a new rollout; raises UnknownNameError for a task without demonstrations."""
         if start.task not in self._motions:
             raise UnknownNameError("task of the place policy", start.task, list(self._motions))
         self._start, self._plan = start, None
@@ -310,8 +304,7 @@ class Demonstration:
 def read_demonstrations(settings: TrainPolicySettings) -> list[Demonstration]:
     """The successful robot episodes of the stores, and those that were imagined.
 
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    Raises NotFoundError and ConflictError as `select_episodes`.
     """
     recorded = [EpisodeStore(url) for url in settings.episodes]
     generated = [EpisodeStore(url) for url in settings.imagined]

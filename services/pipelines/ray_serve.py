@@ -54,8 +54,7 @@ def application(
         settings: of the service.
         num_replicas: number of processes.
 
-    Raises:
-        InvalidInputError: state in memory, which each replica would have for itself.
+    Raises InvalidInputError for state in memory, which each replica would have for itself.
     """
     if settings.state_url == "memory://":
         raise InvalidInputError(

@@ -17,10 +17,10 @@ from fastapi import FastAPI
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.serving import ServiceSettings, bound_socket, server_options
 
-BACKLOG = 128
-START_TIMEOUT_S = 60.0
-START_CHECK_S = 0.01
-GRACE_S = 10
+BACKLOG = 128  # as the kernel's usual somaxconn of before
+START_TIMEOUT_S = 60.0  # chosen: for imports of torch on a busy machine
+START_CHECK_S = 0.01  # chosen: less than anyone notices
+GRACE_S = 10  # chosen: for requests in flight
 
 T = TypeVar("T")
 
@@ -98,8 +98,7 @@ async def serve_all(
 ) -> None:
     """Serve until `stop` is set; `on_ready` is called once all services respond.
 
-    Raises:
-        UnavailableError: a service terminated unexpectedly; the others were shut down.
+    Raises UnavailableError if a service ended unexpectedly; the others were shut down.
     """
     servers = {place.name: _server(app, grace_s) for place, app in placed}
     # A full collection would visit all modules and hold up every request for some 60 ms.
@@ -156,8 +155,7 @@ async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> 
 def served(apps: Mapping[str, FastAPI]) -> Iterator[dict[str, str]]:
     """Context manager that serves applications in threads on loopback; yields URLs by name.
 
-    Raises:
-        UnavailableError: they did not start, or one terminated unexpectedly.
+    Raises UnavailableError if they did not start, or one terminated unexpectedly.
     """
     placed = {name: bind(name, host="127.0.0.1", port=0) for name in apps}
     servers = [_server(app, GRACE_S) for app in apps.values()]

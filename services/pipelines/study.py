@@ -38,7 +38,7 @@ from services.evaluation.studies.results import (
     StudyHeader,
     StudyResults,
     WorldChoice,
-    cells_of,
+    planned_rollouts_of,
     read_definition,
 )
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
@@ -57,11 +57,7 @@ _CHILD = "services.pipelines.study_world"
 
 
 def main(arguments: list[str]) -> int:
-    """Run `dextouch study COMMAND`.
-
-    Returns:
-        0, or 1 if a rollout failed or has no result yet.
-    """
+    """Run `dextouch study COMMAND`; returns 0, or 1 if a rollout failed or has no result yet."""
     options = study_parser().parse_args(arguments)
     if options.word == "report":
         return _finish(StudyResults.read(options.folder), options.json)
@@ -82,11 +78,11 @@ def _run(options: argparse.Namespace) -> int:
             digests |= connect(addresses, connections).digests
         header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
         results = StudyResults.create_or_resume(folder, header)
-        num_cells = sum(1 for _ in cells_of(definition))
+        num_planned = sum(1 for _ in planned_rollouts_of(definition))
         if parts.store is not None:
             # What a killed run left unfinished.
             parts.store.sweep()
-        print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
+        print(f"{definition.name}: {len(results.outcomes)} of {num_planned} rollouts have a result")
         if options.ray is None:
             run_study(definition, results, parts, retry_failed=options.retry_failed)
     if options.ray is not None:
@@ -143,8 +139,7 @@ def _run_on_cluster(
 ) -> None:
     """Run rollouts on the machines of a Ray cluster, which see the study's files.
 
-    Raises:
-        DexTouchError: a block of rollouts failed; those of the others are kept.
+    Raises DexTouchError if a block of rollouts failed; those of the others are kept.
     """
     blocks = blocks_of(definition, missing, results.header, store_url)
     folders = [results.path.parent, *(EpisodeStore(store_url).folders if store_url else ())]
@@ -297,10 +292,8 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
 def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
     """Refuse starts whose task and seed a state model was trained on.
 
-    Content digests miss them where image size or simulator changed since.
-
-    Raises:
-        ConflictError: a start was trained on.
+    Content digests miss them where image size or simulator changed since. Raises ConflictError if a
+    start was trained on.
     """
     metadata = read_state_checkpoint(checkpoint).metadata
     for task in tasks:
@@ -317,8 +310,7 @@ def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Seq
 def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> ReplayPolicy:
     """The twin's demonstrator, planned for all starts without simulation.
 
-    Raises:
-        UnknownNameError: no such script or task.
+    Raises UnknownNameError for an unknown script or task.
     """
     return ReplayPolicy(
         {

@@ -27,6 +27,7 @@ from services.pipelines.parsers import training_data_parser
 from services.twin.cameras import Markers, marked_objects
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
+from services.twin.names import CAMERAS as ALL_CAMERAS
 from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
 from services.twin.scene import Sizes, object_boxes_m
 from services.twin.settings import TwinSettings
@@ -36,7 +37,7 @@ from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
-MAX_LABEL = 32
+MAX_LABEL = 32  # chosen: names stay recognizable in ids
 # Markers of 3 cm are 20 px wide in such images.
 _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
@@ -60,6 +61,7 @@ class Scope:
     path: TakePath | None = None
     varied: float = 0.0
     resized: float = 0.0
+    cameras: tuple[str, ...] = CAMERAS
 
     def path_of(self, domain: Domain) -> TakePath:
         """The path of the takes of a domain."""
@@ -249,8 +251,7 @@ def make_training_data(
         Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
         or the take could not be aligned), and of those made, how many `succeeded`.
 
-    Raises:
-        InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
+    Raises InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
     """
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(
@@ -301,7 +302,7 @@ def _orders(
         for task in scope.tasks:
             made = TakeOptions() if policy is not None else options_of(task, seed, mix)
             options = replace(
-                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
+                made, images=scope.cameras, image_every=scope.image_every, streams=scope.streams,
                 varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
                 sizes=_sizes(task, seed, scope),
             )  # fmt: skip
@@ -328,8 +329,9 @@ def main(argv: Sequence[str]) -> int:
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
     tasks = named_tasks(arguments.tasks)
+    cameras = ALL_CAMERAS if arguments.wrist_cameras else CAMERAS
     scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path,
-                  arguments.varied, arguments.resized)  # fmt: skip
+                  arguments.varied, arguments.resized, cameras)  # fmt: skip
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(

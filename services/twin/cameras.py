@@ -32,8 +32,8 @@ FOVY_RAD: Final = {
     "camera_wrist_left": math.radians(80.0),
     "camera_wrist_right": math.radians(80.0),
 }
-_CHECKER_M: Final = 0.08
-_FAR_M: Final = 4.0
+_CHECKER_M: Final = 0.08  # chosen: motion of the camera shows on the table's fields
+_FAR_M: Final = 4.0  # chosen: farther than anything on the table
 # Rays that descend less than this from a camera 4 mm above a plane do not meet it within _FAR_M.
 _LEVEL: Final = 1e-3
 # Corners of boxes nearer to the plane of the camera have no useful projection.
@@ -244,8 +244,8 @@ def _draw(
     )
     window = (slice(low[1], high[1]), slice(low[0], high[0]))
     nearest_m = range_m[window].repeat(_FINE, axis=0).repeat(_FINE, axis=1)
-    shown = (np.abs(x) <= half_m) & (np.abs(y) <= half_m) & (distance_m < nearest_m)
-    share, brightness = _averaged(shown, _brightness(one, x, y))
+    is_visible = (np.abs(x) <= half_m) & (np.abs(y) <= half_m) & (distance_m < nearest_m)
+    share, brightness = _averaged(is_visible, _brightness(one, x, y))
     part = image[window].astype(np.float64)
     mixed = part * (1 - share[..., None]) + 255.0 * brightness[..., None]
     image[window] = np.clip(np.round(mixed), 0, 255).astype(np.uint8)
@@ -261,13 +261,13 @@ def _brightness(one: _Print, x: np.ndarray, y: np.ndarray) -> Float64[np.ndarray
 
 
 def _averaged(
-    shown: Bool[np.ndarray, "fine_h fine_w"], brightness: np.ndarray
+    is_visible: Bool[np.ndarray, "fine_h fine_w"], brightness: np.ndarray
 ) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
     """Share of each pixel that the marker covers, and its brightness times this share."""
-    height, width = shown.shape[0] // _FINE, shown.shape[1] // _FINE
+    height, width = is_visible.shape[0] // _FINE, is_visible.shape[1] // _FINE
     blocks = (height, _FINE, width, _FINE)
-    share = shown.reshape(blocks).mean(axis=(1, 3))
-    return share, (shown * brightness).reshape(blocks).mean(axis=(1, 3))
+    share = is_visible.reshape(blocks).mean(axis=(1, 3))
+    return share, (is_visible * brightness).reshape(blocks).mean(axis=(1, 3))
 
 
 class CameraRig:

@@ -22,7 +22,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 
-_MISS_DRAW = 5
+_MISS_DRAW = 5  # stream of random numbers of its own
 # Seed and options of a take, for a worker process.
 Order = tuple[int, TakeOptions]
 

@@ -132,8 +132,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
     """Commands of a whole take: smoothstep between waypoints, constant before and after them.
 
-    Raises:
-        InvalidInputError: times that do not increase.
+    Raises InvalidInputError for times that do not increase.
     """
     times = np.array([waypoint.time_s for waypoint in waypoints])
     if len(times) < 2 or (np.diff(times) <= 0).any():
@@ -307,9 +306,9 @@ def _slipping(
     grips = [np.abs(q[from_step] - q[0]).max() > _SAME_POSTURE_RAD for q in joints]
     left, right = commands.Ts_world_wrist_left.copy(), commands.Ts_world_wrist_right.copy()
     if not any(grips):
-        apart = right[:, :3, 3] - left[:, :3, 3]
-        apart /= np.linalg.norm(apart, axis=1, keepdims=True)
-        left[:, :3, 3] -= gap_m * share * apart
-        right[:, :3, 3] += gap_m * share * apart
+        direction = right[:, :3, 3] - left[:, :3, 3]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        left[:, :3, 3] -= gap_m * share * direction
+        right[:, :3, 3] += gap_m * share * direction
     q_left, q_right = (q + opened * share * (q[0] - q) for q in joints)
     return HandTrajectory(left, right, q_left, q_right, commands.Ts_world_camera_head)

@@ -173,11 +173,7 @@ def _attributes(
 
 
 def write_episode(store: EpisodeStore, episode: TruthEpisode) -> str:
-    """Write an episode to a store and return its id.
-
-    Raises:
-        ConflictError: the id exists.
-    """
+    """Write an episode to a store and return its id; raises ConflictError if the id exists."""
     with store.writer(kind="episode", attributes=episode.attributes) as writer:
         for name, stream in episode.streams.items():
             writer.add_stream(stream.descriptor)
@@ -198,7 +194,7 @@ class Recorder:
         self.pad_forces_n: list[np.ndarray] = []
         for name, (descriptor, _) in self._sources.items():
             if descriptor.kind == "image" and self._every is not None:
-                steps = [step * STEPS_PER_GRID for step in shown_steps(self._every)]
+                steps = [step * STEPS_PER_GRID for step in image_steps(self._every)]
             else:
                 period = PHYSICS_RATE_HZ // round(descriptor.nominal_rate_hz)
                 steps = list(range(0, NUM_GRID_STEPS * STEPS_PER_GRID, period))
@@ -220,8 +216,8 @@ class Recorder:
             if descriptor.kind == "keypoints":
                 values = self._keypoints(descriptor, values)
             if descriptor.kind == "image" and self._every is not None:
-                shown_ns = _regular_ns(NUM_GRID_STEPS, MODEL_RATE_HZ)[shown_steps(self._every)]
-                finished[name] = TruthStream(descriptor, shown_ns[: len(values)], values)
+                image_ns = _regular_ns(NUM_GRID_STEPS, MODEL_RATE_HZ)[image_steps(self._every)]
+                finished[name] = TruthStream(descriptor, image_ns[: len(values)], values)
             else:
                 finished[name] = timed_stream(descriptor, values)
         return finished
@@ -322,7 +318,7 @@ def _regular_ns(num_samples: int, rate_hz: int) -> Int64[np.ndarray, " n"]:
     return (np.arange(num_samples, dtype=np.int64) * _NS_PER_S + rate_hz // 2) // rate_hz
 
 
-def shown_steps(image_every: int) -> list[int]:
+def image_steps(image_every: int) -> list[int]:
     """Grid steps with images: multiples of `image_every` and the last three."""
     last = range(NUM_GRID_STEPS - NUM_LAST_SHOWN_STEPS, NUM_GRID_STEPS)
     return sorted({*range(0, NUM_GRID_STEPS, image_every), *last})

@@ -16,8 +16,9 @@ from services.twin.hands import TwinHand, twin_hand
 from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD
 from services.twin.names import Domain
 
+# Draws of the first round and of each next one, and rounds (chosen).
 _NUM_FIRST, _NUM_NEXT, _NUM_ROUNDS = 6000, 300, 45
-_SHRINK: Final = 0.90
+_SHRINK: Final = 0.90  # chosen: _NUM_ROUNDS narrow the search to 1 %
 # Cost weights relative to the distance between fingertip and cylinder.
 _FACING_M_PER_RAD: Final = 0.004
 _PLACE_M_PER_RAD: Final = 0.02
@@ -83,9 +84,9 @@ def _costs(
     inwards /= np.linalg.norm(inwards, axis=-1, keepdims=True) + 1e-12
     palmar = frames[:, :, 3, :3, 1] * hand.palm_sign
     facing = np.arccos(np.clip((palmar * inwards[:, :, 0]).sum(axis=-1), -1.0, 1.0))
-    wanted = np.arctan2(v[..., 0], u[..., 0]) - grasp.below_rad
+    target_rad = np.arctan2(v[..., 0], u[..., 0]) - grasp.below_rad
     cost = np.abs(reach).mean(axis=-1)
-    cost += _FACING_M_PER_RAD * facing + _PLACE_M_PER_RAD * np.abs(wanted)
+    cost += _FACING_M_PER_RAD * facing + _PLACE_M_PER_RAD * np.abs(target_rad)
     cost += _ALONG * np.abs(distal[:, :, 0, 0] - axis[0] - grasp.thumb_m) * (side < 0)
     cost += _BEND_M_PER_RAD2 * (joints_rad.reshape(-1, 5, 4) ** 2 @ np.array([0.2, 4.0, 0.2, 0.5]))
     return cost + _INSIDE * _penetration(hand, grasp, axis, chain_m)

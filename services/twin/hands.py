@@ -1,9 +1,8 @@
 """Robot and human hands of the twin: kinematics, collision shape and tactile skin.
 
 Both are five fingers × four hinges in the wrist frame of `dextouch.hands.robot_hand` (fingers
-along -z, thumb side +x, right palm towards +y, left palm towards -y). Bones of the human hand are
-adult means (Buryanov and Kotiuk 2010; phalanges with the pulp added to the last one); positions of
-the wrist bones and the limits are our estimates from common anatomy. The thumb's base frame is
+along -z, thumb side +x, right palm towards +y, left palm towards -y). The human hand is the mean
+one of `dextouch.hands`; its limits are our estimates from common anatomy. The thumb's base frame is
 oriented like the robot's, so that flexion and abduction have the same meaning.
 """
 
@@ -18,6 +17,9 @@ from jaxtyping import Float64
 from dextouch.errors import UnknownNameError
 from dextouch.hands import (
     CHAINS,
+    MEAN_FINGERS,
+    MEAN_THUMB_BASE_M,
+    MEAN_THUMB_BONES_M,
     NODE_INDEX,
     NUM_KEYPOINTS,
     FingerTable,
@@ -40,28 +42,10 @@ TIP_CAP_ANGLES_RAD: Final = np.deg2rad([52.0, 20.0])
 TIP_SHAFT_M: Final = (0.002, 0.007)
 # Base of each finger's metacarpal in the right wrist frame, metres.
 METACARPAL_BASES_M: Final[dict[str, np.ndarray]] = {
-    "index": np.array([0.013, -0.002, -0.027]),
-    "middle": np.array([0.003, -0.004, -0.029]),
-    "ring": np.array([-0.007, -0.003, -0.027]),
-    "little": np.array([-0.015, 0.000, -0.024]),
+    name: np.array(base_m) for name, (base_m, _, _) in MEAN_FINGERS.items()
 }
-# Length of the metacarpal, and its lean to the thumb side.
-_METACARPALS: Final = {
-    "index": (0.06812, 0.14),
-    "middle": (0.06460, 0.00),
-    "ring": (0.05800, -0.13),
-    "little": (0.05369, -0.26),
-}
-# Proximal, middle, and distal phalanx with pulp, metres.
-_PHALANGES_M: Final = {
-    "index": (0.03978, 0.02238, 0.01966),
-    "middle": (0.04463, 0.02633, 0.02135),
-    "ring": (0.04137, 0.02565, 0.02125),
-    "little": (0.03274, 0.01811, 0.01969),
-}
+# Limits of a finger and the thumb; turns of the thumb's hinges as on the robot.
 _FINGER_LIMITS_RAD: Final = ((-0.5, 1.57), (-0.35, 0.35), (0.0, 1.92), (0.0, 1.40))
-_THUMB_BASE_M: Final = (0.018, 0.007, -0.020)
-_THUMB_BONES_M: Final = (0.04622, 0.03157, 0.02734)
 _THUMB_LIMITS_RAD: Final = ((-1.0, 1.2), (-1.4, 0.6), (-0.5, 1.3), (-0.5, 1.5))
 _THUMB_BASE_TURN: Final = (0.6294, -0.0606, -0.7201, 0.2856)
 _THUMB_SADDLE_TURN: Final = (0.9347, 0.0919, 0.3425, -0.0234)
@@ -101,10 +85,8 @@ _HUMAN_SHAPE: Final = HandShape(
 class HumanHand(HandModel):
     """A human hand with the robot's kinematic tree and joint order, but human bones and limits.
 
-    `fingers` are a person's finger tables, thumb first; by default those of average size.
-
-    Raises:
-        UnknownNameError: any other side.
+    `fingers` are a person's finger tables, thumb first; by default those of average size. Raises
+    UnknownNameError for any other side.
     """
 
     def __init__(self, side: str, fingers: Sequence[FingerTable] | None = None) -> None:
@@ -177,11 +159,7 @@ class TwinHand:
 
 @lru_cache(maxsize=4)
 def twin_hand(side: Side, domain: Domain) -> TwinHand:
-    """The hand of one side and domain.
-
-    Raises:
-        UnknownNameError: unknown side or domain.
-    """
+    """The hand of one side and domain; raises UnknownNameError for unknown side or domain."""
     if domain not in DOMAINS:
         raise UnknownNameError("domain", domain, list(DOMAINS))
     kinematics: HandModel = RobotHand(side) if domain == "robot" else HumanHand(side)
@@ -212,10 +190,8 @@ def _table(
 
 
 def _finger(name: str) -> FingerTable:
-    length, lean = _METACARPALS[name]
-    base = METACARPAL_BASES_M[name]
+    base, lean, (length, proximal, middle, distal) = MEAN_FINGERS[name]
     knuckle = base + length * np.array([np.sin(lean), 0.0, -np.cos(lean)])
-    proximal, middle, distal = _PHALANGES_M[name]
     # The finger spreads half as much as its metacarpal, by a rotation about y.
     fan = (float(np.cos(lean / 4)), 0.0, float(-np.sin(lean / 4)), 0.0)
     firmware = "pinky" if name == "little" else f"{name}_finger"
@@ -227,9 +203,9 @@ def _finger(name: str) -> FingerTable:
 
 
 def _thumb() -> FingerTable:
-    metacarpal, proximal, distal = _THUMB_BONES_M
+    metacarpal, proximal, distal = MEAN_THUMB_BONES_M
     joints = (f"thumb_{joint}" for joint in ("cmc_flex", "cmc_abd", "mcp", "ip"))
-    places = (_THUMB_BASE_M, _ORIGIN, (0.0, 0.0, -metacarpal), (0.0, 0.0, -proximal))
+    places = (MEAN_THUMB_BASE_M, _ORIGIN, (0.0, 0.0, -metacarpal), (0.0, 0.0, -proximal))
     turns = (_THUMB_BASE_TURN, _THUMB_SADDLE_TURN, _THUMB_ROLL, _NO_TURN)
     return _table("thumb", joints, places, turns, _THUMB_LIMITS_RAD, distal)
 

@@ -7,7 +7,7 @@ import numpy as np
 from dextouch.tactile.layout import FINGERS
 from services.twin.hands import PALM_THICKNESS_M, TwinHand
 
-PHYSICS_RATE_HZ = 600
+PHYSICS_RATE_HZ = 600  # a multiple of the rates of all devices
 # Wrist impedance of the arm (or the operator's arm) towards the commanded pose.
 WRIST_STIFFNESS_N_M, WRIST_DAMPING_N_S_M = 700.0, 40.0
 WRIST_STIFFNESS_NM_RAD, WRIST_DAMPING_NM_S_RAD = 15.0, 0.4

@@ -62,9 +62,8 @@ mujoco.set_mju_user_warning(_log_warning)
 class ObjectBodies:
     """Access to poses and speeds of a task's objects in MuJoCo's arrays.
 
-    Raises:
-        InvalidInputError: a name without a body, or a body that is neither free nor attached to a
-            mocap body by hinges and slides.
+    Raises InvalidInputError for a name without a body, or a body that is neither free nor attached
+    to a mocap body by hinges and slides.
     """
 
     def __init__(self, model: mujoco.MjModel, names: tuple[str, ...]) -> None:
@@ -141,8 +140,7 @@ class ObjectBodies:
     def place(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
         """Set the pose of every object; joints of fixed objects keep their rest position.
 
-        Raises:
-            InvalidInputError: contradictory poses of the parts of a fixed object.
+        Raises InvalidInputError for contradictory poses of the parts of a fixed object.
         """
         data.qpos[self._free_qpos] = poses[self.is_free]
         placed: dict[int, np.ndarray] = {}

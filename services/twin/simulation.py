@@ -22,7 +22,7 @@ from dextouch.tactile.layout import FINGERS, NUM_TAXELS, SIDES, taxel_areas_m2
 from services.twin.mjcf import PHYSICS_RATE_HZ
 from services.twin.scene import Scene
 
-MODEL_RATE_HZ = 15
+MODEL_RATE_HZ = 15  # as in the paper
 STEPS_PER_GRID = PHYSICS_RATE_HZ // MODEL_RATE_HZ
 STEPS_PER_TACTILE = PHYSICS_RATE_HZ // 60
 # Commands are interpolated between grid steps and held for this many physics steps.
@@ -101,10 +101,8 @@ class Simulation:
         """Simulate one grid interval, moving the command linearly to `target`.
 
         Yields the index of every physics step; poses are current at each step, everything else
-        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE.
-
-        Raises:
-            InvalidInputError: the physics diverged.
+        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE. Raises InvalidInputError
+        if the physics diverged.
         """
         poses, joints_rad = self._interpolated(target)
         for pose, joints in zip(poses, joints_rad, strict=True):

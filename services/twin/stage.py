@@ -23,7 +23,7 @@ from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation
 from services.twin.tasks import get_task
 
-MAX_NOISE_M: Final = 0.2
+MAX_NOISE_M: Final = 0.2  # chosen: a demonstrator that far off grasps nothing
 # Positions of the objects in a miss episode: aside, or out of view behind the viewer.
 _ASIDE_M: Final = 0.13
 _SHELF_Y_M: Final = -3.0

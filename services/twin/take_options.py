@@ -229,8 +229,7 @@ class Mix:
     def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
         """Copy with another share of misses, or of takes that stop (half) or never start.
 
-        Raises:
-            InvalidInputError: shares outside 0 … 1, or none left for other kinds.
+        Raises InvalidInputError for shares outside 0 … 1, or none left for other kinds.
         """
         given = {} if miss is None else {"miss": miss}
         if still is not None:
@@ -261,8 +260,7 @@ MIXES: Final[dict[str, Mix]] = {
 def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
     """Options of the take of a task and seed; deterministic.
 
-    Raises:
-        InvalidInputError: a negative seed.
+    Raises InvalidInputError for a negative seed.
     """
     if seed < 0:
         raise InvalidInputError(f"training data: got seed {seed}, expected 0 or more")

@@ -31,7 +31,7 @@ from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TA
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
 
-MAX_SNAPSHOT_BYTES: Final = 1 << 20
+MAX_SNAPSHOT_BYTES: Final = 1 << 20  # chosen: refuses what is no state
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,8 @@ class TwinWorld:
 
     A rollout starts from task and seed, at the first observation of the demonstration of that seed;
     replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
-    treated as commands. The physics has no noise, so the seed of a step has no effect.
-
-    Raises:
-        UnknownNameError: an unknown camera.
+    treated as commands. The physics has no noise, so the seed of a step has no effect. Raises
+    UnknownNameError for an unknown camera.
     """
 
     def __init__(self, settings: TwinSettings) -> None:
@@ -243,8 +241,8 @@ def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
 def serve(arguments: list[str]) -> None:
     """Serve both over HTTP until SIGINT or SIGTERM.
 
-    Raises:
-        InvalidInputError: invalid settings.
+    Raises InvalidInputError for invalid settings.
     """
-    settings = load_settings(TwinServiceSettings, arguments)
-    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin")
+    load = partial(load_settings, TwinServiceSettings, arguments)
+    settings = load()
+    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin", load=load)

@@ -80,7 +80,8 @@ class CheckpointMetadata(FrozenModel):
     file. None is not written, so that older releases can read the file. `sets` are the episodes by
     domain, those of ancestors included; empty in files of older releases. `horizon_latents` is the
     length of the longest training episode. `text_dropout` and `action_dropout` are the shares of
-    windows without instruction and without actions, of this training or of an ancestor's.
+    windows without instruction and without actions, of this training or of an ancestor's, and
+    `view_dropout` that of windows without a further view; 0 where starts need them all.
     """
 
     format_version: int = 1
@@ -101,6 +102,7 @@ class CheckpointMetadata(FrozenModel):
     horizon_latents: int = Field(default=HORIZON_LATENTS, ge=1, exclude_if=HORIZON_LATENTS.__eq__)
     text_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
     action_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
+    view_dropout: float = Field(default=0.0, ge=0, le=1, exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
 
     @property

@@ -111,12 +111,14 @@ def run_serve(arguments: list[str]) -> int:
 
     Rollouts that began in another checkpoint continue in it while it is in the same folder.
     """
-    settings = load_settings(WorldModelSettings, arguments)
+    load = partial(load_settings, WorldModelSettings, arguments)
+    settings = load()
     serve_worlds(
         partial(open_worlds, settings),
         settings,
         name="world_model",
         reopen=partial(open_by_digest, settings),
+        load=load,
     )
     return 0
 

@@ -77,6 +77,12 @@ class WindowSettings(FrozenModel):
     action_dropout: Share = Field(
         default=0.0, description="share of windows without actions, for --guidance of serving"
     )
+    view_dropout: Share = Field(
+        default=0.1,
+        description="share of windows without a further view, so that starts and episodes may lack "
+        "it; 0: they are refused",
+    )
+    past_dropout: Share = Field(default=0.1, description="share of windows without past images")
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 

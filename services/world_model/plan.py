@@ -28,6 +28,7 @@ from services.world_model.network.configuration import NetworkConfig, Precision,
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
+from services.world_model.network.past import kept_bytes
 from services.world_model.paper_settings import LoraSettings, TrainSettings
 from services.world_model.pretrained_video import freeze_pretrained
 
@@ -201,7 +202,8 @@ def plan_table(config: NetworkConfig) -> str:
             *work,
             *totals,
             row("shared by sampler steps", "", (plan.kept_bytes for plan in columns)),
-        ]
+            row("remembered by a rollout, at most", "", [kept_bytes(config)] * len(columns)),
+        ][: None if config.past_images else -1]
     )
 
 
@@ -213,7 +215,8 @@ def plan_of(config: NetworkConfig) -> Plan:
         work, kept_bytes = _work(model, 1 + steps)
         return Plan(
             num_steps=steps,
-            num_video_tokens=num_latents(1 + steps) * config.tokens_per_latent,
+            num_video_tokens=(num_latents(1 + steps) + config.past_images)
+            * config.tokens_per_frame,
             num_tactile_tokens=(1 + steps) * 2 * model.tokenizer.num_tokens,
             parts=_parts(model),
             work=work,
@@ -316,7 +319,8 @@ def _encoding_bytes(config: NetworkConfig) -> int:
     """What the codec takes for the latents of one window."""
     with torch.device("meta"), torch.no_grad():
         codec = JointWorldModel(config).codec
-        images = torch.zeros(1, config.max_steps, config.image_px, config.image_px, 3)
+        shape = config.max_steps, config.image_px, config.image_px, 3
+        images = torch.zeros(config.num_views, *shape)
         with PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
             codec.encode(images)
     return memory.peak_bytes
@@ -349,7 +353,8 @@ def _drop_gradient(weight: Tensor) -> None:
 
 
 def _parts(model: JointWorldModel) -> tuple[Part, ...]:
-    video = [model.video_condition, model.video, *(layer.video for layer in model.layers)]
+    ends = [model.video_condition, model.video, *([model.views] if model.views else [])]
+    video = [*ends, *(layer.video for layer in model.layers)]
     touch = [model.tactile_condition, model.tactile, *(layer.tactile for layer in model.layers)]
     groups: dict[str, list[Any]] = {
         "video expert": video,
@@ -419,7 +424,7 @@ def _latents(
     if model.text_features is not None and config.wan is not None:
         model.text_features.learn({key_of(""): torch.zeros(1, config.wan.text_width)})
     first = FirstLatents(
-        torch.zeros(num_windows, config.tokens_per_latent, config.video_channels),
+        torch.zeros(num_windows, config.tokens_per_frame, config.video_channels),
         torch.zeros(num_windows, 2, model.tokenizer.num_tokens, model.tokenizer.channels),
     )
     return first, JointLatents(
@@ -429,7 +434,8 @@ def _latents(
 
 
 def _inputs(config: NetworkConfig, num_steps: int, num_windows: int = 1) -> ModelInputs:
-    cells, num = config.raster_cells, num_windows
+    cells, num, past = config.raster_cells, num_windows, config.past_images
+    px, further = config.image_px, len(config.further_views)
     return ModelInputs(
         first_image=torch.zeros(num, config.image_px, config.image_px, 3, dtype=torch.uint8),
         first_tactile_kpa=torch.zeros(num, 2, config.tactile_layout.num_taxels),
@@ -442,4 +448,12 @@ def _inputs(config: NetworkConfig, num_steps: int, num_windows: int = 1) -> Mode
         acting=torch.ones(num),
         words=torch.zeros(num, MAX_WORDS, dtype=torch.int64),
         instructions=("",) * num,
+        further_images=torch.zeros(num, further, px, px, 3, dtype=torch.uint8),
+        missing=torch.zeros(num, further, dtype=torch.bool),
+        past_images=torch.zeros(num, 0, 1 + further, px, px, 3, dtype=torch.uint8),
+        past_latents=torch.zeros(num, past, config.tokens_per_frame, config.video_channels),
+        past_hands=torch.zeros(num, past, 2, HAND_DIM),
+        past_camera=torch.zeros(num, past, 2, CAMERA_DIM),
+        past_raster=torch.zeros(num, past, 2, cells, cells),
+        past_age=torch.zeros(num, past),
     )

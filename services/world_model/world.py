@@ -1,13 +1,13 @@
 """World of a flow-matching checkpoint: predicts observations chunk by chunk."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float16, Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply
@@ -21,7 +21,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.tactile.layout import described
-from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
+from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout, asked_cameras
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints, starts
 from services.world_model.devices import claimed_device
@@ -31,16 +31,19 @@ from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
     GloveNetworkConfig,
+    NetworkConfig,
     Precision,
 )
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Sampling, stack_noise
+from services.world_model.network.past import MAX_KEPT, PastImages, PastRule, kept_bytes
 from services.world_model.network.video import WanVideoCodec, to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
 MAX_SNAPSHOT_BYTES = 4 * 2**20
+_IMAGE = "image/"
 _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head", "still_m")
 _SNAPSHOT_FIELDS = ("instruction", "action_kind", "step", "task", "num_still", "num_moving")
 # Points on the axes of the head camera, so that it counts as still only if it does not turn either.
@@ -49,11 +52,56 @@ _NUM_WATCHED_POINTS = NUM_POINTS + len(_CAMERA_POINTS_M)
 
 
 @dataclass(frozen=True)
+class KeptImages:
+    """Images that a rollout remembers, the oldest first: steps, poses then, and latents.
+
+    Latents are half as precise as those of the network, so that a snapshot has all of them.
+    """
+
+    steps: tuple[int, ...]
+    reached: Float64[np.ndarray, "kept 67"]
+    latents: Float16[np.ndarray, "kept tokens channels"]
+
+    @classmethod
+    def none(cls, config: NetworkConfig) -> "KeptImages":
+        """Those of a rollout that begins."""
+        shape = 0, config.tokens_per_frame, config.video_channels
+        return cls((), np.zeros((0, 67)), np.zeros(shape, np.float16))
+
+    def with_first(
+        self, state: "ModelState", latents: np.ndarray, config: NetworkConfig
+    ) -> "KeptImages":
+        """These and the first image of a chunk, if it is a stride after the last of them."""
+        rule = PastRule.of(config)
+        if rule is None or (self.steps and state.step - self.steps[-1] < rule.stride):
+            return self
+        last = slice(-MAX_KEPT, None)
+        return KeptImages(
+            (*self.steps, state.step)[last],
+            np.concatenate([self.reached, state.reached[None]])[last],
+            np.concatenate([self.latents, latents[None].astype(np.float16)])[last],
+        )
+
+    def before(
+        self, state: "ModelState", actions: np.ndarray, config: NetworkConfig
+    ) -> PastImages | None:
+        """Those that a chunk of these re-anchored actions is predicted from."""
+        rule = PastRule.of(config)
+        if rule is None or not self.steps:
+            return None
+        poses = reanchor(self.reached, 0, anchor_action=state.reached)
+        rows = rule.chosen(poses, actions)
+        ages = state.step - np.array(self.steps)[rows]
+        return PastImages(poses[rows], ages, latents=self.latents[rows].astype(np.float32))
+
+
+@dataclass(frozen=True)
 class ModelState(starts.ObservedStart):
     """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0.
 
     `still_m` are points of hands and camera when they last moved, `num_still` the latent steps
-    since then, and `num_moving` all those with motion.
+    since then, and `num_moving` all those with motion. `further` has the last image of each further
+    view that the start had, and `kept` the images that are remembered.
     """
 
     instruction: str
@@ -62,7 +110,9 @@ class ModelState(starts.ObservedStart):
     task: str
     still_m: Float32[np.ndarray, "2 points 3"]
     num_still: int
+    kept: KeptImages
     num_moving: int = 0
+    further: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
 
 class ModelWorld(BatchWorld[ModelState]):
@@ -93,6 +143,7 @@ class ModelWorld(BatchWorld[ModelState]):
         self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._horizon_latents = metadata.horizon_latents
+        self._needs_views = not metadata.view_dropout
         self._reader = reader if config.use_contact_geometry else None
         if config.use_contact_geometry:
             _check_reader(reader, checkpoint.metadata)
@@ -102,6 +153,7 @@ class ModelWorld(BatchWorld[ModelState]):
             digest=checkpoint.digest,
             tasks=metadata.tasks,
             cameras=(HEAD_CAMERA,),
+            optional_cameras=config.further_views,
             image_height_px=config.image_px,
             image_width_px=config.image_px,
             model_rate_hz=config.model_rate_hz,
@@ -130,6 +182,17 @@ class ModelWorld(BatchWorld[ModelState]):
         first = starts.observed_start(
             start, tasks=self._description.tasks, layout=self._model.config.tactile_layout
         )
+        config = self._model.config
+        seen = {} if start.observation is None else start.observation.images
+        further: dict[str, np.ndarray] = {
+            name: seen[name][-1].copy() for name in config.further_views if name in seen
+        }
+        if self._needs_views and len(further) < len(config.further_views):
+            raise InvalidInputError(
+                f"start: got images of {', '.join(seen)}, expected those of "
+                f"{', '.join(config.further_views)}, too: this model was trained with all its "
+                "views; send them, or train with --windows.view-dropout"
+            )
         state = ModelState(
             **vars(first),
             instruction=start.instruction,
@@ -138,11 +201,15 @@ class ModelWorld(BatchWorld[ModelState]):
             task=start.task,
             still_m=_watched_points(first.reached[None], first.anchor)[0],
             num_still=REST_LATENTS * int(first.tactile_kpa.max() < FREE_KPA),
+            kept=KeptImages.none(config),
+            further=further,
         )
         if self._model.text_features is not None:
             self._model.text_features.of(start.instruction)
         self._check_chunk(state)
-        return StartedRollout(state, first.observation(), first.anchor, first.K_head)
+        observation = first.observation()
+        observation.images.update({name: image[None] for name, image in further.items()})
+        return StartedRollout(state, observation, first.anchor, first.K_head)
 
     def step_batch(
         self,
@@ -164,8 +231,13 @@ class ModelWorld(BatchWorld[ModelState]):
             UnavailableError: the model returned NaN or infinity.
         """
         requested = starts.checked_selectors(states, actions, seeds, selectors)
-        for state in states:
+        for state, selector in zip(states, requested, strict=True):
             starts.refuse_ended(state.num_moving, self._horizon_latents, self._description)
+            if absent := {*(selector.cameras or ())} - {HEAD_CAMERA, *state.further}:
+                raise InvalidInputError(
+                    f"chunk: got a request for {', '.join(sorted(absent))}, expected views that "
+                    "the rollout began with; send their images with its start"
+                )
         chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         still = _stillness(states, chunks)
         rests = still.at_rest.all(dim=1).tolist()
@@ -182,40 +254,52 @@ class ModelWorld(BatchWorld[ModelState]):
                 num_moving=state.num_moving + int(still.moves[index].sum()),
             )
             if rests[index]:
-                images, touch = (
-                    np.stack([o] * len(chunk)) for o in (state.image, state.tactile_kpa)
-                )
-                future = images, touch
+                views = {HEAD_CAMERA: state.image, **state.further}
+                images = {name: np.stack([one] * len(chunk)) for name, one in views.items()}
+                future = images, np.stack([state.tactile_kpa] * len(chunk))
             else:
-                future = next(futures)
+                shown, touch, latents = next(futures)
+                future = shown, touch
+                kept = state.kept.with_first(state, latents, self._model.config)
+                following = replace(following, kept=kept)
             stepped.append(_advance(following, chunk, future, requested[index]))
         return stepped
 
     def _futures(
         self, asked: Sequence[tuple[ModelState, np.ndarray, int, ReturnSelector]]
-    ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Predicted images, maybe the last only, and touch of each chunk."""
+    ) -> list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
+        """Predicted images by view, maybe the last only, touch, and latents of the first images."""
         if not asked:
             return []
         states, chunks, seeds, requested = zip(*asked, strict=True)
         inputs = build_inputs(self._requests(states, chunks), self._model.config)
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         noise = stack_noise([self._model.noise(inputs.num_steps, each) for each in generators])
-        wanted = any(one.steps == "all" and one.wants(HEAD_CAMERA) for one in requested)
+        wanted = any(
+            one.steps == "all" and (one.wants(HEAD_CAMERA) or one.cameras) for one in requested
+        )
         future = self._model.predict(
             inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
         )
         starts.refuse_non_finite(
-            "world model", {"image": future.images, "touch": future.tactile_kpa}
+            "world model",
+            {"image": future.images, "touch": future.tactile_kpa, "view": future.further},
         )
-        images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
-        return list(zip(images, touches, strict=True))
+        shown = torch.cat([future.images[:, None], future.further], dim=1)
+        images, touches = to_uint8(shown).cpu().numpy(), future.tactile_kpa.cpu().numpy()
+        names = HEAD_CAMERA, *self._model.config.further_views
+        views = [
+            {name: one for name, one in zip(names, row, strict=True) if name in known}
+            for row, known in zip(images, [{HEAD_CAMERA, *s.further} for s in states], strict=True)
+        ]
+        return list(zip(views, touches, future.first.cpu().numpy(), strict=True))
 
     def _requests(
         self, states: Sequence[ModelState], chunks: Sequence[np.ndarray]
     ) -> list[PredictionRequest]:
         """Requests for the chunks, with the objects as they are seen at the first step."""
-        requests = [_request(state, chunk) for state, chunk in zip(states, chunks, strict=True)]
+        each = zip(states, chunks, strict=True)
+        requests = [_request(state, chunk, self._model.config) for state, chunk in each]
         if self._reader is None:
             return requests
         objects = self._reader.objects(requests, [state.task for state in states])
@@ -241,6 +325,12 @@ class ModelWorld(BatchWorld[ModelState]):
         fields = {name: getattr(state, name) for name in _SNAPSHOT_FIELDS}
         fields |= {"digest": self._digest}
         arrays = {name: getattr(state, name) for name in _SNAPSHOT_ARRAYS}
+        arrays |= {_IMAGE + name: image for name, image in state.further.items()}
+        if self._model.config.past_images:
+            # The codec of snapshots has no half floats.
+            latents = state.kept.latents.view(np.uint16)
+            arrays |= {"kept/latents": latents, "kept/reached": state.kept.reached}
+            arrays |= {"kept/steps": np.array(state.kept.steps, dtype=np.int64)}
         return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> ModelState:
@@ -249,13 +339,22 @@ class ModelWorld(BatchWorld[ModelState]):
         Raises:
             InvalidInputError: not a snapshot of this checkpoint.
         """
-        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        config = self._model.config
+        max_bytes = config.num_views * MAX_SNAPSHOT_BYTES + kept_bytes(config)
+        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=max_bytes)
         words, task = fields.get("instruction"), fields.get("task")
         counts: dict[str, Any] = {
             name: fields.get(name) for name in ("step", "num_still", "num_moving")
         }
+        further: dict[str, np.ndarray] = {
+            name: arrays.pop(_IMAGE + name)
+            for name in config.further_views
+            if _IMAGE + name in arrays
+        }
+        kept = _kept_of(arrays, config)
         if (
-            set(arrays) != set(_SNAPSHOT_ARRAYS)
+            kept is None
+            or set(arrays) != set(_SNAPSHOT_ARRAYS)
             or not all(isinstance(one, int) and one >= 0 for one in counts.values())
             or not isinstance(words, str)
             or task not in self._description.tasks
@@ -275,6 +374,8 @@ class ModelWorld(BatchWorld[ModelState]):
             action_kind=fields["action_kind"],
             task=str(task),
             still_m=arrays["still_m"],
+            kept=kept,
+            further=further,
             **counts,
         )
         self._check_chunk(state)
@@ -410,27 +511,47 @@ def _stillness(states: Sequence[ModelState], chunks: Sequence[np.ndarray]) -> St
     )
 
 
-def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:
+def _kept_of(arrays: dict[str, np.ndarray], config: NetworkConfig) -> KeptImages | None:
+    """Images kept in a snapshot, whose arrays are taken out; None if they are not as expected."""
+    kept = KeptImages.none(config)
+    if not config.past_images:
+        return kept
+    found = [arrays.pop(f"kept/{name}", None) for name in ("steps", "reached", "latents")]
+    expected = [(np.dtype(np.int64), ()), (kept.reached.dtype, (67,))]
+    expected.append((np.dtype(np.uint16), kept.latents.shape[1:]))
+    num = 0 if found[0] is None else len(found[0])
+    if num > MAX_KEPT or any(
+        one is None or (one.dtype, one.shape) != (dtype, (num, *shape))
+        for one, (dtype, shape) in zip(found, expected, strict=True)
+    ):
+        return None
+    steps, reached, latents = (np.array(one) for one in found)
+    return KeptImages(tuple(steps.tolist()), reached, latents.view(np.float16))
+
+
+def _request(state: ModelState, chunk: np.ndarray, config: NetworkConfig) -> PredictionRequest:
     """Request for a chunk, re-anchored to the rollout's current poses."""
-    rows = np.concatenate([state.reached[None], chunk])
+    actions = reanchor(np.concatenate([state.reached[None], chunk]), 0)
     return PredictionRequest(
         first_image=state.image,
         first_tactile_kpa=state.tactile_kpa,
-        actions=reanchor(rows, 0),
+        actions=actions,
         action_kind=state.action_kind,
         instruction=state.instruction,
         anchor=poses_from_actions(state.reached[None], state.anchor).anchor(0),
         K_head=state.K_head,
+        further_images=tuple(state.further.get(name) for name in config.further_views),
+        past=state.kept.before(state, actions, config),
     )
 
 
 def _advance(
     state: ModelState,
     chunk: np.ndarray,
-    imagined: tuple[np.ndarray, np.ndarray],
+    imagined: tuple[dict[str, np.ndarray], np.ndarray],
     selector: ReturnSelector,
 ) -> SteppedRollout[ModelState]:
-    """New state and requested outputs, from predicted images (maybe the last only) and touch.
+    """New state and requested outputs, from predicted images by view (maybe the last) and touch.
 
     The model predicts no poses: the next chunk starts from the last commanded action.
     """
@@ -438,14 +559,18 @@ def _advance(
     first = 0 if selector.steps == "all" else len(chunk) - 1
     observation = Observation(
         first_step=state.step + 1 + first,
-        images={HEAD_CAMERA: images[first - len(chunk) :]} if selector.wants(HEAD_CAMERA) else {},
+        images={
+            name: images[name][first - len(chunk) :]
+            for name in asked_cameras(selector, (HEAD_CAMERA,))
+        },
         tactile_kpa=tactile_kpa[first:],
         action_reached=chunk[first:],
         reached_is_measured=False,
     )
     following = replace(
         state,
-        image=images[-1],
+        image=images[HEAD_CAMERA][-1],
+        further={name: images[name][-1] for name in state.further},
         tactile_kpa=tactile_kpa[-1],
         reached=chunk[-1],
         step=state.step + len(chunk),

@@ -66,9 +66,9 @@ def _installed() -> "Distribution | None":
 
 def _arguments(installed: "Distribution", origin: dict[str, Any] | None, extra: str) -> list[str]:
     """Arguments of `pip install`."""
-    wanted = f"{NAME}[{extra}]"
+    requirement = f"{NAME}[{extra}]"
     if origin is None:
-        return [wanted]
+        return [requirement]
     url: str = origin["url"]
     packages = _packages_of(installed, extra)
     others = [package for package in packages if not package.startswith(WEIGHTS)]
@@ -83,8 +83,8 @@ def _arguments(installed: "Distribution", origin: dict[str, Any] | None, extra: 
         url = f"{vcs['vcs']}+{url}@{vcs['commit_id']}"
     weights = [f"{WEIGHTS} @ {_weights_beside(url)}"] if needs_weights else []
     if not url.startswith("file:") or _path_of(url).is_file():
-        return [*weights, f"{wanted} @ {url}"]
-    return [*weights, *others] or [wanted]
+        return [*weights, f"{requirement} @ {url}"]
+    return [*weights, *others] or [requirement]
 
 
 def _weights_beside(url: str) -> str:

@@ -40,7 +40,8 @@ class TraceContext:
 
 def new_trace(trace_id: str | None = None) -> TraceContext:
     """The first span of a new trace, or a new one of the trace of this id."""
-    return TraceContext(trace_id or secrets.token_hex(16), secrets.token_hex(8))
+    drawn = secrets.token_hex(24)
+    return TraceContext(trace_id or drawn[:32], drawn[32:])
 
 
 def parse_traceparent(text: str) -> TraceContext | None:

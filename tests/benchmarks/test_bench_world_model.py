@@ -46,7 +46,7 @@ def test_a_quick_run_measures_everything(run):
     folder, figures = run
     names = {one.name for one in benchmark.VARIANTS}
     assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {benchmark.COPY_FIRST}
-    assert len(figures["asked_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
+    assert len(figures["requested_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
     assert len(figures["state_model_ms"]) == len(benchmark.SELECTORS) * len(benchmark.STATE_BATCHES)
     assert figures["options"]["served"] in names
     assert "as served" in (folder / "bench_world-model.md").read_text()
@@ -139,8 +139,8 @@ def test_verdicts():
 
 def test_the_state_model_is_judged_by_its_rounds():
     costs = {
-        benchmark.asked_name(asked, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
-        for asked in benchmark.SELECTORS
+        benchmark.cost_name(amount, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
+        for amount in benchmark.SELECTORS
         for batch in benchmark.STATE_BATCHES
     }
     found = benchmark.state_model_requirements(costs)

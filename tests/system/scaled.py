@@ -79,6 +79,7 @@ class Service:
                 [str(word) for word in command],
                 env=environment,
                 cwd=ROOT,
+                stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )

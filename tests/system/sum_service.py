@@ -56,8 +56,11 @@ def reopen(settings, name, digest):
 
 
 if __name__ == "__main__":
-    given = load_settings(SumSettings, sys.argv[1:])
+    load = partial(load_settings, SumSettings, sys.argv[1:])
+    given = load()
     try:
-        serve_worlds(partial(worlds, given), given, name="sum", reopen=partial(reopen, given))
+        serve_worlds(
+            partial(worlds, given), given, name="sum", reopen=partial(reopen, given), load=load
+        )
     except UnavailableError as error:
         sys.exit(error.message)

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from dextouch.clients import RolloutClient
-from dextouch.errors import UnavailableError
+from dextouch.errors import AccessDeniedError, UnavailableError
 from tests.contracts.redis_server import running_redis
 from tests.programs import needed_program
 from tests.system.scaled import (
@@ -168,6 +168,67 @@ def test_a_new_checkpoint_by_a_restart_of_one_worker_after_another(one_port):
             assert rollout.step(actions(4)).tactile_kpa[-1, 0, 0] == pytest.approx(total, abs=1e-4)
     # Each response was checked against the noise of the digest that its rollout began with: d1.
     assert load.mistakes == []
+
+
+OLD, NEW = "the old key, 5d1f9a0c", "the new key, 83b7e2d4"
+
+
+def write_keys(folder, *keys, raw=""):
+    lines = "".join(
+        f'[[sum.api_keys]]\nname = "lab"\nkey = "{key}"\nscopes = ["rollout"]\n' for key in keys
+    )
+    (folder / "dextouch.toml").write_text(lines + raw)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_keys_are_exchanged_while_a_rollout_goes_on(tmp_path, redis_url, monkeypatch, num_workers):
+    monkeypatch.setenv("DEXTOUCH_CONFIG", str(tmp_path / "dextouch.toml"))
+    write_keys(tmp_path, OLD)
+    service = Service(tmp_path, redis_url, ("--workers", num_workers))
+
+    def reload(*keys):
+        before = service.workers()
+        write_keys(tmp_path, *keys)
+        service.process.send_signal(signal.SIGHUP)
+        if num_workers > 1:
+            wait_until(
+                lambda: len(now := service.workers()) == num_workers and not set(before) & set(now),
+                "workers anew",
+            )
+
+    def valid(key):
+        try:
+            with RolloutClient(service.url, api_key=key) as client:
+                return bool(client.worlds())
+        except AccessDeniedError:
+            return False
+
+    try:
+        wait_until(lambda: is_ready(service.url), "service")
+        wait_until(lambda: len(service.workers()) == num_workers, "workers")
+        assert (valid(OLD), valid(NEW)) == (True, False)
+        with RolloutClient(service.url, api_key=OLD) as client:
+            rollout = client.start(seed=3, **ASKED)
+            reload(OLD, NEW)
+            wait_until(lambda: valid(NEW), "the new key")
+            rollout.step(actions(4))
+        reload(NEW)
+        wait_until(lambda: not valid(OLD), "the end of the old key")
+        assert valid(NEW)
+        # Settings with a mistake change nothing.
+        write_keys(tmp_path, OLD, raw="[sum]\nclient_timeout_s = -1\n")
+        service.process.send_signal(signal.SIGHUP)
+        wait_until(lambda: "keys_not_reloaded" in service.log_path.read_text(), "the reason")
+        if num_workers > 1:
+            # One that takes the place of a dead one has the keys of now, not those of the start.
+            dead, _ = service.workers()
+            os.kill(dead, signal.SIGKILL)
+            wait_until(lambda: len(set(service.workers()) - {dead}) == num_workers, "a new worker")
+            # The kernel gives connections to either.
+            assert not any(valid(OLD) for _ in range(20))
+        assert (valid(OLD), valid(NEW)) == (False, True)
+    finally:
+        service.stop()
 
 
 def test_a_worker_that_cannot_start_ends_the_service(tmp_path, redis_url):

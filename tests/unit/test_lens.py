@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.geometry import box_pixels, points_on_level, project, undistorted
+from dextouch.geometry import (
+    NUM_DISTORTION,
+    box_pixels,
+    distortion_of,
+    points_on_level,
+    project,
+    undistorted,
+)
 
 K = np.array([[560.0, 0.0, 322.0], [0.0, 555.0, 238.0], [0.0, 0.0, 1.0]])
 STRAIGHT = np.zeros(5)
@@ -124,3 +131,9 @@ def test_images_without_distortion_are_left_alone():
     images = np.zeros((1, 480, 640, 3), dtype=np.uint8)
     assert undistorted(images, K, STRAIGHT) is images
     assert undistorted(images[:0], K, LENSES[1]).shape == (0, 480, 640, 3)
+
+
+def test_coefficients_that_a_calibration_lacks_are_zero():
+    calibration = {"distortion_head": ((0.1, -0.2, 1e-3, 2e-3),), "K_head": np.eye(3)}
+    assert distortion_of(calibration, "head").tolist() == [0.1, -0.2, 1e-3, 2e-3, 0.0]
+    assert distortion_of(calibration, "wrist_left").tolist() == [0.0] * NUM_DISTORTION

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DexTouchError, InvalidInputError
+from dextouch.geometry import Distortion
 from services.alignment.calibration.motion import DegenerateMotionError, hat
 from services.alignment.calibration.time_offset import (
     CUTOFF_HZ,
@@ -108,7 +109,7 @@ def turning_of_images(
     t_ns: Int64[np.ndarray, " n"],
     images: Iterable[UInt8[np.ndarray, "h w channels"]],
     K: Float64[np.ndarray, "3 3"],
-    distortion: Float64[np.ndarray, "5"],
+    distortion: Distortion,
 ) -> Turning:
     """Angular velocity of a camera from the corners that consecutive images share, in its axes.
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import invert
+from dextouch.geometry import Distortion, invert
 from services.alignment.calibration.bundle import (
     Bundle,
     Component,
@@ -100,7 +100,7 @@ class BoardViews:
     points_board: Sequence[np.ndarray]
     pixels_px: Sequence[np.ndarray]
     K: Float64[np.ndarray, "3 3"]
-    distortion: Float64[np.ndarray, "5"]
+    distortion: Distortion
 
     def __post_init__(self) -> None:
         if len(self.points_board) != len(self.pixels_px) or not self.points_board:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.geometry import Distortion
 from services.alignment.calibration.motion import DegenerateMotionError
 
 if TYPE_CHECKING:
@@ -118,9 +119,9 @@ class CameraCalibration:
     """
 
     K: Float64[np.ndarray, "3 3"]
-    distortion: Float64[np.ndarray, "5"]
+    distortion: Distortion
     sigma_fxfycxcy_px: Float64[np.ndarray, "4"]
-    sigma_distortion: Float64[np.ndarray, "5"]
+    sigma_distortion: Distortion
     rms_px: float
     rms_by_place_px: Float64[np.ndarray, " n"]
     board_bend_m: float

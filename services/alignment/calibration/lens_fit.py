@@ -15,10 +15,13 @@ from jaxtyping import Float64
 from numpy.polynomial import chebyshev
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import NUM_DISTORTION, Distortion
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.places import Structure, structure
 
 # Radial functions show an equidistant lens, of which k1 k2 k3 leave waves along the radius.
+# fx fy cx cy and the distortion.
+NUM_LENS = 4 + NUM_DISTORTION
 NUM_RADIAL = 10
 # Others show what is not round: a tilted sensor, or a part of the image cut out.
 MAX_DEGREE = 3
@@ -50,8 +53,8 @@ class LensFit(NamedTuple):
     """
 
     K: Float64[np.ndarray, "3 3"]
-    distortion: Float64[np.ndarray, "5"]
-    covariance: Float64[np.ndarray, "9 9"]
+    distortion: Distortion
+    covariance: Float64[np.ndarray, "lens lens"]
     normals: Float64[np.ndarray, "n 3"]
     board_bend_m: float
     image: Structure
@@ -146,7 +149,7 @@ def _with_statistics(
     return LensFit(
         K=camera.K,
         distortion=camera.distortion,
-        covariance=(variance * np.outer(scale, scale) * shares)[:9, :9],
+        covariance=(variance * np.outer(scale, scale) * shares)[:NUM_LENS, :NUM_LENS],
         normals=rotation_from_vector(turns)[:, :, 2],
         board_bend_m=float(np.ptp(heights_m)),
         image=image,
@@ -187,7 +190,7 @@ def _calibrated(
     size_px: tuple[int, int],
     start: _Camera | None,
 ) -> _Camera:
-    K, distortion = (np.eye(3), np.zeros(5)) if start is None else start[:2]
+    K, distortion = (np.eye(3), np.zeros(NUM_DISTORTION)) if start is None else start[:2]
     flags = 0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS
     boards, seen = ([one.astype(np.float32) for one in series] for series in (points, pixels))
     try:
@@ -201,7 +204,11 @@ def _calibrated(
         ) from error
     K, distortion = (np.asarray(values, dtype=np.float64) for values in (K, distortion))
     return _Camera(
-        K, distortion.ravel()[:5], turns, shifts, np.asarray(by_photo, dtype=np.float64).ravel()
+        K,
+        distortion.ravel()[:NUM_DISTORTION],
+        turns,
+        shifts,
+        np.asarray(by_photo, dtype=np.float64).ravel(),
     )
 
 
@@ -230,7 +237,7 @@ def _design(
         normal = rotation_from_vector(np.asarray(turn).reshape(1, 3))[0, :, 2]
         along_normal = (J[:, 3:6] @ normal).reshape(-1, 2, 1)
         by_bend = (along_normal * bend[:, None]).reshape(len(J), -1)
-        lens = J[:, 6:15]
+        lens = J[:, 6 : 6 + NUM_LENS]
         columns = np.column_stack(
             [
                 (seen - predicted).ravel(),
@@ -243,7 +250,7 @@ def _design(
         Q, _ = np.linalg.qr(J[:, :6])
         rows.append(columns - Q @ (Q.T @ columns))
     stacked = np.concatenate(rows)
-    ends = [1, 10, 13, stacked.shape[1] - NUM_DRIFTING]
+    ends = [1, 1 + NUM_LENS, 4 + NUM_LENS, stacked.shape[1] - NUM_DRIFTING]
     residuals, *others = np.split(stacked, ends, axis=1)
     return _Design(residuals[:, 0], *others)
 

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from dextouch.command_line import progress
 from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.geometry import apply, transform
+from dextouch.geometry import Distortion, apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.intrinsics import (
     DICTIONARIES,
@@ -81,7 +81,7 @@ class Lens:
     """OpenCV's camera: K with pixel centres at whole numbers, distortion k1 k2 p1 p2 k3."""
 
     K: Float64[np.ndarray, "3 3"]
-    distortion: Float64[np.ndarray, "5"]
+    distortion: Distortion
 
     @staticmethod
     def guessed(width_px: int, height_px: int) -> "Lens":

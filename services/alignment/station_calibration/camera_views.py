@@ -15,6 +15,7 @@ import numpy as np
 
 from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
+from dextouch.geometry import NUM_DISTORTION
 from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
@@ -161,7 +162,7 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
     try:
         matrices = read_matrices(folder)
         K = named_matrix(matrices, f"K_{camera}", (3, 3))
-        distortion = named_matrix(matrices, f"distortion_{camera}", (1, 5))
+        distortion = named_matrix(matrices, f"distortion_{camera}", (1, NUM_DISTORTION))
         width_px, height_px = named_matrix(matrices, f"image_size_{camera}_px", (1, 2))[0]
     except NotFoundError as error:
         raise NotFoundError(

@@ -11,7 +11,7 @@ import numpy as np
 from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.geometry import transform_from_pose
+from dextouch.geometry import distortion_of, transform_from_pose
 from dextouch.hands import PALM_NODES
 from dextouch.images import decode_jpeg
 from dextouch.schemas import Matrix
@@ -177,12 +177,11 @@ def _camera_turning(
             "brisk turn"
         )
     is_kept = np.isin(np.arange(len(batch)), timing.kept)
-    distortion = cameras.get(f"distortion_{camera}", ((0.0,) * 5,))
     return turning_of_images(
         timing.t_host_ns,
         (image for image, kept in zip(images, is_kept, strict=True) if kept),
         np.array(cameras[f"K_{camera}"]),
-        np.array(distortion[0]),
+        distortion_of(cameras, camera),
     )
 
 

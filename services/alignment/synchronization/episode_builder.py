@@ -8,6 +8,7 @@ from jaxtyping import Bool
 
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import NUM_DISTORTION
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor, check_camera_matrix
 from dextouch.tactile.layout import common_layout
@@ -317,7 +318,7 @@ def _check_lenses(recording: RecordingReader) -> None:
         camera = name.removeprefix("camera_")
         if stream.kind != "image" or camera == name:
             continue
-        shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, 5)}
+        shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, NUM_DISTORTION)}
         for matrix, shape in (shapes | {f"image_size_{camera}_px": (1, 2)}).items():
             found = np.shape(calibration[matrix]) if matrix in calibration else shape
             if found != shape:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64, Int64, Shaped
 
 from dextouch.episodes import GOP_IMAGES, RecordingReader
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import pose_from_transform, transform, transform_from_pose
+from dextouch.geometry import distortion_of, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
 from dextouch.streams import (
@@ -397,9 +397,8 @@ def marker_streams(
     camera = streams[HEAD_CAMERA]
     period_ns = camera.descriptor.period_ns()
     calibration = recording.attributes.calibration
-    distortion = calibration.get("distortion_head", ((0.0,) * 5,))
     K = np.array(calibration["K_head"])
-    tracker = MarkerTracker(listed, objects.dictionary, K, np.array(distortion[0]))
+    tracker = MarkerTracker(listed, objects.dictionary, K, distortion_of(calibration, "head"))
     wanted = np.flatnonzero(
         (camera.t_ns >= inside_ns[0] - period_ns) & (camera.t_ns <= inside_ns[1] + period_ns)
     )

@@ -289,10 +289,8 @@ class BehaviourCloningPolicy:
     """Sends the next 16 actions, given the newest image, touch and pose.
 
     The only state between `reset` calls is the rollout's first image and anchor. Of an observation
-    it needs the last step only (`uses_images`).
-
-    Raises:
-        InvalidInputError: the weights do not match the shape in the metadata.
+    it needs the last step only (`uses_images`). Raises InvalidInputError if the weights do not
+    match the shape in the metadata.
     """
 
     uses_images = "last"
@@ -318,8 +316,7 @@ class BehaviourCloningPolicy:
     def reset(self, start: PolicyStart) -> None:
         """Start a new rollout.
 
-        Raises:
-            UnknownNameError: a task that the network was not trained for.
+        Raises UnknownNameError for a task that the network was not trained for.
         """
         if start.task not in self.shape.tasks:
             raise UnknownNameError("task of the cloned policy", start.task, list(self.shape.tasks))

@@ -117,10 +117,7 @@ def read_cloning_episode(
     """Read one robot episode that has what is `IMITATED`.
 
     Only images at decision steps are decoded, and the middle square of larger ones is scaled to
-    `image_px`.
-
-    Raises:
-        InvalidInputError: the outcome is unknown.
+    `image_px`. Raises InvalidInputError if the outcome is unknown.
     """
     grid, about = EpisodeGrid(reader, image_px), reader.attributes
     steps = range(0, len(grid), DECISION_STRIDE)
@@ -154,10 +151,8 @@ def read_cloning_episodes(
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
     `tasks` and `splits` of scenes are empty for all; the middle square of larger images is scaled
-    to `image_px`. With `imagined`, imagined episodes are read instead of true ones.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
+    to `image_px`. With `imagined`, imagined episodes are read instead of true ones. Raises
+    NotFoundError and ConflictError as `select_episodes`.
     """
     origins: Collection[Origin] = ("imagined",) if imagined else TRUE_ORIGINS
     readers = select_episodes(
@@ -212,15 +207,13 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     """Samples at every eighth step of successful episodes, once as measured and once as imagined.
 
     An imagined world measures no joints and returns the given actions, so each sample is also
-    trained on with the commanded pose in place of the measured one.
-
-    Raises:
-        InvalidInputError: no successful episode is long enough, or image sizes differ.
+    trained on with the commanded pose in place of the measured one. Raises InvalidInputError if no
+    successful episode is long enough, or image sizes differ.
     """
-    wanted = [item for item in episodes if item.success and item.decisions()]
-    if not wanted:
+    demonstrations = [item for item in episodes if item.success and item.decisions()]
+    if not demonstrations:
         raise InvalidInputError("behaviour cloning: no successful demonstration to imitate")
-    sizes = sorted({item.moments[0].image.shape for item in wanted})
+    sizes = sorted({item.moments[0].image.shape for item in demonstrations})
     if len(sizes) > 1:
         raise InvalidInputError(
             f"behaviour cloning: got images of {sizes[0]} and of {sizes[1]}, expected one size"
@@ -230,7 +223,7 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
     newest: list[np.ndarray] = []
     frame: list[int] = []
     begins = [0]
-    for item in wanted:
+    for item in demonstrations:
         commanded = in_world(item.commanded, item.anchor)
         for step in item.decisions():
             moment = item.moments[step]
@@ -247,9 +240,9 @@ def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Dec
         begins.append(len(inputs))
     counts = torch.tensor(begins).diff()
     return Decisions(
-        torch.from_numpy(np.stack([item.moments[0].image for item in wanted])),
+        torch.from_numpy(np.stack([item.moments[0].image for item in demonstrations])),
         torch.from_numpy(np.stack(newest)),
-        torch.arange(len(wanted)).repeat_interleave(counts),
+        torch.arange(len(demonstrations)).repeat_interleave(counts),
         torch.tensor(frame),
         torch.tensor(begins),
         *cloning_state(inputs, shape),

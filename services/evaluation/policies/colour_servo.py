@@ -59,8 +59,8 @@ def thing_pixels(image: UInt8[np.ndarray, "h w 3"], thing: Thing) -> Bool[np.nda
     """Mask of the pixels with the object's colour."""
     rgb = image.astype(np.float64)
     hue = rgb / np.maximum(rgb.sum(axis=-1, keepdims=True), 1.0)
-    wanted = np.array(thing.colour) / sum(thing.colour)
-    is_near = np.abs(hue - wanted).max(axis=-1) < _HUE_TOLERANCE
+    chromaticity = np.array(thing.colour) / sum(thing.colour)
+    is_near = np.abs(hue - chromaticity).max(axis=-1) < _HUE_TOLERANCE
     return np.asarray(is_near & (rgb.max(axis=-1) > _LEAST_BRIGHTNESS))
 
 
@@ -147,11 +147,7 @@ class ColourServo:
         self._gave_up = False
 
     def reset(self, start: PolicyStart) -> None:
-        """Start a new rollout.
-
-        Raises:
-            UnknownNameError: a task whose colours are not known.
-        """
+        """Start a new rollout; raises UnknownNameError for a task whose colours are not known."""
         if start.task not in _PLANS:
             raise UnknownNameError("task of the colour servo", start.task, list(_PLANS))
         self._start, self._place_m, self._sent, self._gave_up = start, None, None, False

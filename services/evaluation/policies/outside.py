@@ -27,9 +27,8 @@ _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<fact
 def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
     """Call a function of a policy.
 
-    Raises:
-        InvalidInputError: the function raised; `details["traceback"]` is its own traceback,
-            without frames of the caller.
+    Raises InvalidInputError if it raised; `details["traceback"]` is its own traceback, without
+    frames of the caller.
     """
     try:
         return call(*arguments, **keywords)
@@ -100,8 +99,7 @@ class PolicySource:
     def parse(cls, text: str) -> "PolicySource":
         """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`.
 
-        Raises:
-            InvalidInputError: any other text.
+        Raises InvalidInputError for any other text.
         """
         match = _SOURCE.fullmatch(text)
         if match is None:

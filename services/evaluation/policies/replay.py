@@ -58,8 +58,7 @@ class ReplayPolicy:
     def reset(self, start: PolicyStart) -> None:
         """Select the episode of this task and seed.
 
-        Raises:
-            NotFoundError: there is no such episode.
+        Raises NotFoundError if there is no such episode.
         """
         key = (start.task, start.seed)
         if key not in self._actions:
@@ -74,8 +73,8 @@ class ReplayPolicy:
         if self._playing is None:
             raise InvalidInputError("replay policy: act before reset; call reset with the start")
         step = observation.first_step + len(observation) - 1
-        wanted = np.arange(step, step + CHUNK_STEPS)
-        return self._playing[np.minimum(wanted, len(self._playing) - 1)]
+        rows = np.arange(step, step + CHUNK_STEPS)
+        return self._playing[np.minimum(rows, len(self._playing) - 1)]
 
 
 class HoldPolicy:

@@ -140,7 +140,10 @@ def _latex(pairs: Pairs, title: str) -> str:
         r"\begin{tikzpicture}",
         rf"\begin{{axis}}[title={{{latex(title)}}}, xlabel={{real success}},",
         r"  ylabel={imagined success}, xmin=-0.04, xmax=1.04, ymin=-0.04, ymax=1.04,",
-        r"  width=\linewidth, axis equal image, grid=major, legend pos=outer north east]",
+        r"  width=\linewidth, axis equal image, grid=major, xtick distance=0.25,",
+        # Below the axes: beside them, long names would be wider than the line.
+        r"  ytick distance=0.25, legend cell align=left,",
+        r"  legend style={draw=none, at={(0, -0.18)}, anchor=north west}]",
         r"\addplot[gray, forget plot] coordinates {(0, 0) (1, 1)};",
     ]
     for index, (name, found) in enumerate(pairs.items()):

@@ -33,8 +33,8 @@ from services.evaluation.studies.study_pictures import picture, picture_name
 
 SCOPE: Final = "study_read"
 PICTURE_TYPES: Final = {"svg": "image/svg+xml", "png": "image/png", "tex": "application/x-tex"}
-MAX_PAGE: Final = 500
-MAX_STUDIES: Final = 200
+MAX_PAGE: Final = 500  # chosen: a few hundred bytes each
+MAX_STUDIES: Final = 200  # chosen: more than people look through
 # While a study runs, reading it takes at most this share of the time.
 MAX_READING_SHARE: Final = 0.1
 

@@ -24,8 +24,8 @@ from services.evaluation.studies.results import (
     StudyDefinition,
     StudyHeader,
     StudyResults,
-    cells_of,
     keep_rollout,
+    planned_rollouts_of,
     study_report,
 )
 from services.evaluation.success_classifier import SuccessClassifier
@@ -88,10 +88,10 @@ def missing_rollouts(
 ) -> list[PlannedRollout]:
     """Rollouts of a study that have no result yet, or failed and are to be run again."""
     return [
-        cell
-        for cell in cells_of(definition)
-        if cell not in results.outcomes
-        or (retry_failed and isinstance(results.outcomes[cell], RolloutFailure))
+        planned
+        for planned in planned_rollouts_of(definition)
+        if planned not in results.outcomes
+        or (retry_failed and isinstance(results.outcomes[planned], RolloutFailure))
     ]
 
 
@@ -151,22 +151,27 @@ class _Workers:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
 
-    def run(self, cells: Sequence[PlannedRollout], keep: Callable[[Outcome], None]) -> None:
+    def run(
+        self, planned_rollouts: Sequence[PlannedRollout], keep: Callable[[Outcome], None]
+    ) -> None:
         """Run rollouts; `keep` is called with each outcome.
 
-        Raises:
-            UnavailableError: a world stopped answering.
+        Raises UnavailableError if a world stopped answering.
         """
         by_world: dict[str, list[PlannedRollout]] = {}
-        for cell in cells:
-            by_world.setdefault(cell.world, []).append(cell)
+        for planned in planned_rollouts:
+            by_world.setdefault(planned.world, []).append(planned)
         num_failed = 0
-        with self._connections, Progress("rollouts", len(cells)) as progress, ExitStack() as pools:
+        with (
+            self._connections,
+            Progress("rollouts", len(planned_rollouts)) as progress,
+            ExitStack() as pools,
+        ):
             pending: set[Future[Outcome | None]] = set()
-            for world, wanted in by_world.items():
+            for world, own in by_world.items():
                 pool = ThreadPoolExecutor(self._definition.in_flight, f"rollouts of {world}")
                 pools.callback(pool.shutdown, cancel_futures=True)
-                pending |= {pool.submit(self._outcome, cell) for cell in wanted}
+                pending |= {pool.submit(self._outcome, planned) for planned in own}
             try:
                 while pending:
                     done, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -180,22 +185,22 @@ class _Workers:
                 # After an error or Ctrl-C, threads end with their current rollout.
                 self._stopping.set()
 
-    def _outcome(self, cell: PlannedRollout) -> Outcome | None:
+    def _outcome(self, planned: PlannedRollout) -> Outcome | None:
         """Outcome of one rollout; None if the study is stopping."""
         if self._stopping.is_set():
             return None
         runner, policies = self._of_this_thread()
-        start = self._starts[cell.task, cell.seed]
+        start = self._starts[planned.task, planned.seed]
         outcome, played = runner.run(
-            start, policies[cell.policy], cell.policy, cell.world, cell.repeat
+            start, policies[planned.policy], planned.policy, planned.world, planned.repeat
         )
         if isinstance(outcome, RolloutFailure) and outcome.error == UnavailableError.__name__:
             # An unavailable world would fail all further rollouts too.
-            runner.worlds.addresses[cell.world].client.worlds()
+            runner.worlds.addresses[planned.world].client.worlds()
         store = self._parts.store
         if store is not None and played is not None and isinstance(start, MatchedStart):
-            world = runner.worlds.descriptions[cell.world]
-            keep_rollout(store, self._header, cell, start, played, world)
+            world = runner.worlds.descriptions[planned.world]
+            keep_rollout(store, self._header, planned, start, played, world)
         return outcome
 
     def _of_this_thread(self) -> tuple[RolloutRunner, Mapping[str, Policy]]:

@@ -37,7 +37,7 @@ from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 
 NAME_PATTERN: Final = r"^[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}$"
-MAX_ROLLOUTS: Final = 100_000
+MAX_ROLLOUTS: Final = 100_000  # chosen: some hundred bytes of results each
 # Starts are kept in memory, with one image per camera.
 MAX_STARTS: Final = 2_000
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -158,8 +158,7 @@ class StudyDefinition(FrozenModel):
 def read_definition(path: Path) -> StudyDefinition:
     """Read a study file.
 
-    Raises:
-        InvalidInputError: it cannot be read, or does not define a study; all problems are listed.
+    Raises InvalidInputError, with all problems, if it cannot be read or defines no study.
     """
     try:
         fields = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -275,7 +274,7 @@ class StudyResults:
             header = _HEADER.validate_json(first)
             for number, line in enumerate(rows, 2):  # noqa: B007 - for the message
                 outcome = _ROW.validate_json(line)
-                outcomes[cell_of(outcome)] = outcome
+                outcomes[planned_rollout_of(outcome)] = outcome
         except ValidationError as error:
             raise CorruptDataError(
                 f"results {path}, line {number}: not a row of a study ({line[:60]!r}); move the "
@@ -300,8 +299,7 @@ class StudyResults:
     def keep(self, outcome: Outcome) -> None:
         """Append an outcome; it is on the disk when this returns.
 
-        Raises:
-            StorageError: the file cannot be written.
+        Raises StorageError if the file cannot be written.
         """
         try:
             with self.path.open("ab") as file:
@@ -310,7 +308,7 @@ class StudyResults:
                 os.fsync(file.fileno())
         except OSError as error:
             raise StorageError(f"results {self.path}: cannot be written ({error})") from error
-        self.outcomes[cell_of(outcome)] = outcome
+        self.outcomes[planned_rollout_of(outcome)] = outcome
 
 
 @contextmanager
@@ -331,12 +329,12 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
-def cell_of(outcome: Outcome) -> PlannedRollout:
+def planned_rollout_of(outcome: Outcome) -> PlannedRollout:
     """The cell that an outcome belongs to."""
     return PlannedRollout(outcome.world, outcome.task, outcome.seed, outcome.policy, outcome.repeat)
 
 
-def cells_of(definition: StudyDefinition) -> Iterator[PlannedRollout]:
+def planned_rollouts_of(definition: StudyDefinition) -> Iterator[PlannedRollout]:
     """All rollouts of a study, in the order of its report."""
     for world in (REAL, *definition.imagined):
         repeats = 1 if world == REAL else definition.repeats
@@ -353,7 +351,7 @@ def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLo
 
     Rollouts without a result count as failed, with the error `NotRunYet`.
     """
-    ordered = [results.outcomes.get(c) or _not_run(c) for c in cells_of(definition)]
+    ordered = [results.outcomes.get(c) or _not_run(c) for c in planned_rollouts_of(definition)]
     return ClosedLoopReport(
         tuple(one for one in ordered if isinstance(one, RolloutScore)),
         tuple(definition.imagined),
@@ -362,19 +360,25 @@ def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLo
     )
 
 
-def _not_run(cell: PlannedRollout) -> RolloutFailure:
+def _not_run(planned: PlannedRollout) -> RolloutFailure:
     message = "no result yet; `dextouch study run` continues the study"
     return RolloutFailure(
-        cell.world, cell.policy, cell.task, cell.seed, "NotRunYet", message, repeat=cell.repeat
+        planned.world,
+        planned.policy,
+        planned.task,
+        planned.seed,
+        "NotRunYet",
+        message,
+        repeat=planned.repeat,
     )
 
 
-def rollout_episode_id(header: StudyHeader, cell: PlannedRollout) -> str:
+def rollout_episode_id(header: StudyHeader, planned: PlannedRollout) -> str:
     """Id of the episode of one rollout, derived from the study's digests and the cell."""
-    digest = hashlib.sha256(repr((sorted(header.digests.items()), tuple(cell))).encode())
-    label = f"{cell.world}-{cell.policy}-{cell.task}-{cell.seed}"
-    if cell.repeat:
-        label += f"-{cell.repeat}"
+    digest = hashlib.sha256(repr((sorted(header.digests.items()), tuple(planned))).encode())
+    label = f"{planned.world}-{planned.policy}-{planned.task}-{planned.seed}"
+    if planned.repeat:
+        label += f"-{planned.repeat}"
     label = re.sub(r"[^a-z0-9_-]+", "_", label.lower())[:_MAX_LABEL]
     return f"rollout-{digest.hexdigest()[:10]}-{label}"
 
@@ -386,7 +390,7 @@ def _line(row: Mapping[str, object]) -> bytes:
 def keep_rollout(
     store: EpisodeStore,
     header: StudyHeader,
-    cell: PlannedRollout,
+    planned: PlannedRollout,
     start: MatchedStart,
     played: PlayedRollout,
     world: WorldDescription,
@@ -395,17 +399,17 @@ def keep_rollout(
 
     `success` is the one reported by the world itself, never the probe's estimate.
     """
-    episode_id = rollout_episode_id(header, cell)
+    episode_id = rollout_episode_id(header, planned)
     if store.exists(episode_id):
         return
     is_digest = re.fullmatch(r"[0-9a-f]{64}", world.digest) is not None
     attributes = EpisodeAttributes(
         episode_id=episode_id,
-        task=cell.task,
+        task=planned.task,
         instruction=start.instruction,
         domain="robot",
         origin=_ORIGINS.get(world.kind, "imagined"),
-        seed=cell.seed,
+        seed=planned.seed,
         model_rate_hz=world.model_rate_hz,
         anchor=StoredAnchor.from_poses(start.anchor),
         K_head=matrix_rows(start.K_head),
@@ -413,7 +417,7 @@ def keep_rollout(
         quality=played.uncertainty.to_quality(),
         trace_id=played.trace_id,
         lineage=(
-            LineageEntry(kind="rollout", id=f"{header.name}: {cell.policy} in {cell.world}"),
+            LineageEntry(kind="rollout", id=f"{header.name}: {planned.policy} in {planned.world}"),
             LineageEntry(
                 kind="checkpoint", id=world.name, sha256=world.digest if is_digest else None
             ),

@@ -37,8 +37,8 @@ from services.evaluation.studies.results import (
     PlannedRollout,
     StudyDefinition,
     StudyResults,
-    cell_of,
-    cells_of,
+    planned_rollout_of,
+    planned_rollouts_of,
     rollout_episode_id,
     study_report,
 )
@@ -184,14 +184,14 @@ def study_summary(
 def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[StudyRollout, ...]:
     """All rollouts with a result, those first that disagree with the real world most."""
     real = {
-        (cell.task, cell.seed, cell.policy): outcome.success
-        for cell, outcome in results.outcomes.items()
-        if cell.world == REAL and isinstance(outcome, RolloutScore)
+        (planned.task, planned.seed, planned.policy): outcome.success
+        for planned, outcome in results.outcomes.items()
+        if planned.world == REAL and isinstance(outcome, RolloutScore)
     }
     found = [
-        _rollout(cell, outcome, real, results, is_kept=definition.keep_rollouts)
-        for cell in cells_of(definition)
-        if (outcome := results.outcomes.get(cell)) is not None
+        _rollout(planned, outcome, real, results, is_kept=definition.keep_rollouts)
+        for planned in planned_rollouts_of(definition)
+        if (outcome := results.outcomes.get(planned)) is not None
     ]
     # Stable, so that the order of the report stays among equals.
     return tuple(sorted(found, key=_unlike))
@@ -204,7 +204,7 @@ def _unlike(rollout: StudyRollout) -> tuple[bool, bool, float]:
 
 
 def _rollout(
-    cell: PlannedRollout,
+    planned: PlannedRollout,
     outcome: RolloutScore | RolloutFailure,
     real: dict[tuple[str, int, str], bool],
     results: StudyResults,
@@ -212,19 +212,19 @@ def _rollout(
     is_kept: bool,
 ) -> StudyRollout:
     if isinstance(outcome, RolloutFailure):
-        return StudyRollout(**cell._asdict(), error=f"{outcome.error}: {outcome.message}")
-    real_cell = cell._replace(world=REAL, repeat=0)
-    in_reality = real.get((cell.task, cell.seed, cell.policy))
+        return StudyRollout(**planned._asdict(), error=f"{outcome.error}: {outcome.message}")
+    real_one = planned._replace(world=REAL, repeat=0)
+    in_reality = real.get((planned.task, planned.seed, planned.policy))
     return StudyRollout(
-        **cell._asdict(),
+        **planned._asdict(),
         success=outcome.success,
         probability=outcome.probability,
         unreliable=outcome.cannot_tell,
         real_success=in_reality,
         disagrees=in_reality is not None and in_reality != outcome.success,
-        episode_id=rollout_episode_id(results.header, cell) if is_kept else None,
+        episode_id=rollout_episode_id(results.header, planned) if is_kept else None,
         real_episode_id=(
-            rollout_episode_id(results.header, real_cell)
+            rollout_episode_id(results.header, real_one)
             if is_kept and in_reality is not None
             else None
         ),
@@ -334,7 +334,7 @@ def kept_pairs(
     store = EpisodeStore(str(results.path.with_name(KEPT_FOLDER)))
     found = list[PredictionPicture]()
     for pair in example_pairs(report, world).values():
-        ids = [rollout_episode_id(results.header, cell_of(score)) for score in pair]
+        ids = [rollout_episode_id(results.header, planned_rollout_of(score)) for score in pair]
         if len(found) < MAX_MOVING and all(map(store.exists, ids)):
             try:
                 found.append(episode_pair(title_of(pair), store.open(ids[0]), store.open(ids[1])))
@@ -361,7 +361,7 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
             report.scores, (world, *others), report.policies, report.failures
         ).to_report()
         title = f"{definition.name}: {world} and the real world"
-        shown = ReportPictures(moving=kept_pairs(report, world, results))
-        write_report(page | {"title": title}, shown, folder / f"report {world}.html")
+        pictures = ReportPictures(moving=kept_pairs(report, world, results))
+        write_report(page | {"title": title}, pictures, folder / f"report {world}.html")
     (folder / TABLES_FILE).write_text(latex_tables(report), encoding="utf-8")
     return figures

@@ -19,10 +19,8 @@ from services.evaluation.studies.study_figures import (
 def picture(figures: StudyFigures, world: str, task: str, form: Format) -> bytes:
     """The picture of an imagined world, of one task or, with an empty name, of all.
 
-    Policies of which too few rollouts are decided are left out, as from the agreement.
-
-    Raises:
-        UnknownNameError: no such world or task in the study.
+    Policies of which too few rollouts are decided are left out, as from the agreement. Raises
+    UnknownNameError if the study has no such world or task.
     """
     known = figures.summary
     if world not in known.worlds:

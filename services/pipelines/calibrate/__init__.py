@@ -130,7 +130,6 @@ Delays are relative to --reference; by default to the stream whose latency is kn
 example:
   dextouch station calibrate time --take spool/shake --to calibration"""
 
-
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
     "camera": (
@@ -180,8 +179,7 @@ _COMMANDS = {
 def main(argv: Sequence[str]) -> int:
     """Run one calibration, or show the existing ones.
 
-    Returns:
-        0; for `show` 1 if something is missing or wrong (level ERROR).
+    Returns 0; for `show` 1 if something is missing or wrong (level ERROR).
     """
     options = _parser().parse_args(list(argv))
     module, _, function = _COMMANDS[options.word][2].partition(":")
@@ -208,8 +206,8 @@ def _parser() -> argparse.ArgumentParser:
     measuring = " ".join(name for name in of if name != "show")
     folder = {"type": Path, "metavar": "FOLDER"}
     add(measuring, "--to", required=True, help="calibration folder; created if new", **folder)
-    shown = "calibration folder or file, or a spooled take"
-    add("show", "folder", type=Path, metavar="PATH", help=shown)
+    source = "calibration folder or file, or a spooled take"
+    add("show", "folder", type=Path, metavar="PATH", help=source)
     add("glove wrist profile", "--side", required=True, choices=("left", "right"), help="hand")
     take = "spool folder, or id of a recording"
     add("wrist profile time latency", "--take", required=True, metavar="TAKE", help=take)

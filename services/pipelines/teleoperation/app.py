@@ -32,9 +32,10 @@ from services.pipelines.teleoperation.hand_follower import Command, HandFollower
 from services.pipelines.teleoperation.settings import TeleoperationSettings
 
 SCOPE: Final = "teleop"
-_REFUSED: Final = 1008
-MAX_REASON_LETTERS: Final = 120
+_REFUSED: Final = 1008  # policy violation (RFC 6455)
+MAX_REASON_LETTERS: Final = 120  # of 123 bytes that a close frame holds
 _FORMS: Final = ("start", "sample", "stop")
+# Buckets around the period of 1/60 s.
 LATENCY_S: Final = (0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.05, 0.1)
 
 
@@ -227,11 +228,7 @@ def _sample(value: object, keypoints_m: np.ndarray | None) -> HandSample:
 
 
 def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
-    """Routes of `/v1/teleop/{side}`.
-
-    Raises:
-        InvalidInputError: the calibration cannot be read.
-    """
+    """Routes of `/v1/teleop/{side}`; raises InvalidInputError if the calibration cannot be read."""
     router = APIRouter(prefix="/v1/teleop", tags=["teleoperation"])
     calibration = load_calibration(settings.calibration)
     # Name of the controller's key, and the hand that it controls.

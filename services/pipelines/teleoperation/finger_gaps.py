@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import ShapeError
 from dextouch.hands.robot_hand import HandModel
 
-NUM_LINKS: Final = 3
+NUM_LINKS: Final = 3  # capsules of a finger, between its four points
 # A movement is checked at these shares of it. At 9.6 rad/s and 60 Hz a fingertip moves 16 mm in a
 # period: 2 mm between two checks, an eighth of a finger's thickness.
 SHARES: Final = np.linspace(0.0, 1.0, 9)

@@ -229,11 +229,9 @@ class HandFollower:
     def check_person(self) -> None:
         """Check unit, side and axes of the first samples, and measure the person; takes 50 ms.
 
-        From then on samples are followed. It may run in another thread than the commands.
-
-        Raises:
-            InvalidInputError: they are not this hand in metres and in the wrist's axes, or do not
-                show every finger; the next samples are checked instead.
+        From then on samples are followed. It may run in another thread than the commands. Raises
+        InvalidInputError if they are not this hand in metres and in the wrist's axes, or do not
+        show every finger; the next samples are checked instead.
         """
         keypoints_m, self._checked = np.stack(self._checked), []
         keypoints_m = hand_axes_check(keypoints_m, self._side, self._calibration)
@@ -253,15 +251,15 @@ class HandFollower:
         received_s = self._follow_newest()
         age_s = t_s - self._fresh_s
         status = self._status(age_s)
-        wanted_rad = self._target_rad
+        goal_rad = self._target_rad
         speed_rad_s = self.limits.speed_rad_s
         if status is FollowerStatus.RELAXING:
-            wanted_rad, speed_rad_s = self._relaxed_rad, self.limits.relax_speed_rad_s
+            goal_rad, speed_rad_s = self._relaxed_rad, self.limits.relax_speed_rad_s
         elif status is not FollowerStatus.FOLLOWING:
-            wanted_rad = self._joints_rad
+            goal_rad = self._joints_rad
         reach_rad = speed_rad_s * elapsed_s
-        wanted_rad = np.clip(wanted_rad, self._lower_rad, self._upper_rad)
-        step_rad = np.clip(wanted_rad - self._joints_rad, -reach_rad, reach_rad)
+        goal_rad = np.clip(goal_rad, self._lower_rad, self._upper_rad)
+        step_rad = np.clip(goal_rad - self._joints_rad, -reach_rad, reach_rad)
         self._joints_rad, is_stopped = self._gaps.limited(
             self._joints_rad, step_rad, self.limits.clearance_m
         )

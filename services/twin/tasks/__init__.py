@@ -40,11 +40,7 @@ _TASKS: Final[dict[str, Task]] = {
 
 
 def get_task(name: str) -> Task:
-    """Get a task by name.
-
-    Raises:
-        UnknownNameError: no such task.
-    """
+    """Get a task by name; raises UnknownNameError if there is none."""
     if name not in _TASKS:
         raise UnknownNameError("task", name, list(_TASKS))
     return _TASKS[name]
@@ -53,8 +49,7 @@ def get_task(name: str) -> Task:
 def named_tasks(names: Iterable[str]) -> tuple[str, ...]:
     """Names of tasks, each once, from names of tasks and of `TASK_SETS`.
 
-    Raises:
-        UnknownNameError: a name of neither.
+    Raises UnknownNameError for a name of neither.
     """
     found: dict[str, None] = {}
     for name in names:

@@ -36,9 +36,9 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.0, 0.2),
     "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.0, 0.2),
 }
-_SQUEEZE_N: Final = 8.0
-_OPEN_M: Final = 0.022
-_LIFT_M: Final = 0.120
+_SQUEEZE_N: Final = 8.0  # chosen: holds the full can of 0.5 kg
+_OPEN_M: Final = 0.022  # chosen: gap around the object before the grasp
+_LIFT_M: Final = 0.120  # chosen: above _RAISED_M
 # Commanded depth below the table, so that the compliant wrist sets the can down firmly.
 _PUSH_M: Final = 0.004
 # Success: height of the raised can and its lean; distance from the mat's centre, so that the whole

@@ -35,9 +35,9 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.020, 0.06),
     "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.020, 0.06),
 }
-_SQUEEZE_N: Final = 6.0
-_OPEN_M: Final = 0.020
-_LIFT_M: Final = 0.075
+_SQUEEZE_N: Final = 6.0  # chosen: holds the peg while it is inserted
+_OPEN_M: Final = 0.020  # chosen: gap around the object before the grasp
+_LIFT_M: Final = 0.075  # chosen: clears the block
 # Commanded depth below the table, so that the compliant wrist pushes the peg in.
 _PUSH_M: Final = 0.010
 # Position of the peg's foot in the grasp frame when held, determined by closing the hand once.

@@ -52,10 +52,10 @@ def _hook(domain: Domain) -> Float64[np.ndarray, "20"]:
     lower, upper = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     samples = np.clip(samples.reshape(-1, 20), lower, upper)
     reach = -hand.kinematics.chain_points_m(samples)[:, :, 3, 2]
-    wanted = reach[np.abs(bases - 0.35).argmin(), 3]
+    target = reach[np.abs(bases - 0.35).argmin(), 3]
     best = samples[0].reshape(5, 4).copy()
     for finger in _HOOK_FINGERS:
-        nearest = np.abs(reach[:, finger] - wanted).argmin()
+        nearest = np.abs(reach[:, finger] - target).argmin()
         best[finger] = samples[nearest].reshape(5, 4)[finger]
     return best.ravel()
 

@@ -36,8 +36,8 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.043, -0.095, 0.45, 0.40, 0.0, 0.2),
     "human": CylinderGrasp(_RADIUS_M, 0.047, -0.105, 0.45, 0.40, 0.0, 0.2),
 }
-_SQUEEZE_N: Final = 12.0
-_OPEN_M: Final = 0.020
+_SQUEEZE_N: Final = 12.0  # chosen: presses both pins in by _SQUEEZED_M
+_OPEN_M: Final = 0.020  # chosen: gap around the object before the grasp
 # Both pins are pushed in by this much at least.
 _PRESSED_M, _SQUEEZED_M = 0.002, 0.0045
 _SIDES: Final = (("near", 1.0), ("far", -1.0))

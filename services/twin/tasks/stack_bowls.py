@@ -12,7 +12,7 @@ from services.twin.names import Domain
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Noise, Poses, is_left, with_palm, yawed
 
-_NUM_WALLS: Final = 12
+_NUM_WALLS: Final = 12  # chosen: the round of a bowl in few boxes
 _WALL_HALF_M: Final = (0.017, 0.024, 0.003)
 _WALL_RADIUS_M, _WALL_HEIGHT_M = 0.046, 0.026
 _RIM_RADIUS_M, _RIM_HEIGHT_M = 0.0606, 0.047

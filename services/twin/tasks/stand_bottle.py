@@ -25,8 +25,8 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.050, _FOOT_RADIUS_M),
     "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.050, _FOOT_RADIUS_M),
 }
-_SQUEEZE_N: Final = 10.0
-_OPEN_M: Final = 0.020
+_SQUEEZE_N: Final = 10.0  # chosen: holds the bottle while it turns
+_OPEN_M: Final = 0.020  # chosen: gap around the object before the grasp
 # Commanded depth below the table, so that the compliant wrist sets the bottle down firmly.
 _PUSH_M: Final = 0.001
 # Pose of the bottle in the closed hand, where thumb and fingers rotate it: axis (towards the cap)
@@ -39,8 +39,8 @@ _HELD_MIDDLES_M: Final[dict[Domain, tuple[float, float, float]]] = {
     "robot": (0.0088, -0.0017, 0.0015),
     "human": (0.0127, -0.0010, -0.0010),
 }
-_RELEASE_S: Final = 0.4
-_LIFTED_M: Final = 0.03
+_RELEASE_S: Final = 0.4  # chosen: fingers open slowly
+_LIFTED_M: Final = 0.03  # chosen: clear of the table's contact
 # The bottle's z axis (cap) points to world -x at yaw 0.
 _LYING: Final = rotation_from_vector(np.array([0.0, -0.5 * np.pi, 0.0]))
 _ROLL_UP: Final = rotation_from_vector(np.array([0.0, 0.5 * np.pi, 0.0]))

@@ -12,7 +12,13 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
-from services.world_model.network.attention import CAMERA_DIM, HAND_DIM, ActionTokens, split_axis
+from services.world_model.network.attention import (
+    CAMERA_DIM,
+    HAND_DIM,
+    ActionTokens,
+    split_axis,
+    zero_linear,
+)
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import InstructionEncoder, SubwordEncoder
@@ -30,10 +36,14 @@ _TYPICAL_LAYOUT = torch.tensor([0.0, 0.0, 0.5] + [0.0] * 6)
 
 @dataclass(frozen=True)
 class ActionFeatures:
-    """Normalized actions as each hand sees them: own, other, camera."""
+    """Normalized actions as each hand sees them: own, other, camera.
+
+    `past` are those at the past images, as the right hand sees them, with the age.
+    """
 
     per_hand: Float32[Tensor, "batch time 2 67"]
     layout: Float32[Tensor, "batch 2 18"]
+    past: Float32[Tensor, "batch past 69"]
 
 
 class ActionNormalizer(nn.Module):
@@ -60,14 +70,21 @@ class ActionNormalizer(nn.Module):
 
     def forward(self, inputs: ModelInputs) -> ActionFeatures:
         """Normalized features, clipped to ten deviations so that no input saturates the network."""
-        own = _bounded((inputs.hands - self.mean) / self.std)
         device = inputs.camera.device
-        camera = _bounded((inputs.camera - _NO_MOTION.to(device)) / _CAMERA_SCALE.to(device))
         layout = _bounded((inputs.layout - _TYPICAL_LAYOUT.to(device)) / _LAYOUT_SCALE.to(device))
+        age = inputs.past_age[..., None]
+        of_past = self._per_hand(inputs.past_hands, inputs.past_camera)[:, :, 1]
         return ActionFeatures(
-            torch.cat([own, own.flip(2), camera], dim=-1),
+            self._per_hand(inputs.hands, inputs.camera),
             torch.cat([layout, layout.flip(1)], dim=-1),
+            torch.cat([of_past, torch.log1p(age / FRAMES_PER_LATENT), (age > 0).float()], dim=-1),
         )
+
+    def _per_hand(self, hands: Tensor, camera: Tensor) -> Float32[Tensor, "batch time 2 67"]:
+        own = _bounded((hands - self.mean) / self.std)
+        device = camera.device
+        camera = _bounded((camera - _NO_MOTION.to(device)) / _CAMERA_SCALE.to(device))
+        return torch.cat([own, own.flip(2), camera], dim=-1)
 
 
 class TimeEmbedding(nn.Module):
@@ -139,24 +156,45 @@ class VideoCondition(ExpertCondition):
         super().__init__(config, width=width, num_steps=FRAMES_PER_LATENT)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
+        self.num_clean = config.num_clean_frames
+        self.past = PastCondition(width) if config.past_images else None
 
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
         """What does not depend on the flow time."""
-        terms, tokens = [], None
+        terms, tokens, num = [], None, self.num_clean
         # Of each latent frame after the first, as the right hand sees them.
         actions = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
         if self.actions is not None:
-            terms.append(after_first(without_dropped(self.actions(actions.flatten(2)), inputs)))
+            moved = without_dropped(self.actions(actions.flatten(2)), inputs)
+            terms.append(after_first(moved, num))
         if self.action_tokens is not None:
-            tokens = after_first(without_dropped(self.action_tokens(actions), inputs))
+            tokens = after_first(without_dropped(self.action_tokens(actions), inputs), num)
         if self.geometry is not None:
             near = split_axis(inputs.geometry[:, 1:], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
-            terms.append(after_first(without_dropped(self.geometry(near), inputs)))
+            terms.append(after_first(without_dropped(self.geometry(near), inputs), num))
+        if self.past is not None:
+            terms.append(self.past(features.past, actions.shape[1]))
         return Constants((*terms, self.static(inputs)[:, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
         """Conditions at these times; t is zero where tokens are clean."""
         return constants.at(self.time(t))
+
+
+class PastCondition(nn.Module):
+    """What the latent frames of past images depend on beside time: the poses then, and the age."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = two_layers(ACTION_WIDTH + 2, width, width)
+        self.layers[-1] = zero_linear(width, width)
+
+    def forward(
+        self, past: Float32[Tensor, "batch past 69"], num_later: int
+    ) -> Float32[Tensor, "batch frames width"]:
+        """Embeddings of the past, followed by zeros for the first frame and the later ones."""
+        found: Tensor = self.layers(past).float()
+        return nn.functional.pad(found, (0, 0, 0, 1 + num_later))
 
 
 class TactileCondition(ExpertCondition):
@@ -253,9 +291,12 @@ def without_dropped(
     return condition * inputs.acting.view(-1, *[1] * (condition.ndim - 1))
 
 
-def after_first(condition: Float32[Tensor, "batch later ..."]) -> Float32[Tensor, "batch time ..."]:
-    """Prepend zeros for index 0, which has no action (c_0 = 0)."""
-    return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
+def after_first(
+    condition: Float32[Tensor, "batch later ..."], num_clean: int = 1
+) -> Float32[Tensor, "batch time ..."]:
+    """Prepend zeros for index 0, which has no action (c_0 = 0), and for past images before it."""
+    zeros = condition.new_zeros(len(condition), num_clean, *condition.shape[2:])
+    return torch.cat([zeros, condition], dim=1)
 
 
 def _bounded(features: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:

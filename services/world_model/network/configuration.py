@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Sampler = Literal["euler", "unipc"]
 Precision = Literal["float32", "bfloat16"]
 TokenizerName = Literal["principal_axes", "split_hands", "grid"]
+FurtherView = Literal["camera_wrist_left", "camera_wrist_right"]
+PastChoice = Literal["nearest", "recent"]
 FRAMES_PER_LATENT = 4
 RASTER_CELLS_PER_TOKEN = 4
 # Fixed by the published autoencoder: it maps 1 + 4k images to 1 + k latents at a sixteenth of the
@@ -191,6 +193,29 @@ class NetworkConfig(FrozenModel):
     tactile_target: Literal["residual", "plain"] = Field(
         default="residual", description="tactile latents: residuals from the first, or themselves"
     )
+    further_views: tuple[FurtherView, ...] = Field(
+        default=(), exclude_if=not_, description="wrist cameras that are seen and predicted, too"
+    )
+    past_images: int = Field(
+        default=0,
+        ge=0,
+        le=16,
+        exclude_if=not_,
+        description="images before the first one that a chunk is predicted from, too; 0: none",
+    )
+    past_choice: PastChoice = Field(
+        default="nearest",
+        exclude_if="nearest".__eq__,
+        description="which: taken nearest to where the actions lead, or the most recent",
+    )
+    past_stride: int = Field(
+        default=16,
+        ge=4,
+        le=256,
+        multiple_of=4,
+        exclude_if=(16).__eq__,
+        description="steps between the images that are remembered",
+    )
     training_time_shift: float = Field(
         default=5.0, ge=1.0, description="shift of flow-matching times in training"
     )
@@ -234,6 +259,8 @@ class NetworkConfig(FrozenModel):
                 f"image_px: got {self.image_px}, expected a multiple of {2 * self.patch_px} "
                 "(tokens of two patches by two)"
             )
+        if len(set(self.further_views)) != len(self.further_views):
+            raise ValueError(f"further_views: got {self.further_views}, expected each once")
         return self
 
     @model_validator(mode="after")
@@ -281,8 +308,23 @@ class NetworkConfig(FrozenModel):
 
     @property
     def tokens_per_latent(self) -> int:
-        """Visual tokens of one latent frame."""
+        """Visual tokens of one view in one latent frame."""
         return self.tokens_across**2
+
+    @property
+    def num_views(self) -> int:
+        """Cameras: that of the head, then the further ones."""
+        return 1 + len(self.further_views)
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """Visual tokens of one latent frame of all views, those of the head first."""
+        return self.num_views * self.tokens_per_latent
+
+    @property
+    def num_clean_frames(self) -> int:
+        """Latent frames without noise: the past images, then the first one."""
+        return self.past_images + 1
 
     @property
     def raster_cells(self) -> int:

@@ -47,6 +47,7 @@ from services.world_model.network.attention import (
 )
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.instruction import NO_WORD, instruction_ids
+from services.world_model.network.past import PastImages
 
 _PER_SLOT = SLOT_SIZE // len(SAMPLE_OFFSETS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
@@ -166,7 +167,8 @@ class PredictionRequest:
 
     `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; the poses in row 0
     are the anchor by definition and are ignored. `objects` are those of row 0, where they are
-    known.
+    known. `further_images` are those of the network's further views, None where one is missing;
+    `past` are the images that it remembers, which only one with `past_images` takes.
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
@@ -177,13 +179,17 @@ class PredictionRequest:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
     objects: ObjectsAtStart | None = None
+    further_images: tuple[UInt8[np.ndarray, "h w 3"] | None, ...] = ()
+    past: PastImages | None = None
 
 
 @dataclass(frozen=True)
 class ModelInputs:
     """Batched tensors of requests in physical units; normalized inside the network.
 
-    `acting` is 0 for windows without actions, otherwise 1.
+    `acting` is 0 for windows without actions, otherwise 1. `missing` says which of the further
+    views are. Past images come as pixels or as latents, and the other has none; where there are
+    fewer than the network takes, the rest have age 0, and are the first image.
     """
 
     first_image: UInt8[Tensor, "batch px px 3"]
@@ -197,6 +203,14 @@ class ModelInputs:
     acting: Float32[Tensor, " batch"]
     words: Int64[Tensor, "batch ids"]
     instructions: tuple[str, ...]
+    further_images: UInt8[Tensor, "batch further px px 3"]
+    missing: Bool[Tensor, "batch further"]
+    past_images: UInt8[Tensor, "batch seen views px px 3"]
+    past_latents: Float32[Tensor, "batch encoded tokens channels"]
+    past_hands: Float32[Tensor, "batch past 2 29"]
+    past_camera: Float32[Tensor, "batch past 2 9"]
+    past_raster: Float32[Tensor, "batch past 2 cells cells"]
+    past_age: Float32[Tensor, "batch past"]
 
     @property
     def num_steps(self) -> int:
@@ -213,12 +227,16 @@ class ModelInputs:
     def first_step_keys(self) -> list[bytes]:
         """A digest of all of each window that is known at its first step, without later actions."""
         known = (self.first_image, self.first_tactile_kpa, self.layout, self.raster[:, 0])
-        arrays = [one.cpu().numpy() for one in (*known, self.commanded, self.words)]
+        further = (self.further_images, self.missing, *self._of_past())
+        arrays = [one.cpu().numpy() for one in (*known, self.commanded, self.words, *further)]
         digests = []
         for index, text in enumerate(self.instructions):
             parts = [text.encode(), *(array[index].tobytes() for array in arrays)]
             digests.append(hashlib.sha256(b"".join(parts)).digest())
         return digests
+
+    def _of_past(self) -> tuple[Tensor, ...]:
+        return tuple(one for name, one in vars(self).items() if name.startswith("past_"))
 
     def rows(self, indices: Sequence[int]) -> "ModelInputs":
         """Some of the windows."""
@@ -293,7 +311,9 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         each = zip(requests, actions, strict=True)
         geometry = np.stack([contact_geometry(row, r.anchor, r.objects) for r, row in each])
     return ModelInputs(
-        first_image=torch.from_numpy(np.stack([_checked_image(r, config) for r in requests])),
+        first_image=torch.from_numpy(
+            np.stack([_checked_image(r.first_image, config, "first") for r in requests])
+        ),
         first_tactile_kpa=torch.from_numpy(
             np.stack([_checked_tactile(r, config.tactile_layout) for r in requests])
         ),
@@ -306,7 +326,76 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         acting=torch.ones(len(requests)),
         words=torch.stack([instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
+        **_further_views(requests, config),
+        **_past_inputs(requests, actions, anchors, K_head, config),
     )
+
+
+def _further_views(
+    requests: Sequence[PredictionRequest], config: NetworkConfig
+) -> dict[str, Tensor]:
+    """First images of the further views, black where one is missing, and which are."""
+    px, names = config.image_px, config.further_views
+    images = np.zeros((len(requests), len(names), px, px, 3), dtype=np.uint8)
+    missing = np.ones(images.shape[:2], dtype=np.bool_)
+    for row, request in enumerate(requests):
+        if len(request.further_images) not in {0, len(names)}:
+            raise ShapeError(
+                f"model input: got {len(request.further_images)} further views, expected those of "
+                f"{', '.join(names) or 'none'}"
+            )
+        for view, image in enumerate(request.further_images):
+            if image is not None:
+                images[row, view] = _checked_image(image, config, names[view])
+                missing[row, view] = False
+    return {"further_images": torch.from_numpy(images), "missing": torch.from_numpy(missing)}
+
+
+def _past_inputs(
+    requests: Sequence[PredictionRequest],
+    actions: np.ndarray,
+    anchors: np.ndarray,
+    K_head: np.ndarray,
+    config: NetworkConfig,
+) -> dict[str, Tensor]:
+    """Images of the past, their poses and ages; the first image, of age 0, where there are less."""
+    count, num = config.past_images, len(requests)
+    pasts = [request.past for request in requests]
+    rows, ages = np.repeat(actions[:, :1], count, axis=1), np.zeros((num, count))
+    shape = num, count, config.num_views, config.image_px, config.image_px, 3
+    images = np.zeros(shape, dtype=np.uint8)
+    latents = np.zeros((num, count, config.tokens_per_frame, config.video_channels), np.float32)
+    if is_encoded := any(past is not None and past.latents is not None for past in pasts):
+        images = images[:, :0]
+    else:
+        latents = latents[:, :0]
+    for row, past in enumerate(pasts):
+        if past is None or not len(past.ages):
+            continue
+        values = past.latents if is_encoded else past.images
+        whole = latents if is_encoded else images
+        expected = (len(past.ages), *whole.shape[2:])
+        if values is None or values.shape != expected or len(past.ages) > count:
+            raise ShapeError(
+                f"model input: got past images {None if values is None else values.shape}, expected"
+                f" {expected} with at most {count} of them, all of a batch as pixels or as latents"
+            )
+        first = count - len(past.ages)
+        rows[row, first:] = check_actions(past.actions, where="past actions").round(DECIMALS) + 0.0
+        ages[row, first:], whole[row, first:] = past.ages, values
+    raster = np.zeros((num, 0, 2, config.raster_cells, config.raster_cells), np.float32)
+    if count:
+        raster = pose_raster(
+            rows, anchors, K_head, image_px=config.image_px, cells=config.raster_cells
+        )
+    return {
+        "past_images": torch.from_numpy(images),
+        "past_latents": torch.from_numpy(latents),
+        "past_hands": torch.from_numpy(hand_features(rows).astype(np.float32)),
+        "past_camera": torch.from_numpy(camera_features(rows).astype(np.float32)),
+        "past_raster": torch.from_numpy(raster),
+        "past_age": torch.from_numpy(ages.astype(np.float32)),
+    }
 
 
 def _hand_layout(anchors: np.ndarray) -> Float64[np.ndarray, "batch 2 9"]:
@@ -381,11 +470,13 @@ def _checked_camera(K_head: np.ndarray) -> np.ndarray:
     return K
 
 
-def _checked_image(request: PredictionRequest, config: NetworkConfig) -> np.ndarray:
-    image = np.asarray(request.first_image)
+def _checked_image(image: np.ndarray, config: NetworkConfig, which: str) -> np.ndarray:
+    image = np.asarray(image)
     expected = (config.image_px, config.image_px, 3)
     if image.shape != expected or image.dtype != np.uint8:
-        raise ShapeError(f"first image: got {image.dtype} {image.shape}, expected uint8 {expected}")
+        raise ShapeError(
+            f"{which} image: got {image.dtype} {image.shape}, expected uint8 {expected}"
+        )
     return image
 
 

@@ -13,7 +13,13 @@ from torch import Tensor, nn
 
 from services.world_model.dynamics.trees import combined, mapped
 from services.world_model.network import flow_matching
-from services.world_model.network.attention import ExpertBlock, JointLayer, Stream, clean_mask
+from services.world_model.network.attention import (
+    ExpertBlock,
+    JointLayer,
+    Stream,
+    clean_mask,
+    split_axis,
+)
 from services.world_model.network.conditioning import (
     ActionNormalizer,
     Condition,
@@ -36,6 +42,7 @@ from services.world_model.network.low_rank import add_adapters, merge_adapters
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
+    ViewTokens,
     VisualCodec,
     WanBlock,
     WanVideoCodec,
@@ -71,12 +78,16 @@ class FirstLatents:
 class Context:
     """What the predictions of a chunk at all flow times have in common.
 
-    `video` (of the type of the video side) and `tactile` are the conditions without the time. With
-    `clean`, clean tokens are not computed again for every time.
+    `video` (of the type of the video side) and `tactile` are the conditions without the time.
+    `past` are latents of past images, before those of the window. With `clean`, clean tokens are
+    not computed again for every time.
     """
 
     first: FirstLatents
     raster: Float32[Tensor, "batch time 2 cells cells"]
+    past: Float32[Tensor, "batch past tokens channels"]
+    past_raster: Float32[Tensor, "batch past 2 cells cells"]
+    missing: Bool[Tensor, "batch further"]
     video: Any
     tactile: Constants | None
     clean: CleanTokens | None = None
@@ -110,10 +121,15 @@ class Observed:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future after the first step; images of all its steps, or of the last ones only."""
+    """Future after the first step; images of all its steps, or of the last ones only.
+
+    `further` has the images of the further views, and `first` the latents of the first images.
+    """
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
+    further: Float32[Tensor, "batch further shown px px 3"]
+    first: Float32[Tensor, "batch tokens channels"]
 
 
 class JointWorldModel(nn.Module):
@@ -152,6 +168,11 @@ class JointWorldModel(nn.Module):
         self.video: VideoExpert | WanVideoExpert = (
             VideoExpert(config) if wan is None else WanVideoExpert(config, transformer)
         )
+        self.views: ViewTokens | None = None
+        if config.further_views or config.past_images:
+            self.views = ViewTokens(config)
+            if wan is not None:
+                self.views.to(wan.dtype)
         self.tactile: TactileExpert | None = None
         if config.use_touch:
             tokens, channels = self.tokenizer.num_tokens, self.tokenizer.channels
@@ -204,22 +225,43 @@ class JointWorldModel(nn.Module):
         return self
 
     def first_latents(self, inputs: ModelInputs) -> FirstLatents:
-        """Latents of the first image and the first touch."""
-        images = to_unit(inputs.first_image)[:, None]
-        return FirstLatents(
-            self.codec.encode(images)[:, 0], self.tokenizer.encode(inputs.first_tactile_kpa)
-        )
+        """Latents of the first images of all views and the first touch."""
+        images = torch.cat([inputs.first_image[:, None], inputs.further_images], dim=1)
+        video = self._encoded(images[:, :, None])[:, 0]
+        return FirstLatents(video, self.tokenizer.encode(inputs.first_tactile_kpa))
+
+    def with_past(self, inputs: ModelInputs) -> ModelInputs:
+        """The inputs with their past images as latents."""
+        pixels = inputs.past_images
+        if not pixels.shape[1]:
+            return inputs
+        shape = self.config.tokens_per_frame, self.config.video_channels
+        latents = torch.zeros(*pixels.shape[:2], *shape, device=pixels.device)
+        known = inputs.past_age > 0
+        if known.any():
+            latents[known] = self._encoded(pixels[known][:, :, None])[:, 0]
+        return replace(inputs, past_images=pixels[:, :0], past_latents=latents)
+
+    def _encoded(
+        self, images: UInt8[Tensor, "batch views time px px 3"]
+    ) -> Float32[Tensor, "batch latents tokens channels"]:
+        """Latents of images, the tokens of each frame view by view."""
+        latents = self.codec.encode(to_unit(images.flatten(0, 1)))
+        return split_axis(latents, 0, tuple(images.shape[:2])).transpose(1, 2).flatten(2, 3)
 
     def targets(
         self,
         images: UInt8[Tensor, "batch time px px 3"],
         tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
+        further: UInt8[Tensor, "batch further time px px 3"] | None = None,
     ) -> JointLatents:
         """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
 
         Residuals from the first latents, or the latents themselves, as the configuration says.
+        `further` are the images of the further views, if there are any.
         """
-        video = from_first(self.codec.encode(to_unit(images)), self.config.video_target)
+        shown = images[:, None] if further is None else torch.cat([images[:, None], further], dim=1)
+        video = from_first(self._encoded(shown), self.config.video_target)
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
 
     def tactile_targets(
@@ -245,9 +287,15 @@ class JointWorldModel(nn.Module):
     def context(self, inputs: ModelInputs, first: FirstLatents) -> Context:
         """What does not depend on the flow time."""
         features, touch = self.normalizer(inputs), self.tactile_condition
+        past = torch.where(
+            inputs.past_age[..., None, None] > 0, inputs.past_latents, first.video[:, None]
+        )
         return Context(
             first,
             inputs.raster,
+            past,
+            inputs.past_raster,
+            inputs.missing,
             self.video_condition.constants(inputs, features),
             None if touch is None else touch.constants(inputs, features),
         )
@@ -256,7 +304,7 @@ class JointWorldModel(nn.Module):
         """Clean tokens, which no value of `noisy` changes."""
         t = torch.ones(len(noisy.video), device=noisy.video.device)
         video, tactile, _, _ = self._begin(context, noisy, t)
-        video = video.split(self.config.tokens_per_latent)[0]
+        video = video.split(self.config.num_clean_frames * self.config.tokens_per_frame)[0]
         if tactile is not None:
             tactile = tactile.split(2 * self.tokenizer.num_tokens)[0]
         return CleanTokens.through(self.joint_layers(), video, tactile)
@@ -272,7 +320,7 @@ class JointWorldModel(nn.Module):
                 video, tactile = layer(video, tactile, mask)
         else:
             video, tactile = context.clean.update(self.joint_layers(), video, tactile)
-        latents = self.video.finish(video, of_video)
+        latents = self.video.finish(video, of_video)[:, self.config.past_images :]
         if self.tactile is None or tactile is None or of_tactile is None:
             return JointLatents(latents, self.with_clean_first(noisy, context.first).tactile)
         return JointLatents(latents, self.tactile.finish(tactile, of_tactile))
@@ -290,14 +338,25 @@ class JointWorldModel(nn.Module):
         self, context: Context, noisy: JointLatents, t: Tensor
     ) -> tuple[Stream, Stream | None, Any, Condition | None]:
         """Both streams before the first layer, then their conditions."""
-        noisy = self.with_clean_first(noisy, context.first)
-        of_video: Any = self.video_condition.at(context.video, _time_of_each(t, noisy.video))
-        video = self.video.start(noisy.video, context.first.video, of_video, context.raster)
+        noisy, first = self.with_clean_first(noisy, context.first), context.first.video
+        frames = torch.cat([self._past(context), noisy.video], dim=1)
+        times = _time_of_each(t, frames, self.config.num_clean_frames)
+        of_video: Any = self.video_condition.at(context.video, times)
+        video = self.video.start(frames, first, of_video, context.raster, context.past_raster)
+        if self.views is not None:
+            video = replace(video, tokens=self.views(video.tokens, context.missing))
         if self.tactile is None or self.tactile_condition is None or context.tactile is None:
             return video, None, of_video, None
         of_tactile = self.tactile_condition.at(context.tactile, _time_of_each(t, noisy.tactile))
         tactile = self.tactile.start(noisy.tactile, context.first.tactile, of_tactile)
         return video, tactile, of_video, of_tactile
+
+    def _past(self, context: Context) -> Float32[Tensor, "batch past tokens channels"]:
+        """Latents of past images as those of the window: residuals from its first, or plain."""
+        past = context.past
+        if self.config.video_target == "residual":
+            past = past - context.first.video[:, None]
+        return past / self.video_residual_std
 
     def with_clean_first(self, noisy: JointLatents, first: FirstLatents) -> JointLatents:
         """Latents whose first ones are clean: zero for residuals, `first` for plain ones."""
@@ -312,9 +371,13 @@ class JointWorldModel(nn.Module):
         )
 
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
-        """Mask by which clean tokens (first latent frame and touch) attend to each other only."""
-        per_latent = self.config.tokens_per_latent
-        is_clean = torch.arange(num_latents(num_steps) * per_latent) < per_latent
+        """Mask by which clean tokens attend to each other only.
+
+        They are those of past images, of the first latent frame, and of the first touch.
+        """
+        per_frame, num_clean = self.config.tokens_per_frame, self.config.num_clean_frames
+        num_frames = num_clean - 1 + num_latents(num_steps)
+        is_clean = torch.arange(num_frames * per_frame) < num_clean * per_frame
         if self.config.use_touch:
             per_step = 2 * self.tokenizer.num_tokens
             of_touch = torch.arange(num_steps * per_step) < per_step
@@ -324,7 +387,7 @@ class JointWorldModel(nn.Module):
     def noise(self, num_steps: int, generator: torch.Generator) -> JointLatents:
         """Noise for one chunk of one rollout; stack several for a batch."""
         config = self.config
-        video = (num_latents(num_steps), config.tokens_per_latent, config.video_channels)
+        video = (num_latents(num_steps), config.tokens_per_frame, config.video_channels)
         tactile = (num_steps, 2, self.tokenizer.num_tokens, self.tokenizer.channels)
         return JointLatents(
             torch.randn(1, *video, generator=generator),
@@ -347,7 +410,7 @@ class JointWorldModel(nn.Module):
         all are decoded or only the last ones. `precision` is that of the experts' matrix
         products (autocast); codecs always use float32.
         """
-        inputs, sampling = inputs.to(self.device), sampling or Sampling()
+        inputs, sampling = self.with_past(inputs.to(self.device)), sampling or Sampling()
         noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
         conditions = inputs
         if sampling.guidance != 1.0:
@@ -358,7 +421,7 @@ class JointWorldModel(nn.Module):
         first = mapped(first, lambda one: one[:num_windows])
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
-        return Prediction(future.images, touch)
+        return replace(future, tactile_kpa=touch)
 
     def _observe(
         self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling, precision: Precision
@@ -462,8 +525,11 @@ class JointWorldModel(nn.Module):
             tactile = first.tactile[:, None] + tactile
         if not self.config.use_touch:
             tactile = torch.zeros_like(tactile)
-        images = self.codec.decode_future(video, all_images=all_images)
-        return Prediction(images, self.tokenizer.decode(tactile))
+        views = split_axis(video, 2, (self.config.num_views, -1)).transpose(1, 2)
+        images = self.codec.decode_future(views.flatten(0, 1), all_images=all_images)
+        shown = split_axis(images, 0, (len(video), -1))
+        touch = self.tokenizer.decode(tactile)
+        return Prediction(shown[:, 0], touch, shown[:, 1:], first.video)
 
 
 @contextmanager
@@ -488,8 +554,8 @@ def from_first(latents: Float32[Tensor, "batch time ..."], target: str) -> Tenso
     return latents - latents[:, :1] if target == "residual" else latents
 
 
-def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:
-    """Flow time of every latent or step: zero for the clean first one."""
+def _time_of_each(t: Tensor, latents: Tensor, num_clean: int = 1) -> Tensor:
+    """Flow time of every latent or step: zero for the clean ones, which come first."""
     times = t[:, None].repeat(1, latents.shape[1])
-    times[:, 0] = 0.0
+    times[:, :num_clean] = 0.0
     return times

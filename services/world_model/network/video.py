@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -29,6 +29,7 @@ from services.world_model.network.conditioning import (
     TIME_RANGE,
     ActionFeatures,
     Condition,
+    PastCondition,
     after_first,
     two_layers,
     without_dropped,
@@ -53,18 +54,19 @@ if TYPE_CHECKING:
 Latents = Float32[Tensor, "batch latents tokens channels"]
 Images = Float32[Tensor, "batch time px px 3"]
 _Raster = Float32[Tensor, "batch time 2 cells cells"]
+_PastRaster = Float32[Tensor, "batch past 2 cells cells"]
 _Shown = Float32[Tensor, "batch shown px px 3"]
 _Patches = Float32[Tensor, "batch latents rows cols values"]
 _Frames = Float[Tensor, "batch _channels _frames _rows _columns"]
 
 
 class VideoExpert(nn.Module):
-    """Visual stream: `tokens_per_latent` tokens per latent frame; the first frame is clean."""
+    """Visual stream: `tokens_per_frame` tokens per latent frame; past and first frame are clean."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         width = config.video_width
-        self.tokens_across = config.tokens_across
+        self.tokens_across, self.num_views = config.tokens_across, config.num_views
         self.use_pose_raster = config.use_pose_raster
         self.add_condition = config.add_condition_to_tokens
         self.is_anchored = config.video_target == "residual"
@@ -84,20 +86,24 @@ class VideoExpert(nn.Module):
         first: Float32[Tensor, "batch tokens channels"],
         condition: Condition,
         raster: _Raster,
+        past_raster: _PastRaster,
     ) -> Stream:
         """Tokens before the first layer.
 
-        `noisy` are residuals, the first one zero, or plain latents, the first one clean.
+        `noisy` are residuals, the first one zero, or plain latents, the first one clean; those of
+        past images come before it. Rasters are of the head's view.
         """
-        num_latents, dtype = noisy.shape[1], self.places.dtype
+        dtype, num_past = self.places.dtype, past_raster.shape[1]
         condition = condition.to(dtype)
         if self.is_anchored:
             noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
-        tokens = self.embed(noisy.to(dtype)) + self.places + self.frames[:num_latents]
+        frames = functional.pad(self.frames[: noisy.shape[1] - num_past], (0, 0, 0, 0, num_past, 0))
+        tokens = self.embed(noisy.to(dtype)) + self.places.repeat(self.num_views, 1) + frames
         if self.add_condition:
             tokens = tokens + condition.vector[:, :, None]
         if self.use_pose_raster:
-            tokens = tokens + self.embed_raster(self.raster_tokens(raster).to(dtype))
+            shown = self.embed_raster(self.raster_tokens(raster, past_raster).to(dtype))
+            tokens = tokens + functional.pad(shown, (0, 0, 0, tokens.shape[2] - shown.shape[2]))
         modulation = split_axis(self.modulate(condition.vector), -1, (NUM_MODULATIONS, -1))
         per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
         return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
@@ -110,13 +116,43 @@ class VideoExpert(nn.Module):
         shift, scale = ends.expand(-1, -1, tokens.shape[2], -1).chunk(2, dim=-1)
         return self.predict(modulated_norm(tokens, shift, scale)).float()
 
-    def raster_tokens(self, raster: _Raster) -> Float32[Tensor, "batch latents tokens values"]:
-        """The raster cut into image tokens: four steps, four by four cells and two hands each."""
-        groups = _by_latent(raster)
+    def raster_tokens(
+        self, raster: _Raster, past_raster: _PastRaster
+    ) -> Float32[Tensor, "batch latents tokens values"]:
+        """The rasters cut into image tokens: four steps, four by four cells and two hands each."""
+        still = past_raster[:, :, None].expand(-1, -1, FRAMES_PER_LATENT, -1, -1, -1)
+        groups = torch.cat([still, _by_latent(raster)], dim=1)
         cells = (self.tokens_across, RASTER_CELLS_PER_TOKEN)
         grid = split_axis(split_axis(groups, 5, cells), 4, cells)
         # [B, L, 4, 2, rows, 4, cols, 4] -> [B, L, rows, cols, 4, 2, 4, 4]
         return grid.permute(0, 1, 4, 6, 2, 3, 5, 7).flatten(4).flatten(2, 3)
+
+
+class ViewTokens(nn.Module):
+    """What tells apart the tokens of the head's view, of further ones, and of past images.
+
+    Tokens of a missing view are all equal, so that nothing comes from them.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width, num_further = config.video_width, len(config.further_views)
+        self.num_places = config.tokens_per_latent
+        self.views = nn.Parameter(0.02 * torch.randn(num_further, 1, width))
+        self.absent = nn.Parameter(torch.zeros(num_further, 1, width))
+        self.past = nn.Parameter(0.02 * torch.randn(config.past_images, 1, 1, width))
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch tokens width"],
+        missing: Bool[Tensor, "batch further"],
+    ) -> Float[Tensor, "batch tokens width"]:
+        """Tokens, frame by frame and view by view, with their embeddings."""
+        grid = split_axis(tokens, 1, (-1, 1 + len(self.views), self.num_places))
+        num_later = grid.shape[1] - len(self.past)
+        grid = grid + functional.pad(self.past, (0, 0, 0, 0, 0, 0, 0, num_later))
+        further = torch.where(missing[:, None, :, None, None], self.absent, grid[:, :, 1:])
+        return torch.cat([grid[:, :, :1], further + self.views], dim=2).flatten(1, 3)
 
 
 class VisualCodec(nn.Module):
@@ -407,6 +443,8 @@ class WanVideoCondition(nn.Module):
         self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, width, width)
         self.actions[-1] = zero_linear(width, width)
         self.commanded = nn.Parameter(torch.zeros(width))
+        self.num_clean = config.num_clean_frames
+        self.past = PastCondition(width) if config.past_images else None
         self.text_features = TextFeatures(wan)
         self.kept_texts: LastUsed[Text] | None = None
 
@@ -414,7 +452,9 @@ class WanVideoCondition(nn.Module):
         """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = self.actions(groups.to(self.commanded.dtype)).float()
-        actions = after_first(without_dropped(actions, inputs))
+        actions = after_first(without_dropped(actions, inputs), self.num_clean)
+        if self.past is not None:
+            actions = actions + self.past(features.past, groups.shape[1])
         kind = inputs.commanded[:, None, None] * self.commanded.float()
         texts = inputs.instructions
         if self.kept_texts is None:
@@ -519,6 +559,7 @@ class WanVideoExpert(nn.Module):
     def __init__(self, config: NetworkConfig, transformer: "WanTransformer3DModel") -> None:
         super().__init__()
         self._side, self._head_width = config.tokens_across, config.head_width
+        self._num_views = config.num_views
         self.patch_embedding = transformer.patch_embedding
         self.norm_out = transformer.norm_out
         self.proj_out = transformer.proj_out
@@ -530,18 +571,23 @@ class WanVideoExpert(nn.Module):
         first: Float32[Tensor, "batch tokens channels"],
         condition: WanCondition,
         _: _Raster,
+        past_raster: _PastRaster,
     ) -> Stream:
-        """Tokens before the first layer; the first latent frame is the clean `first`."""
-        latents = torch.cat([first[:, None], noisy[:, 1:]], dim=1)
+        """Tokens before the first layer; after past ones, the clean `first` latent frame."""
+        num_past = past_raster.shape[1]
+        latents = torch.cat([noisy[:, :num_past], first[:, None], noisy[:, num_past + 1 :]], dim=1)
         # The convolution has the size of its stride, so it is one product per token.
         weight = self.patch_embedding.weight
         matrix = weight.permute(0, 2, 3, 4, 1).flatten(1)
         embedded = functional.linear(latents.to(weight.dtype), matrix, self.patch_embedding.bias)
+        # Past images have times before that of the first one, and all views the same places.
         positions = video_positions(noisy.shape[1], self._side)
+        positions[:, 0] -= num_past
+        positions = split_axis(positions, 0, (noisy.shape[1], -1)).repeat(1, self._num_views, 1)
         return Stream(
             embedded.flatten(1, 2),
             condition.modulation,
-            turn=angles(positions, self._head_width).to(noisy.device),
+            turn=angles(positions.flatten(0, 1), self._head_width).to(noisy.device),
             text=condition.text,
         )
 

@@ -6,8 +6,8 @@ memory, they stay on disk, and a window is read through that reader, its span al
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Final, TypeAlias, TypeVar
 
@@ -33,6 +33,7 @@ from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
 from services.world_model.checkpoints import TrainingSet
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
+from services.world_model.network.past import PastImages, PastRule
 from services.world_model.settings import DataSettings
 
 # What an episode must have for windows to be cut from it.
@@ -48,7 +49,8 @@ _COMMANDED_SHARE, _CHAINED_SHARE = 0.5, 0.3
 class WindowPosition:
     """Position of a window: steps start … start + num_steps − 1 of an episode.
 
-    `from_command` anchors commanded actions at the first step's *commanded* pose.
+    `from_command` anchors commanded actions at the first step's *commanded* pose. `past` says which
+    images before it are remembered, and the further views at the indices `hidden` are left out.
     """
 
     episode_index: int
@@ -56,11 +58,16 @@ class WindowPosition:
     num_steps: int
     action_kind: ActionKind = "measured"
     from_command: bool = False
+    past: PastRule | None = None
+    hidden: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """One episode on the model grid, ready for cutting; actions are relative to its step 0."""
+    """One episode on the model grid, ready for cutting; actions are relative to its step 0.
+
+    `further` are the images of further views, None of those that the episode lacks.
+    """
 
     episode_id: str
     task: str
@@ -82,9 +89,15 @@ class EpisodeArrays:
         default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
     )
     tactile_layout: TactileLayout = DEXTOUCH_V1
+    further: tuple[UInt8[np.ndarray, "steps h w 3"] | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
+
+    @property
+    def missing(self) -> tuple[bool, ...]:
+        """Which further views it lacks."""
+        return tuple(images is None for images in self.further)
 
     def objects_at(self, step: int) -> ObjectsAtStart | None:
         """Objects at a step, if their poses and boxes are known."""
@@ -132,13 +145,60 @@ class EpisodeArrays:
             K_head=self.K_head,
             objects=self.objects_at(place.start),
         )
-        return Window(
-            request,
-            self.images[steps],
-            self.tactile_kpa[steps],
-            self.tactile_valid[steps],
-            self.measured_taxels,
+        views = [None if i in place.hidden else one for i, one in enumerate(self.further)]
+        actions = self.actions[place.action_kind]
+        past = _past_of(
+            place,
+            request.actions,
+            lambda kept: reanchor(actions[kept], 0, anchor_action=origin),
+            lambda chosen: [None if one is None else one[chosen] for one in (self.images, *views)],
         )
+        further = tuple(None if one is None else one[steps] for one in views)
+        return _window(
+            replace(request, past=past),
+            (self.images[steps], *further),
+            (self.tactile_kpa[steps], self.tactile_valid[steps], self.measured_taxels),
+        )
+
+
+# Images of the head, then of further views, None of those that are missing.
+Views: TypeAlias = Sequence[UInt8[np.ndarray, "n h w 3"] | None]
+
+
+def _past_of(
+    place: WindowPosition,
+    actions: Float64[np.ndarray, "time 67"],
+    actions_at: Callable[[Int64[np.ndarray, " n"]], Float64[np.ndarray, "n 67"]],
+    images_at: Callable[[Int64[np.ndarray, " n"]], Views],
+) -> PastImages | None:
+    """What a window at a place with these actions remembers.
+
+    `actions_at` gives actions of steps relative to the window's anchor, and `images_at` their
+    images.
+    """
+    kept = np.zeros(0, dtype=np.int64) if place.past is None else place.past.steps(place.start)
+    if place.past is None or not len(kept):
+        return None
+    known = actions_at(kept)
+    rows = place.past.chosen(known, actions)
+    images = np.stack(_filled(images_at(kept[rows])), axis=1)
+    return PastImages(known[rows], place.start - kept[rows], images)
+
+
+def _filled(views: Views) -> list[UInt8[np.ndarray, "n h w 3"]]:
+    """Images of all views, black where one is missing."""
+    like = next(one for one in views if one is not None)
+    return [np.zeros_like(like) if one is None else one for one in views]
+
+
+def _window(
+    request: PredictionRequest, views: Views, touch: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> "Window":
+    """The window of a request, of all its images, and of touch, its validity and its taxels."""
+    head, *further = _filled(views)
+    firsts = tuple(None if one is None else one[0] for one in views[1:])
+    stacked = np.stack(further) if further else None
+    return Window(replace(request, further_images=firsts), head, *touch, stacked)
 
 
 @dataclass(frozen=True)
@@ -150,32 +210,39 @@ class Window:
     tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
     tactile_valid: Bool[np.ndarray, "time 2"]
     measured_taxels: Bool[np.ndarray, "2 taxels"]
+    further: UInt8[np.ndarray, "views time h w 3"] | None = None
 
 
 @dataclass(frozen=True)
 class WindowBatch:
-    """Batch of windows of one length."""
+    """Batch of windows of one length; `further` are the images of further views, if any."""
 
     requests: list[PredictionRequest]
     images: UInt8[Tensor, "batch time px px 3"]
     tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     tactile_valid: Bool[Tensor, "batch time 2"]
+    further: UInt8[Tensor, "batch views time px px 3"] | None = None
 
 
 def stack_windows(windows: Sequence[Window]) -> WindowBatch:
     """Windows of one length as a batch."""
+    further = [window.further for window in windows if window.further is not None]
     return WindowBatch(
         [window.request for window in windows],
         torch.from_numpy(np.stack([window.images for window in windows])),
         torch.from_numpy(np.stack([window.tactile_kpa for window in windows])),
         torch.from_numpy(np.stack([window.tactile_valid for window in windows])),
+        torch.from_numpy(np.stack(further)) if further else None,
     )
 
 
-def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> EpisodeArrays:
+def read_episode(
+    reader: EpisodeReader, *, image_px: int | None = None, further_views: Sequence[str] = ()
+) -> EpisodeArrays:
     """Read a whole episode.
 
-    The middle square of images that are larger than `image_px` is scaled to it.
+    The middle square of images that are larger than `image_px` is scaled to it. Of the further
+    views, those are missing that have no image of nearly every step.
 
     Raises:
         InvalidInputError: the image of a step is missing.
@@ -194,6 +261,10 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         instruction=about.instruction,
         scene=grid.scene,
         images=grid.images(range(len(grid))),
+        further=tuple(
+            grid.images(range(len(grid)), view) if has_view(reader, view) else None
+            for view in further_views
+        ),
         tactile_kpa=tactile_kpa,
         tactile_valid=tactile_valid,
         actions=actions,
@@ -210,6 +281,11 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
     )
 
 
+def has_view(reader: EpisodeReader, camera: str) -> bool:
+    """Whether an episode has images of a further view at nearly every step."""
+    return camera in reader.streams and reader.has_every_image(camera)
+
+
 @lru_cache(maxsize=MAX_OPEN_READERS)
 def _reader(url: str, episode_id: str) -> EpisodeReader:
     return EpisodeStore(url).open(episode_id)
@@ -218,7 +294,7 @@ def _reader(url: str, episode_id: str) -> EpisodeReader:
 # What a stored episode has of its arrays.
 _SHARED: Final = (
     "episode_id", "task", "scene", "action_kinds", "content_sha256", "domain", "model_rate_hz",
-    "interpolated", "tactile_layout",
+    "interpolated", "tactile_layout", "missing",
 )  # fmt: skip
 
 
@@ -239,6 +315,8 @@ class StoredEpisode:
     image_px: int | None = None
     interpolated: Bool[np.ndarray, " steps"] | None = None
     tactile_layout: TactileLayout = DEXTOUCH_V1
+    missing: tuple[bool, ...] = ()
+    further_views: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return self.num_steps
@@ -249,7 +327,11 @@ class StoredEpisode:
 
     def load(self) -> EpisodeArrays:
         """Load the whole episode."""
-        return read_episode(_reader(self.url, self.episode_id), image_px=self.image_px)
+        return read_episode(
+            _reader(self.url, self.episode_id),
+            image_px=self.image_px,
+            further_views=self.further_views,
+        )
 
     def cut(self, place: WindowPosition) -> Window:
         """Read the window at a place in this episode.
@@ -268,12 +350,25 @@ class StoredEpisode:
         if place.from_command and place.action_kind == "commanded":
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
-        images = grid.images(range(place.start, place.start + place.num_steps))
+        steps = np.arange(place.start, place.start + place.num_steps)
+        cameras = [
+            None if absent or index in place.hidden else name
+            for index, (name, absent) in enumerate(
+                zip(self.further_views, self.missing, strict=True)
+            )
+        ]
+
+        def images_at(chosen: Int64[np.ndarray, " n"]) -> Views:
+            further = [None if name is None else grid.images(chosen, name) for name in cameras]
+            return [grid.images(chosen), *further]
+
+        images = images_at(steps)
         objects = None
         if known := grid.boxed_objects(read.t_ref_ns[:1]):
             objects = ObjectsAtStart(known[0][0].astype(np.float64), known[1])
+        head = _filled(images)[0]
         request = PredictionRequest(
-            first_image=images[0],
+            first_image=head[0],
             first_tactile_kpa=read.tactile_kpa[0],
             actions=actions,
             action_kind=place.action_kind,
@@ -282,7 +377,23 @@ class StoredEpisode:
             K_head=grid.K_head,
             objects=objects,
         )
-        return Window(request, images, read.tactile_kpa, read.tactile_valid, read.taxels_measured)
+        past = _past_of(place, actions, lambda kept: self._actions_at(place, kept), images_at)
+        return _window(
+            replace(request, past=past),
+            images,
+            (read.tactile_kpa, read.tactile_valid, read.taxels_measured),
+        )
+
+    def _actions_at(
+        self, place: WindowPosition, steps: Int64[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "n 67"]:
+        """Actions of earlier steps, relative to the anchor of the window at a place."""
+        reader, kind, last = _reader(self.url, self.episode_id), place.action_kind, place.start + 1
+        origin_kind = kind if place.from_command else "measured"
+        # All of them relative to the poses of step 0.
+        of_kind = reader.actions(0, last, kind=kind)
+        origin = reader.actions(0, last, kind=origin_kind)[place.start]
+        return reanchor(of_kind[steps], 0, anchor_action=origin)
 
 
 # An episode that windows are cut from.
@@ -305,7 +416,8 @@ class WindowSampler:
     Windows have no interpolated step. Episodes have one of `max_steps` at least. Of windows from
     episodes with commanded actions, half have them, and 30 % of these are anchored like a later
     chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
-    None: every episode is equally likely.
+    None: every episode is equally likely. `past` says which images are remembered, and `dropout`
+    has the shares of windows that remember none, and of those without each further view.
     """
 
     def __init__(
@@ -315,6 +427,8 @@ class WindowSampler:
         *,
         max_steps: int,
         human_share: float | None = None,
+        past: PastRule | None = None,
+        dropout: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         short = [e.episode_id for e in episodes if not len(window_starts(e, max_steps))]
         if not episodes or short:
@@ -330,6 +444,7 @@ class WindowSampler:
             of[episode.domain].append(index)
         self._human, self._robot = of["human"], of["robot"]
         self._human_share = human_share if self._human and self._robot else None
+        self._past, (self._past_dropout, self._view_dropout) = past, dropout
 
     def draw(self, batch: int, num_steps: int) -> WindowBatch:
         """A batch of random windows."""
@@ -357,9 +472,17 @@ class WindowSampler:
         start = int(starts[self._rng.integers(len(starts))])
         is_commanded = self._rng.random() < _COMMANDED_SHARE
         is_chained = bool(self._rng.random() < _CHAINED_SHARE)
+        past, hidden = self._past, frozenset[int]()
+        if past is not None and self._rng.random() < self._past_dropout:
+            past = replace(past, kept=0)
+        if num_views := len(episode.missing):
+            rows = np.flatnonzero(self._rng.random(num_views) < self._view_dropout)
+            hidden = frozenset(rows.tolist())
         if not is_commanded or "commanded" not in episode.action_kinds:
-            return WindowPosition(index, start, num_steps)
-        return WindowPosition(index, start, num_steps, "commanded", from_command=is_chained)
+            return WindowPosition(index, start, num_steps, past=past, hidden=hidden)
+        return WindowPosition(
+            index, start, num_steps, "commanded", from_command=is_chained, past=past, hidden=hidden
+        )
 
 
 def load_episodes(
@@ -368,16 +491,17 @@ def load_episodes(
     splits: Collection[Split] = (),
     domain: Domain | None = None,
     image_px: int | None = None,
+    further_views: Sequence[str] = (),
 ) -> list[EpisodeArrays]:
     """Episodes of a store, read once into memory: those of the given splits and domain.
 
-    The middle square of images that are larger than `image_px` is scaled to it.
+    Images are as `read_episode` says.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.
     """
     readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
-    return [read_episode(reader, image_px=image_px) for reader in readers]
+    return [read_episode(one, image_px=image_px, further_views=further_views) for one in readers]
 
 
 def index_episodes(
@@ -386,6 +510,7 @@ def index_episodes(
     splits: Collection[Split] = (),
     domain: Domain | None = None,
     image_px: int | None = None,
+    further_views: Sequence[str] = (),
 ) -> list[StoredEpisode]:
     """`load_episodes`, for episodes that stay on disk; each is read once to be hashed."""
     # The episode of an id may have changed since it was last read.
@@ -393,7 +518,9 @@ def index_episodes(
     store, indexed = EpisodeStore(url), list[StoredEpisode]()
     for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
         # The cached reader, so that processes forked later inherit it open.
-        arrays = read_episode(_reader(url, found.item_id), image_px=image_px)
+        arrays = read_episode(
+            _reader(url, found.item_id), image_px=image_px, further_views=further_views
+        )
         shared: dict[str, Any] = {name: getattr(arrays, name) for name in _SHARED}
         indexed.append(
             StoredEpisode(
@@ -401,6 +528,7 @@ def index_episodes(
                 num_steps=len(arrays),
                 print_sha256=arrays.fingerprint(),
                 image_px=image_px,
+                further_views=tuple(further_views),
                 **shared,
             )
         )

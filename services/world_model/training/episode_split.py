@@ -19,13 +19,15 @@ def load_split(
     Robot episodes are split before a subset of them is taken, so that every subset has the same
     held-out episodes. These are never human if human stores are given.
     """
-    px = settings.network.image_px
+    px, views = settings.network.image_px, settings.network.further_views
     how = dataset.index_episodes if settings.streaming else dataset.load_episodes
-    read = partial(how, splits=settings.splits, image_px=px)
+    read = partial(how, splits=settings.splits, image_px=px, further_views=views)
     domain: Domain | None = "robot" if settings.human else None
     trained: Sequence[dataset.TrainingEpisode] = read(settings.episodes, domain=domain)
     if settings.heldout is not None:
-        heldout = dataset.load_episodes(settings.heldout, domain=domain, image_px=px)
+        heldout = dataset.load_episodes(
+            settings.heldout, domain=domain, image_px=px, further_views=views
+        )
     else:
         trained, stored = _split(trained, settings)
         heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
@@ -37,7 +39,23 @@ def load_split(
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     ids = [episode.episode_id for episode in together]
     dataset.check_stores([settings.episodes, *settings.human], ids, rates_hz)
+    _check_views([*together, *heldout], settings)
     return together, heldout
+
+
+def _check_views(episodes: Sequence[dataset.TrainingEpisode], settings: TrainSettings) -> None:
+    """Raise unless every further view is in an episode, or in all if none may be left out."""
+    share = settings.windows.view_dropout
+    for index, view in enumerate(settings.network.further_views):
+        without = [episode.episode_id for episode in episodes if episode.missing[index]]
+        if len(without) == len(episodes) or (without and not share):
+            raise InvalidInputError(
+                f"training: {len(without)} of {len(episodes)} episodes have no images of {view} at "
+                f"nearly every step {without[:3]}, expected it in "
+                f"{'some' if share else 'all'}; record that camera (in the twin by `dextouch train "
+                "data --wrist-cameras`), leave it out of --network.further-views, or, where some "
+                "have it, train with --windows.view-dropout above 0"
+            )
 
 
 def _split(

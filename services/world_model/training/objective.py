@@ -13,6 +13,7 @@ from typing import Literal, TypeVar
 import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
+from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
@@ -139,15 +140,16 @@ def examples_of(
     The batches of all `processes` together are the whole one. Images are encoded in `num_parts`.
     """
     device = model.device
-    inputs = build_inputs(batch.requests, model.config).to(device)
+    inputs = model.with_past(build_inputs(batch.requests, model.config).to(device))
     if options.text_dropout or options.action_dropout:
         drawn = processes.rand([len(inputs)], generator).to(device)
         inputs = inputs.without(drawn < options.text_dropout, drawn < options.action_dropout)
     tactile_kpa = batch.tactile_kpa.to(device)
+    further = [None] * num_parts if batch.further is None else batch.further.chunk(num_parts)
     encoded = [
-        model.targets(images.to(device), felt)
-        for images, felt in zip(
-            batch.images.chunk(num_parts), tactile_kpa.chunk(num_parts), strict=True
+        model.targets(images.to(device), felt, None if views is None else views.to(device))
+        for images, felt, views in zip(
+            batch.images.chunk(num_parts), tactile_kpa.chunk(num_parts), further, strict=True
         )
     ]
     clean = combined(encoded, torch.cat)
@@ -185,7 +187,13 @@ def errors(model: JointWorldModel, examples: Examples, precision: Precision) -> 
     with products_in(precision, examples.t.device.type):
         guess = model(examples.inputs, examples.first, examples.noisy, examples.t)
     target = examples.target
-    video = (guess.video - target.video)[:, 1:].square().mean() * examples.share
+    video_error = (guess.video - target.video)[:, 1:].square()
+    if examples.inputs.missing.any():
+        # Tokens of missing views are right, whatever they are.
+        shown = functional.pad(~examples.inputs.missing, (1, 0), value=True)
+        counted = shown.repeat_interleave(model.config.tokens_per_latent, dim=1)
+        video_error = video_error * counted[:, None, :, None]
+    video = video_error.mean() * examples.share
     if not model.config.use_touch:
         return Losses(video, torch.zeros((), device=video.device))
     error = (guess.tactile - target.tactile)[:, 1:].square() * examples.counted
@@ -242,6 +250,11 @@ def own_context(
         raise InvalidInputError(
             "distillation: got a model with contact geometry, expected one without: it would need "
             "the objects as they lie where its own first chunk ends"
+        )
+    if model.config.further_views or model.config.past_images:
+        raise InvalidInputError(
+            "distillation: got a model with further views or past images, expected one without: "
+            "the views and the past of its own chunks are not there in training"
         )
     middle = len(batch.requests[0].actions) // 2
     firsts = [replace(request, actions=request.actions[: middle + 1]) for request in batch.requests]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from pydantic import JsonValue
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from services.world_model import checkpoints
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel, from_first
+from services.world_model.network.past import PastRule
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.network.video import to_unit
 from services.world_model.paper_settings import TrainSettings, command_line
@@ -106,6 +108,8 @@ class TrainingRun:
             self._rng,
             max_steps=self._window_steps(settings.network.max_steps),
             human_share=settings.share_of_human,
+            past=PastRule.of(settings.network),
+            dropout=(settings.windows.past_dropout, settings.windows.view_dropout),
         )
         options = settings.optimizer.options()
         self.loop = optimizer.OptimizerLoop(self.model, options, self.budget)
@@ -134,7 +138,7 @@ class TrainingRun:
         for part in fitted:
             part.cpu()
         batch = self._sampler.draw(self.settings.windows.fit_windows, config.max_steps)
-        model.codec.fit(batch.images)
+        model.codec.fit(_all_views(batch))
         if tokenizer is None:
             model.tokenizer.fit(batch.tactile_kpa.flatten(0, 1))
         else:
@@ -143,7 +147,7 @@ class TrainingRun:
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
         # The pretrained expert takes its latents as they are.
         if config.wan is None:
-            videos = from_first(model.codec.encode(to_unit(batch.images)), config.video_target)
+            videos = from_first(model.codec.encode(to_unit(_all_views(batch))), config.video_target)
             model.video_residual_std.copy_(videos[:, 1:].std().clamp_min(1e-3))
         if config.use_touch:
             touch = from_first(model.tokenizer.encode(batch.tactile_kpa), config.tactile_target)
@@ -169,7 +173,11 @@ class TrainingRun:
             "wan": {"precision", "lora_rank", "lora_scale"},
         }
         requested, there = own.model_dump(exclude=free), stored.model_dump(exclude=free)
-        others = {n: (there[n], value) for n, value in requested.items() if there[n] != value}
+        others = {
+            name: (there.get(name), requested.get(name))
+            for name in {**requested, **there}
+            if there.get(name) != requested.get(name)
+        }
         if others:
             raise ConflictError(
                 "training: the initial checkpoint has other network settings (stored, "
@@ -332,6 +340,14 @@ class TrainingRun:
         return int(self._rng.choice(np.arange(5, longest + 1, 4)))
 
 
+def _all_views(batch: dataset.WindowBatch) -> UInt8[Tensor, "n time px px 3"]:
+    """Images of the head, then of the further views that are not missing."""
+    if batch.further is None:
+        return batch.images
+    missing = [[one is None for one in request.further_images] for request in batch.requests]
+    return torch.cat([batch.images, batch.further[~torch.tensor(missing)]])
+
+
 @dataclass(frozen=True)
 class TrainingReport:
     """Result of a run, with its accuracy on held-out episodes."""
@@ -465,6 +481,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
+        view_dropout=windows.view_dropout if network.further_views else 0.0,
     )
 
 

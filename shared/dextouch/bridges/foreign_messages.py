@@ -25,6 +25,7 @@ from dextouch.bridges.foreign_images import (
     raw_form,
 )
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
+from dextouch.geometry import DISTORTION_MODEL, NUM_DISTORTION
 from dextouch.streams import JPEG_UNIT, NO_DEVICE_TIME, StreamKind
 
 MAX_POINTS: Final = 1 << 18
@@ -158,8 +159,8 @@ def camera_model(message: Plain) -> CameraModel:
     none.
     """
     lens = _text(message.get("distortion_model"))
-    if lens not in {"", "plumb_bob"}:
-        raise InvalidInputError(f"distortion model {lens!r}; expected 'plumb_bob'")
+    if lens not in {"", DISTORTION_MODEL}:
+        raise InvalidInputError(f"distortion model {lens!r}; expected {DISTORTION_MODEL!r}")
     try:
         K = _numbers(message.get("K", message.get("k"))).astype(np.float64).ravel()
         D = _numbers(message.get("D", message.get("d", []))).astype(np.float64).ravel()
@@ -167,12 +168,16 @@ def camera_model(message: Plain) -> CameraModel:
         size_px = int(message["height"]), int(message["width"])
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptDataError(f"not a valid calibration ({error})") from error
-    if K.shape != (9,) or D.size > 5 or not (np.isfinite(K).all() and K[0] > 0 and K[4] > 0):
+    if (
+        K.shape != (9,)
+        or D.size > NUM_DISTORTION
+        or not (np.isfinite(K).all() and K[0] > 0 and K[4] > 0)
+    ):
         raise CorruptDataError(f"calibration with K of {K.size} and D of {D.size} numbers: {K}")
     rectified = None
     if P.shape == (12,) and np.isfinite(P).all() and P[0] > 0 and P[5] > 0:
         rectified = _from_corner(P.reshape(3, 4)[:, :3])
-    distortion = tuple([*D.tolist(), *[0.0] * 5][:5])
+    distortion = tuple(np.pad(D, (0, NUM_DISTORTION - D.size)).tolist())
     frame = _frame(message) or ""
     return CameraModel(frame, size_px, _from_corner(K.reshape(3, 3)), distortion, rectified)
 

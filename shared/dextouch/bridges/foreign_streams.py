@@ -39,6 +39,7 @@ from dextouch.errors import (
     LimitExceededError,
     UnknownNameError,
 )
+from dextouch.geometry import NUM_DISTORTION
 from dextouch.schemas import first_problems
 from dextouch.streams import (
     H264_UNIT,
@@ -509,7 +510,7 @@ def _calibration(
                     reason = f"no P, and the images of {stream.source!r} are rectified"
                     refused.append(Refused(source, reason, "calibration", count))
                     continue
-                K, distortion = model.K_rectified, (0.0,) * 5
+                K, distortion = model.K_rectified, (0.0,) * NUM_DISTORTION
             made[f"K_{camera}"] = np.array(K).reshape(3, 3)
             made[f"distortion_{camera}"] = np.array(distortion)[None]
             made[f"image_size_{camera}_px"] = np.array([model.size_px[::-1]], dtype=np.float64)

@@ -57,6 +57,7 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
+from dextouch.geometry import distortion_of
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, first_problems, json_ready
 from dextouch.streams import ENCODED_UNITS, StreamDescriptor, encoded_values
@@ -232,10 +233,9 @@ class _Export:
                 continue
             log_time = int(self._reader.stamps_ns(stream.name)[0]) + self._offset_ns
             height_px, width_px = stream.shape[:2]
-            distortion = known.get(f"distortion_{camera}", np.zeros((1, 5)))
             data = calibration_message(
                 np.array(K),
-                np.array(distortion, dtype=np.float64).ravel(),
+                distortion_of(known, camera),
                 t_ns=log_time,
                 frame=stream.frame or stream.name,
                 shape_px=(height_px, width_px),

@@ -35,6 +35,7 @@ from jaxtyping import Shaped
 
 from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
 from dextouch.errors import CorruptDataError
+from dextouch.geometry import DISTORTION_MODEL
 from dextouch.hands import actions as act
 from dextouch.hands.robot_hand import SIDES, RobotHand
 from dextouch.streams import StreamDescriptor
@@ -287,7 +288,7 @@ def calibration_message(
     K[:2, 2] -= 0.5
     message = _new_message(CALIBRATION)
     _set_time(message.timestamp, t_ns)
-    message.frame_id, message.distortion_model = frame, "plumb_bob"
+    message.frame_id, message.distortion_model = frame, DISTORTION_MODEL
     message.height, message.width = shape_px
     message.D.extend(np.asarray(distortion, dtype=np.float64).tolist())
     message.K.extend(K.ravel().tolist())

@@ -39,8 +39,8 @@ M = TypeVar("M", bound=BaseModel)
 Scalar = str | int | float | bool | datetime
 Query = Mapping[str, Scalar | Sequence[str] | None]
 WINDOW_TYPE = "application/vnd.dextouch.window+msgpack"
-MAX_ANSWER_BYTES = 128 * 2**20
-DEFAULT_TIMEOUT_S = 30.0
+MAX_ANSWER_BYTES = 128 * 2**20  # 17 steps of three cameras of 640 x 480 px have 47 MB
+DEFAULT_TIMEOUT_S = 30.0  # chosen: for a busy store
 
 
 class EpisodeStoreClient:
@@ -149,12 +149,12 @@ class EpisodeStoreClient:
         path, body = "/v1/deletions/confirm", removed.model_dump_json()
         self._model(DeletionsRevision, "POST", path, content=body)
 
-    def recordings(self, **wanted: Scalar | Sequence[str] | None) -> RecordingList:
+    def recordings(self, **filters: Scalar | Sequence[str] | None) -> RecordingList:
         """Finished recordings that match every given filter, as in docs/wire_format.md.
 
         Such as `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
         """
-        return self._model(RecordingList, "GET", "/v1/recordings", query=wanted)
+        return self._model(RecordingList, "GET", "/v1/recordings", query=filters)
 
     def recording_attributes(self, recording_id: str) -> RecordingAttributes:
         """Attributes of a finished recording."""
@@ -176,13 +176,13 @@ class EpisodeStoreClient:
             arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], arrays["values"]
         )
 
-    def episodes(self, **wanted: Scalar | Sequence[str] | None) -> EpisodeList:
+    def episodes(self, **filters: Scalar | Sequence[str] | None) -> EpisodeList:
         """One page of the episodes that match every given filter, named as in `recordings`."""
-        return self._model(EpisodeList, "GET", "/v1/episodes", query=wanted)
+        return self._model(EpisodeList, "GET", "/v1/episodes", query=filters)
 
-    def hours(self, **wanted: Scalar | Sequence[str] | None) -> CatalogHours:
+    def hours(self, **filters: Scalar | Sequence[str] | None) -> CatalogHours:
         """Hours of the episodes that match, by task, domain and origin."""
-        return self._model(CatalogHours, "GET", "/v1/catalog/hours", query=wanted)
+        return self._model(CatalogHours, "GET", "/v1/catalog/hours", query=filters)
 
     def uploads(self, *, idle_s: float = 0.0) -> UploadList:
         """Unfinished uploads that have been idle for at least `idle_s`."""

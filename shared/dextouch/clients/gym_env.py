@@ -150,8 +150,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         images = np.concatenate([seen.images[name] for name in self.description.cameras], axis=2)
         if self.render_mode == "rgb_array":
             return images[-1]
-        is_shown, self._rendered = seen is self._rendered, seen
-        return [] if is_shown else list(images)
+        is_rendered, self._rendered = seen is self._rendered, seen
+        return [] if is_rendered else list(images)
 
     def close(self) -> None:
         """End the running rollout; the client stays open."""

@@ -21,7 +21,7 @@ from dextouch.streams import pack_openpi, unpack_openpi
 
 logger = structlog.get_logger(__name__)
 
-MAX_ANSWER_BYTES: Final = 2**26
+MAX_ANSWER_BYTES: Final = 2**26  # chosen: chunks of actions have kilobytes
 DEFAULT_IMAGES: Final = {"observation/image": "camera_head"}
 
 

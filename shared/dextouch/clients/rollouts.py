@@ -40,7 +40,7 @@ from dextouch.schemas import (
 
 MSGPACK = "application/msgpack"
 ACTIONS_TYPE = "application/octet-stream; dtype=float64"
-MAX_ANSWER_BYTES = 2**28
+MAX_ANSWER_BYTES = 2**28  # 64 steps of three cameras of 640 x 480 px have 177 MB
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # An observation of one step made elsewhere, the poses at that step and the head camera's matrix.
@@ -103,8 +103,10 @@ class RolloutClient:
             LimitExceededError: the service has as many rollouts as it allows.
             UnavailableError: the service does not respond.
         """
-        asked = {"world": world, "task": task, "seed": seed, "instruction": instruction}
-        request = validate_fields(StartRequest, asked | {"action_kind": action_kind}, where="start")
+        fields = {"world": world, "task": task, "seed": seed, "instruction": instruction}
+        request = validate_fields(
+            StartRequest, fields | {"action_kind": action_kind}, where="start"
+        )
         observation, anchor, K_head = (None, None, None) if init is None else init
         start = RolloutStart(task, seed, instruction, action_kind, observation, anchor, K_head)
         query = _query(self.selector)

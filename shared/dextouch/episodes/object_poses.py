@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from dextouch.episodes.reader import EpisodeReader
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import (
+    Distortion,
     bracket,
     interpolate_poses,
     points_on_level,
@@ -194,7 +195,7 @@ class _View:
     """The image of the first step: size (px), camera, height of the table, and what to call it."""
 
     size_px: tuple[int, ...]
-    camera: tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "5"]]
+    camera: tuple[Float64[np.ndarray, "3 3"], Distortion]
     T_world_camera: Float64[np.ndarray, "4 4"]
     table_z_m: float
     where: str

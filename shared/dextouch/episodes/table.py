@@ -332,12 +332,14 @@ class EpisodeGrid:
         height_px, width_px, _ = self.reader.streams[HEAD_CAMERA].shape
         return height_px, width_px
 
-    def images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-        """The head camera image nearest to each of some non-decreasing steps, whatever its own.
+    def images(
+        self, steps: Sequence[int] | np.ndarray, camera: str = HEAD_CAMERA
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        """The image of a camera nearest to each of some non-decreasing steps, whatever its own.
 
-        They are undistorted: as a pinhole camera with `K_head` would have taken them.
+        Those of the head are undistorted: as a pinhole camera with `K_head` would have taken them.
         """
-        return self._nearest(steps)[1]
+        return self._nearest(steps, camera)[1]
 
     def own_images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"] | None:
         """Head camera images of some non-decreasing steps; None if one has none of its own."""
@@ -346,20 +348,22 @@ class EpisodeGrid:
         return images if (np.abs(offset_ns) <= reach_ns).all() else None
 
     def _nearest(
-        self, steps: Sequence[int] | np.ndarray
+        self, steps: Sequence[int] | np.ndarray, camera: str = HEAD_CAMERA
     ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w 3"]]:
         times_ns = self.t_ref_ns[np.asarray(steps)]
-        indices, images = self.reader.nearest_pictures(HEAD_CAMERA, times_ns)
+        indices, images = self.reader.nearest_pictures(camera, times_ns)
         K = self.about.K_head_matrix()
-        flat = undistorted(images, K, self.about.head_distortion())
-        scaled, _ = square_of_at_most(flat, K, self.image_px)
-        return self.reader.stamps_ns(HEAD_CAMERA)[indices] - times_ns, scaled
+        if camera == HEAD_CAMERA:
+            images = undistorted(images, K, self.about.head_distortion())
+        scaled, _ = square_of_at_most(images, K, self.image_px)
+        return self.reader.stamps_ns(camera)[indices] - times_ns, scaled
 
-    def observation(self, step: int = 0) -> Observation:
-        """What a rollout from a step observes first."""
+    def observation(self, step: int = 0, further_views: Iterable[str] = ()) -> Observation:
+        """What a rollout from a step observes first, with those further views that there are."""
+        cameras = (HEAD_CAMERA, *(view for view in further_views if view in self.reader.streams))
         return Observation(
             first_step=0,
-            images={HEAD_CAMERA: self.images([step])},
+            images={camera: self.images([step], camera) for camera in cameras},
             tactile_kpa=self.reader.touch(step, 1)[0],
             action_reached=self.reader.actions(step, 1),
             reached_is_measured=True,

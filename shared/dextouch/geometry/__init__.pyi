@@ -1,7 +1,11 @@
 from . import rotations as rotations
+from .transforms import DISTORTION_MODEL as DISTORTION_MODEL
+from .transforms import NUM_DISTORTION as NUM_DISTORTION
+from .transforms import Distortion as Distortion
 from .transforms import apply as apply
 from .transforms import box_pixels as box_pixels
 from .transforms import bracket as bracket
+from .transforms import distortion_of as distortion_of
 from .transforms import interpolate_linear as interpolate_linear
 from .transforms import interpolate_poses as interpolate_poses
 from .transforms import invert as invert

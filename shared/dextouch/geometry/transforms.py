@@ -7,6 +7,7 @@ distortion (`undistorted`).
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Final
 
@@ -21,6 +22,11 @@ from dextouch.geometry.rotations import (
     vector_from_rotation,
 )
 
+# The lens model of all images: another one, or more coefficients, is defined here, in `_distorted`,
+# and fitted in `services.alignment.calibration.lens_fit`. Its name is that of ROS and Foxglove.
+DISTORTION_MODEL: Final = "plumb_bob"
+NUM_DISTORTION: Final = 5
+Distortion = Float64[np.ndarray, f"{NUM_DISTORTION}"]
 # Newton's method doubles the digits each time; far from the middle of a strong lens it needs more.
 _MAX_ITERATIONS: Final = 50
 _TOLERANCE: Final = 1e-11
@@ -97,6 +103,12 @@ def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64
     return np.array(
         [[focal_px, 0.0, 0.5 * width_px], [0.0, focal_px, 0.5 * height_px], [0.0, 0.0, 1.0]]
     )
+
+
+def distortion_of(calibration: Mapping[str, object], camera: str) -> Distortion:
+    """Coefficients of a camera's lens in a calibration; zeros for those that it lacks."""
+    known = np.array(calibration.get(f"distortion_{camera}", ()), dtype=np.float64).ravel()
+    return np.pad(known, (0, NUM_DISTORTION - len(known)))
 
 
 def project(
@@ -287,14 +299,14 @@ def _undistorted(
     flat = seen
     with np.errstate(all="ignore"):
         for _ in range(_MAX_ITERATIONS):
-            shown, slopes = _distorted(flat, distortion)
-            off = shown - seen
+            projected, slopes = _distorted(flat, distortion)
+            off = projected - seen
             if np.abs(off).max(initial=0.0) < _TOLERANCE:
                 break
             (a, b), (_, d) = np.moveaxis(slopes, (-2, -1), (0, 1))
             step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - b * off[..., 0]])
             flat = flat - np.moveaxis(step / (a * d - b * b), 0, -1)
-        shown, slopes = _distorted(flat, distortion)
+        projected, slopes = _distorted(flat, distortion)
         # Beyond the angle at which the lens turns back, other points have the same image.
         is_first = (slopes[..., 0, 0] > 0) & (np.linalg.det(slopes) > 0)
-        return flat, is_first & (np.abs(shown - seen).max(axis=-1) < _WRONG)
+        return flat, is_first & (np.abs(projected - seen).max(axis=-1) < _WRONG)

@@ -10,6 +10,9 @@ from .skeleton import FINGER_CHAINS as FINGER_CHAINS
 from .skeleton import FINGER_JOINTS as FINGER_JOINTS
 from .skeleton import FINGER_METACARPALS as FINGER_METACARPALS
 from .skeleton import KNUCKLE_NODES as KNUCKLE_NODES
+from .skeleton import MEAN_FINGERS as MEAN_FINGERS
+from .skeleton import MEAN_THUMB_BASE_M as MEAN_THUMB_BASE_M
+from .skeleton import MEAN_THUMB_BONES_M as MEAN_THUMB_BONES_M
 from .skeleton import METACARPAL_NODES as METACARPAL_NODES
 from .skeleton import NO_KEYPOINT as NO_KEYPOINT
 from .skeleton import NODE_INDEX as NODE_INDEX

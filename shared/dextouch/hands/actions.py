@@ -15,8 +15,8 @@ from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_6d, rotation_to_6d
 from dextouch.hands.robot_hand import RobotHand
 
-ACTION_DIM = 67
-POSE_DIM = 9
+ACTION_DIM = 67  # three poses of 9 and two hands of 20 (docs/rollout_api.md)
+POSE_DIM = 9  # translation and two columns of the rotation
 WRIST_LEFT = slice(0, 9)
 WRIST_RIGHT = slice(9, 18)
 JOINTS_LEFT = slice(18, 38)

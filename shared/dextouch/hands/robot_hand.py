@@ -23,13 +23,13 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_quaternion
 from dextouch.hands.skeleton import CHAINS
 
-NUM_JOINTS: Final = 20
+NUM_JOINTS: Final = 20  # of the Wuji Hand 2: four a finger
 NUM_FINGERS: Final = 5
 SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-MAX_HINGES: Final = 6
+MAX_HINGES: Final = 6  # chosen: two more than our own fingers have
 # Tolerance of unit axes, small enough not to affect fingertip positions.
 AXIS_TOLERANCE: Final = 1e-9
 _POINT_NAMES: Final = ("knuckle", "PIP", "DIP")

@@ -22,7 +22,6 @@ CHAINS: Final = ("thumb", "index", "middle", "ring", "little")
 THUMB_JOINTS: Final = ("metacarpal", "proximal", "distal", "tip")
 FINGER_JOINTS: Final = ("metacarpal", "proximal", "intermediate", "distal", "tip")
 
-
 # (chain, joint) of each keypoint. A node sits at the *base* of its bone: "proximal" is the
 # anatomical MCP joint, "intermediate" the PIP, "distal" the DIP (of the thumb: the IP).
 NODES: Final = (
@@ -39,16 +38,18 @@ KNUCKLE_NODES: Final = tuple(NODE_INDEX[chain, FINGER_JOINTS[1]] for chain in FI
 # Keypoints that do not move with the fingers.
 PALM_NODES: Final = (WRIST_NODE, *METACARPAL_NODES, *KNUCKLE_NODES)
 
-# Right hand, metres: base of the metacarpal, its lean to the thumb's side (rad), bones from there.
-_FINGERS: Final = {
+# The mean right hand in metres: bones of adults (Buryanov and Kotiuk 2010), the last one with the
+# pulp; places in the wrist are our estimates from common anatomy. Of a finger: base of the
+# metacarpal, its lean to the thumb's side (rad), bones from there.
+MEAN_FINGERS: Final = {
     "index": ((0.013, -0.002, -0.027), 0.14, (0.06812, 0.03978, 0.02238, 0.01966)),
     "middle": ((0.003, -0.004, -0.029), 0.00, (0.06460, 0.04463, 0.02633, 0.02135)),
     "ring": ((-0.007, -0.003, -0.027), -0.13, (0.05800, 0.04137, 0.02565, 0.02125)),
     "little": ((-0.015, 0.000, -0.024), -0.26, (0.05369, 0.03274, 0.01811, 0.01969)),
 }
-_THUMB_BASE_M: Final = (0.018, 0.007, -0.020)
+MEAN_THUMB_BASE_M: Final = (0.018, 0.007, -0.020)
 _THUMB_DIRECTION: Final = (0.78, 0.10, -0.62)
-_THUMB_BONES_M: Final = (0.04622, 0.03157, 0.02734)
+MEAN_THUMB_BONES_M: Final = (0.04622, 0.03157, 0.02734)
 
 
 def chain_indices(chain: str) -> list[int]:
@@ -73,13 +74,13 @@ def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
     if side not in ("left", "right"):
         raise UnknownNameError("side", side, ["left", "right"])
     points = np.zeros((NUM_KEYPOINTS, 3))
-    for chain, (base_m, lean_rad, bones_m) in _FINGERS.items():
+    for chain, (base_m, lean_rad, bones_m) in MEAN_FINGERS.items():
         # Fingers spread half as much as their metacarpals.
         leans = np.array([lean_rad, *[lean_rad / 2] * 3])
         points[chain_indices(chain)] = _chain(base_m, leans, np.array(bones_m))
     direction = np.array(_THUMB_DIRECTION) / np.linalg.norm(_THUMB_DIRECTION)
-    steps = np.concatenate([[0.0], np.cumsum(_THUMB_BONES_M)])
-    points[chain_indices("thumb")] = np.array(_THUMB_BASE_M) + steps[:, None] * direction
+    steps = np.concatenate([[0.0], np.cumsum(MEAN_THUMB_BONES_M)])
+    points[chain_indices("thumb")] = np.array(MEAN_THUMB_BASE_M) + steps[:, None] * direction
     if side == "left":
         points[:, 1] *= -1
     points.flags.writeable = False

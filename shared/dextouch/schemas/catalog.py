@@ -16,7 +16,7 @@ from dextouch.tactile import LayoutDescription
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
 EditedOutcome = Literal["keep", "success", "failure", "unknown"]
-MAX_MOVED = 500
+MAX_MOVED = 500  # chosen: bounds one request
 # Of an item. Chosen: a take of minutes has tens of notes of a sentence; the file stays below 2 MB.
 MAX_NOTES = 500
 MAX_NOTE = 1000

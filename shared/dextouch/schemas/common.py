@@ -33,8 +33,8 @@ Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, Fin
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:dextouch:error:"
-MAX_NAMED = 1000
-MAX_LISTED = 5
+MAX_NAMED = 1000  # chosen: bounds the text of an error
+MAX_LISTED = 5  # chosen: a line that people read
 # Names of the error constructor's own parameters.
 RESERVED = frozenset({"self", "message"})
 # The first matching class decides; leaves of the tree precede their parents.

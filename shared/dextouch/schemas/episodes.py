@@ -10,7 +10,7 @@ from pydantic import AwareDatetime, BaseModel, Field, FiniteFloat, field_validat
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import check_texts
 from dextouch.frozen_model import FrozenModel, example
-from dextouch.geometry import rigid_error
+from dextouch.geometry import Distortion, distortion_of, rigid_error
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.common import (
     MAX_INSTRUCTION,
@@ -172,9 +172,9 @@ class EpisodeAttributes(FrozenModel):
     def _is_camera_matrix(cls, rows: Matrix | None) -> Matrix | None:
         return None if rows is None else _check_matrix(rows, (3, 3))
 
-    def head_distortion(self) -> Float64[np.ndarray, "5"]:
+    def head_distortion(self) -> Distortion:
         """Distortion of the head camera's lens, k1 k2 p1 p2 k3; zeros where none is known."""
-        return np.array(self.calibration.get("distortion_head", ((0.0,) * 5,))[0], dtype=np.float64)
+        return distortion_of(self.calibration, "head")
 
     def matrices(self) -> dict[str, Matrix]:
         """The calibration, with `K_head` if it is known."""

@@ -56,8 +56,8 @@ class ReturnSelector(FrozenModel):
     """Requested part of an observation.
 
     Attributes:
-        cameras: names of cameras; all of the world if omitted, an empty list means none. In a
-            query, where an empty list cannot be written, none is `cameras=`.
+        cameras: names of cameras; if omitted all of the world but the optional ones, an empty list
+            means none. In a query, where an empty list cannot be written, none is `cameras=`.
         steps: all steps of the chunk, or only its last one.
         tactile: whether touch is sent.
         images: how images are sent; JPEG takes a tenth of the bytes, but is not exact.
@@ -126,11 +126,11 @@ class Observation:
         The last step is an observation of one step that begins where the chunk ends. Touch is
         always kept; whether it is sent is decided by the sender.
         """
-        shown = self.last() if selector.steps == "last" else self
+        chosen = self.last() if selector.steps == "last" else self
         if selector.cameras is None:
-            return shown
-        wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
-        return replace(shown, images=wanted)
+            return chosen
+        images = {camera: rows for camera, rows in chosen.images.items() if selector.wants(camera)}
+        return replace(chosen, images=images)
 
 
 def rollout_uncertainty(observations: Iterable[Observation]) -> RolloutUncertainty:

@@ -13,7 +13,7 @@ from dextouch.tactile import LayoutDescription
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
-MAX_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1  # an int64
 # Of one hand of a `dextouch_v1`.
 _USUAL_TAXELS: Final = 320
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
@@ -67,6 +67,8 @@ class WorldDescription(FrozenModel):
         knows_success: whether observations say if the task is done.
         object_names: by task, the objects whose poses are in its observations; empty for a world
             without object poses.
+        optional_cameras: a start may have their images, too, and then answers have them if they are
+            asked for by name.
         predicts_touch: if false, touch is zero in its observations.
         scales_images: if true, images of a start may have another size: the middle square is
             scaled to the world's size, and the rollout's `K_head` is of the scaled image.
@@ -87,6 +89,7 @@ class WorldDescription(FrozenModel):
     max_chunk_steps: int = 64
     knows_success: bool = False
     object_names: dict[str, tuple[str, ...]] = Field(default={})
+    optional_cameras: tuple[str, ...] = Field(default=(), exclude_if=not_)
     predicts_touch: bool = Field(default=True, exclude_if=bool)
     scales_images: bool = Field(default=False, exclude_if=not_)
     tactile_layout: LayoutDescription | None = Field(

@@ -34,7 +34,7 @@ DICTIONARY_SIZES: dict[MarkerDictionary, int] = {
     "DICT_APRILTAG_16h5": 30,
     "DICT_APRILTAG_36h11": 587,
 }
-_UNIT = 1e-3
+_UNIT = 1e-3  # tolerance of typed numbers of three digits
 
 
 def _is_turned(pose: Pose) -> Pose:

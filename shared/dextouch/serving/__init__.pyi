@@ -35,9 +35,11 @@ from .refusals import WrongKeys as WrongKeys
 from .running import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
 from .running import bound_socket as bound_socket
 from .running import check_address as check_address
+from .running import reload_keys_at_hangup as reload_keys_at_hangup
 from .running import run as run
 from .running import serve as serve
 from .running import server_options as server_options
+from .running import settings_with_keys as settings_with_keys
 from .served_folder import ServedFolder as ServedFolder
 from .settings import ServiceSettings as ServiceSettings
 from .settings import load_settings as load_settings

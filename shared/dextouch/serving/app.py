@@ -223,8 +223,8 @@ def _page_or_problem(request: Request, error: DexTouchError, status: int) -> Res
         request.app.state.refusals.note(request, status, str(reason))
     page = getattr(request.app.state, "refusal_page", None)
     if page is not None and "text/html" in request.headers.get("accept", ""):
-        shown: Response = page(masked(error.message), status)
-        return shown
+        response: Response = page(masked(error.message), status)
+        return response
     return _problem_response(request, error, status)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from dextouch.errors import UnavailableError
 
-STOP_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 30.0  # chosen: for a child that hangs
 
 Answer = Callable[[Mapping[str, object]], None]
 
@@ -58,8 +58,7 @@ class ChildProcess:
     def receive(self) -> dict[str, Any]:
         """Wait for the next response.
 
-        Raises:
-            UnavailableError: the process ended; `details` has its `exit_status`.
+        Raises UnavailableError if the process ended; `details` has its `exit_status`.
         """
         assert self._process.stdout is not None  # noqa: S101 - it is a pipe
         line = self._process.stdout.readline()

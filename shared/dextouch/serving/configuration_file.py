@@ -25,8 +25,8 @@ from pydantic_settings import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import first_problems
 
-MAX_PROBLEMS: Final = 5
-MAX_SHOWN: Final = 60
+MAX_PROBLEMS: Final = 5  # chosen: a message that people read
+MAX_SHOWN: Final = 60  # chosen: the rest of a line
 # What pydantic expects, by the type of its error; `ctx` has the numbers and names.
 _EXPECTED: Final = {
     **dict.fromkeys(("int_parsing", "int_type", "int_from_float"), "a whole number"),
@@ -71,8 +71,8 @@ def _shown(item: Mapping[str, Any]) -> str:
     may_be_secret = any(_SECRET.search(str(part)) for part in item["loc"])
     if may_be_secret or not isinstance(value, str | int | float | bool | None):
         return "another value"
-    shown = repr(value)
-    return shown if len(shown) <= MAX_SHOWN else f"{shown[:MAX_SHOWN]}…"
+    text = repr(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
 VARIABLE: Final = "DEXTOUCH_CONFIG"

@@ -19,7 +19,6 @@ import structlog
 from httptools import HttpParserError
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Metric
 from prometheus_client.registry import Collector
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -29,7 +28,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
-from dextouch.serving.guard import Refuse
+from dextouch.serving.guard import Refuse, header
 from dextouch.serving.logs import masked
 from dextouch.serving.refusals import RefusalLog, caller_of
 from dextouch.serving.spans import traced
@@ -446,7 +445,9 @@ class RequestMiddleware:
             await self._app(scope, receive, partial(_send_without_trace, scope, send))
             return
         started = time.perf_counter()
-        request_id = _request_id(scope)
+        given = header(scope, b"x-request-id") or ""
+        is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+        request_id = given if is_usable else secrets.token_hex(16)
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
 
@@ -512,13 +513,6 @@ async def _send_without_trace(scope: Scope, send: Send, message: Message) -> Non
     if message["type"] == "lifespan.startup.failed" and scope["app"].state.start_error is not None:
         message = {**message, "message": ""}
     await send(message)
-
-
-def _request_id(scope: Scope) -> str:
-    """The caller's, if it is a valid one, or a new one."""
-    given = Headers(scope=scope).get("x-request-id", "")
-    is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
-    return given if is_usable else secrets.token_hex(16)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import KEY_NAME_PATTERN
 
-MIN_LENGTH: Final = 16
+MIN_LENGTH: Final = 16  # with which random hexadecimal keys reach MIN_BITS
 # So many guesses take 35 years at a thousand a second. By this estimate 97 of 100 random keys of 16
 # hexadecimal digits have as many, and all of 32 digits: the least of 20,000 had 75.
 MIN_BITS: Final = 40

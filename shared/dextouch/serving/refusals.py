@@ -21,7 +21,7 @@ from dextouch.serving.logs import MASK
 
 logger = structlog.get_logger(__name__)
 
-PERIOD_S: Final = 60.0
+PERIOD_S: Final = 60.0  # limits are of a minute
 # A person who mistypes a key stays below.
 MAX_PER_ADDRESS: Final = 10
 # All addresses together: many more stations and people than have a wrong key at the same time.

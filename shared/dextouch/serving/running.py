@@ -158,17 +158,10 @@ def reload_keys_at_hangup(app: FastAPI, load: Callable[[], ServiceSettings]) -> 
     """
 
     def reload(*_: object) -> None:
-        try:
-            settings = load()
-        except InvalidInputError as error:
-            logger.error("keys_not_reloaded", reason=error.message)  # noqa: TRY400
-            return
-        if not (settings.api_keys and app.state.access.has_keys):
-            reason = "a service gets its first key, and loses its last one, when it starts"
-            logger.error("keys_not_reloaded", reason=reason)
-            return
-        hide_secrets(settings)
         access = app.state.access
+        settings = settings_with_keys(load, has_keys=access.has_keys)
+        if settings is None:
+            return
         others = access.names - access.key_names
         access.set_keys(settings.api_keys)
         logger.warning("keys_reloaded", names=sorted(access.key_names))
@@ -179,3 +172,23 @@ def reload_keys_at_hangup(app: FastAPI, load: Callable[[], ServiceSettings]) -> 
 
     if sys.stdin is None or not sys.stdin.isatty():
         signal.signal(signal.SIGHUP, reload)
+
+
+def settings_with_keys(
+    load: Callable[[], ServiceSettings], *, has_keys: bool
+) -> ServiceSettings | None:
+    """The settings as they are now; a running service that `has_keys` may take their `api_keys`.
+
+    None, with the reason in the log, if they have a mistake, or would open or close the service.
+    """
+    try:
+        settings = load()
+    except InvalidInputError as error:
+        logger.error("keys_not_reloaded", reason=error.message)  # noqa: TRY400
+        return None
+    if not (settings.api_keys and has_keys):
+        reason = "a service gets its first key, and loses its last one, when it starts"
+        logger.error("keys_not_reloaded", reason=reason)
+        return None
+    hide_secrets(settings)
+    return settings

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import structlog
 from fastapi import FastAPI
-from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from dextouch.installation import install_command
+from dextouch.serving.guard import header
 from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ SPANS = Spans()
 @contextmanager
 def traced(scope: Scope) -> Iterator[str]:
     """Continue the trace of a request's caller, or begin one; yields its id."""
-    caller = parse_traceparent(Headers(scope=scope).get("traceparent", ""))
+    caller = parse_traceparent(header(scope, b"traceparent") or "")
     if SPANS.tracer is not None:
         with SPANS.of_request(scope, caller) as context, in_trace(context):
             yield context.trace_id

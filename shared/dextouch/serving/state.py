@@ -98,8 +98,7 @@ class MemoryState:
         Returns:
             The new version.
 
-        Raises:
-            ConflictError: another version is stored; see `expected` and `got`.
+        Raises ConflictError if another version is stored; see `expected` and `got`.
         """
         self._expire()
         stored = self._entries.get(key)
@@ -119,10 +118,8 @@ class MemoryState:
         """Write a new value into groups unless a limit is reached; False if one is.
 
         Counting and writing are atomic, so concurrent callers never exceed a limit: the number of
-        live keys of each group. The value is in its groups until it is deleted or expires.
-
-        Raises:
-            ConflictError: the key exists.
+        live keys of each group. The value is in its groups until it is deleted or expires. Raises
+        ConflictError if the key exists.
         """
         # No await between counting and writing, hence atomic in one event loop.
         self._expire()

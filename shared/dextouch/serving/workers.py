@@ -23,6 +23,7 @@ from dextouch.errors import DexTouchError, UnavailableError
 logger = structlog.get_logger(__name__)
 
 IsWorking = Callable[[], bool]
+Renewed = Callable[[], Callable[[], FastAPI] | None]
 
 
 class ServiceManager:
@@ -123,6 +124,17 @@ class DrainingServer(uvicorn.Server):
 class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which notices at once if a worker dies while it is asked to respond."""
 
+    renewed: Renewed | None = None
+
+    def restart_all(self) -> None:
+        if self.renewed is not None:
+            create_app = self.renewed()
+            if create_app is None:
+                return
+            # Also that of workers which take the places of dead ones later.
+            self.config.app = partial(_in_worker, create_app)
+        super().restart_all()
+
     def keep_subprocess_alive(self) -> None:
         for worker in self.processes:
             # While this process holds the worker's end of their pipe too, it never reads its end.
@@ -137,14 +149,14 @@ def run_workers(
     port: int,
     num_workers: int,
     options: dict[str, Any],
+    renewed: Renewed | None = None,
 ) -> None:
     """Serve with several processes until SIGINT or SIGTERM.
 
     uvicorn replaces workers that end or hang; on SIGHUP it replaces all, one after another, each
-    once its successor serves. `create_app` is pickled, and called in every worker.
-
-    Raises:
-        UnavailableError: a worker could not start.
+    once its successor serves. `create_app` is pickled, and called in every worker; at SIGHUP
+    `renewed` gives that of the successors, or None to replace none. Raises UnavailableError if a
+    worker could not start.
     """
     config = uvicorn.Config(
         partial(_in_worker, create_app),
@@ -159,6 +171,7 @@ def run_workers(
         # Connections inherit it; without it responses wait for up to 40 ms.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         supervisor = _Supervisor(config, sockets=[listener])
+        supervisor.renewed = renewed
         supervisor.run()
     if any(worker.exitcode == STARTUP_FAILURE for worker in supervisor.processes):
         raise UnavailableError("a worker could not start; the log above says why")

@@ -165,11 +165,11 @@ class TactileLayout(LayoutDescription):
         Raises:
             ShapeError: stacks of other pads.
         """
-        wanted = [(count, *shape) for count, shape in self._stacks]
-        if [stack.shape[-3:] for stack in stacks] != wanted:
+        expected = [(count, *shape) for count, shape in self._stacks]
+        if [stack.shape[-3:] for stack in stacks] != expected:
             raise ShapeError(
                 f"pads: got {[stack.shape for stack in stacks]}, expected stacks that end in "
-                f"{wanted} of layout {self.name!r}"
+                f"{expected} of layout {self.name!r}"
             )
         flat = [stack.reshape(*stack.shape[:-3], -1) for stack in stacks]
         return np.concatenate(flat, axis=-1)

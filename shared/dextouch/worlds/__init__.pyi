@@ -10,3 +10,4 @@ from .world import StartedRollout as StartedRollout
 from .world import State as State
 from .world import SteppedRollout as SteppedRollout
 from .world import World as World
+from .world import asked_cameras as asked_cameras

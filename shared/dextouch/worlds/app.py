@@ -16,9 +16,11 @@ from dextouch.serving import (
     configure_logging,
     create_service_app,
     open_state,
+    reload_keys_at_hangup,
     run,
     run_workers,
     server_options,
+    settings_with_keys,
 )
 from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.records import RecordStore, RolloutWatch
@@ -105,24 +107,41 @@ def serve_worlds(
     *,
     name: str = "worlds",
     reopen: Reopen | None = None,
+    load: Callable[[], WorldServiceSettings] | None = None,
 ) -> None:
     """Serve worlds until SIGINT or SIGTERM, with as many processes as the settings say.
 
     `open_worlds` is called in each process; it and `reopen` (see `create_world_app`) are picklable.
+    At SIGHUP a single process accepts the `api_keys` that `load` gives then; several are replaced,
+    one after another, by ones that do, or all stay if the settings have a mistake.
     """
     check_address(name, settings)
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    create_app = partial(create_serving_app, open_worlds, settings, name, reopen)
+
+    def factory(settings: WorldServiceSettings) -> Callable[[], FastAPI]:
+        return partial(create_serving_app, open_worlds, settings, name, reopen)
+
+    def renewed() -> Callable[[], FastAPI] | None:
+        if load is None or not settings.api_keys:
+            return factory(settings)
+        now = settings_with_keys(load, has_keys=True)
+        if now is None:
+            return None
+        return factory(settings.model_copy(update={"api_keys": now.api_keys}))
+
     if settings.workers == 1:
-        app = create_app()
+        app = factory(settings)()
+        if load is not None:
+            reload_keys_at_hangup(app, load)
         run(app, settings, drain=app.state.drain, drain_s=settings.drain_s)
         return
     run_workers(
-        create_app,
+        factory(settings),
         host=settings.host,
         port=settings.port,
         num_workers=settings.workers,
         options=server_options(settings, grace_s=settings.shutdown_grace_s),
+        renewed=renewed,
     )
 
 

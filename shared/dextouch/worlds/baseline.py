@@ -19,8 +19,8 @@ from dextouch.schemas import (
 from dextouch.tactile import LayoutDescription
 from dextouch.worlds.world import StartedRollout, SteppedRollout
 
-MAX_SNAPSHOT_BYTES = 2**28
-MAX_QUICK_BYTES = 2**20
+MAX_SNAPSHOT_BYTES = 2**28  # images of three cameras of any size
+MAX_QUICK_BYTES = 2**20  # copied in well below a millisecond
 
 
 class CopyFirstWorld:

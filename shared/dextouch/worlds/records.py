@@ -85,8 +85,8 @@ class WatchNote:
         info, written_host_ns, known = msgpack.unpackb(note)
         client, key, begun_host_ns, uncertainty, success, trace_id = known
         unreliable = None if uncertainty is None else Uncertainty.model_validate(uncertainty)
-        shown = WatchNote(client, key, begun_host_ns, unreliable, success, trace_id)
-        return info, written_host_ns, shown
+        restored = WatchNote(client, key, begun_host_ns, unreliable, success, trace_id)
+        return info, written_host_ns, restored
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class RolloutRecord:
                 f"expected {num_bytes}; start a new one"
             )
         note = WatchNote.from_bytes(stored.note)[2]
-        shown = RolloutInfo.model_validate(info)
-        return RolloutRecord(shown, snapshot, sha256, stored.tail, stored.version, note)
+        rollout = RolloutInfo.model_validate(info)
+        return RolloutRecord(rollout, snapshot, sha256, stored.tail, stored.version, note)
 
 
 def new_rollout_id(owner: str) -> str:
@@ -325,8 +325,8 @@ def selector_bytes(selector: ReturnSelector) -> bytes:
     return selector.model_dump_json().encode()
 
 
-_TAG_LETTERS: Final = 32
-_MAX_BYTES: Final = 2**30
+_TAG_LETTERS: Final = 32  # 128 bits: no two are alike
+_MAX_BYTES: Final = 2**30  # chosen: more than any response
 _NS: Final = 1e-9
 
 
@@ -375,8 +375,8 @@ class RolloutWatch:
                     f"watched rollout {watch_id!r}: has no response yet; wait for its next chunk",
                     got=watch_id,
                 )
-            shown = _watched(record.info.model_dump(mode="json"), written_host_ns, record.note)
-            rollout = shown.model_dump(mode="json")
+            watched = _watched(record.info.model_dump(mode="json"), written_host_ns, record.note)
+            rollout = watched.model_dump(mode="json")
             return tag, await asyncio.to_thread(_shown, record.payload, rollout)
 
 

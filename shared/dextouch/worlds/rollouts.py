@@ -22,6 +22,7 @@ from dextouch.errors import (
     ConflictError,
     DexTouchError,
     EndedError,
+    InvalidInputError,
     LimitExceededError,
     UnavailableError,
     UnknownNameError,
@@ -53,6 +54,7 @@ from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,
     World,
+    asked_cameras,
     check_answer,
     check_chunk,
     check_selector,
@@ -60,7 +62,6 @@ from dextouch.worlds.world import (
 )
 
 logger = structlog.get_logger(__name__)
-
 
 # Opens the world of this name and digest, or returns None where it is not to be had.
 Reopen = Callable[[str, str], World[Any] | None]
@@ -160,7 +161,16 @@ class RolloutService:
         rollout_id = new_rollout_id(owner)
         async with self._place(rollout_id) as placed:
             started, snapshot = await worker.call(reset)
-            check_answer(started.observation, description, first_step=0, num_steps=1)
+            cameras = asked_cameras(selector, description.cameras)
+            optional = set(cameras) & set(description.optional_cameras)
+            if absent := sorted(optional - set(started.observation.images)):
+                raise InvalidInputError(
+                    f"start: got a request for {', '.join(absent)}, whose images are not in the "
+                    "start; send them with it, or do not ask for them"
+                )
+            returned = selector.model_copy(update={"cameras": cameras})
+            observation = started.observation.selected(returned)
+            check_answer(observation, description, first_step=0, num_steps=1, selector=returned)
             info = RolloutInfo(
                 id=rollout_id,
                 world=world,
@@ -174,10 +184,14 @@ class RolloutService:
                 ttl_s=self.limits.ttl_s,
             )
             origin = RolloutOrigin(started.anchor, started.K_head)
-            shown = started.observation.selected(selector)
-            parts = await parts_of(info, shown, selector, origin=origin)
+            parts = await parts_of(info, observation, selector, origin=origin)
             note = WatchNote(
-                client, owner, time.time_ns(), shown.uncertainty, shown.success, current_trace_id()
+                client,
+                owner,
+                time.time_ns(),
+                observation.uncertainty,
+                observation.success,
+                current_trace_id(),
             )
             # No chunk has this response; it is kept for those who watch.
             record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
@@ -209,9 +223,9 @@ class RolloutService:
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
-            asked = hashlib.sha256(selector_bytes(selector))
-            asked.update(np.ascontiguousarray(checked, dtype="<f8").data)
-            sha256 = asked.hexdigest()
+            digest = hashlib.sha256(selector_bytes(selector))
+            digest.update(np.ascontiguousarray(checked, dtype="<f8").data)
+            sha256 = digest.hexdigest()
             replayed = record.replay(chunk, sha256)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)

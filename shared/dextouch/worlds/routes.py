@@ -53,7 +53,7 @@ from dextouch.streams import unpack
 from dextouch.worlds.records import ID_LETTERS, Answer, RolloutWatch
 from dextouch.worlds.rollouts import RolloutService
 
-MAX_BODY_BYTES = 2**28
+MAX_BODY_BYTES = 2**28  # a start has images of all cameras
 # Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
 # Of a chunk as JSON; more than any world takes at once.
@@ -62,14 +62,14 @@ MAX_ROWS = 4096
 SCOPE: Final = "rollout"
 WATCH_SCOPE: Final = "watch"
 CLIENT_HEADER: Final = "dextouch-client"
-MAX_CLIENT_LETTERS: Final = 64
-MAX_WATCHED: Final = 200
+MAX_CLIENT_LETTERS: Final = 64  # chosen: a name in a list
+MAX_WATCHED: Final = 200  # chosen: a list that people read
 REPLAYED_HEADER: Final = "dextouch-replayed"
 DTYPES: Final = ("float32", "float64")
 _PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
 _DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}".encode(): dtype for dtype in DTYPES}
-_MAX_QUERIES: Final = 64
-_MAX_QUERY_BYTES: Final = 256
+_MAX_QUERIES: Final = 64  # chosen: clients use a few
+_MAX_QUERY_BYTES: Final = 256  # chosen: cameras and options fit
 
 
 class ActionsBody(FrozenModel):
@@ -165,12 +165,12 @@ class ChunkShortcut:
             spent_s |= answer.spent_s
             size = str(len(answer.payload)).encode()
             replayed = b"true" if answer.replayed else b"false"
-            shown = [
+            answered = [
                 (REPLAYED_HEADER.encode(), replayed),
                 (b"content-length", size),
                 (b"content-type", MSGPACK.encode()),
             ]
-            await send({"type": "http.response.start", "status": 200, "headers": shown})
+            await send({"type": "http.response.start", "status": 200, "headers": answered})
             await send({"type": "http.response.body", "body": answer.payload})
 
         return step
@@ -239,9 +239,9 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
 
     @router.post("/rollouts/{rollout_id}/fork", status_code=201)
     @takes({JSON: KIB})
-    async def fork_rollout(rollout_id: str, asked: ForkRequest, owner: Owner) -> RolloutInfo:
+    async def fork_rollout(rollout_id: str, request: ForkRequest, owner: Owner) -> RolloutInfo:
         """Branch at the current step: the copy shares the past and continues by itself."""
-        return await service.fork(rollout_id, seed=asked.seed, owner=owner)
+        return await service.fork(rollout_id, seed=request.seed, owner=owner)
 
     return router
 
@@ -285,8 +285,8 @@ async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     if kind == MSGPACK:
         # Encoding megabytes of images would block the event loop.
         return await run_in_threadpool(decode_start, body, max_bytes=MAX_BODY_BYTES)
-    asked = validate_fields(StartRequest, body, where="body")
-    return asked, start_from(asked)
+    fields = validate_fields(StartRequest, body, where="body")
+    return fields, start_from(fields)
 
 
 async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
@@ -317,7 +317,7 @@ def _response(request: Request, answer: Answer, *, status: int = 200) -> Respons
 def _as_json(payload: bytes) -> bytes:
     """A response as JSON: the packing's layout with array data in base64."""
     fields, arrays = unpack(payload, max_bytes=len(payload))
-    shown = {
+    encoded = {
         name: {
             "dtype": array.dtype.name,
             "shape": list(array.shape),
@@ -325,7 +325,7 @@ def _as_json(payload: bytes) -> bytes:
         }
         for name, array in arrays.items()
     }
-    return json.dumps({"fields": fields, "arrays": shown}).encode()
+    return json.dumps({"fields": fields, "arrays": encoded}).encode()
 
 
 async def _body(receive: Receive) -> bytes:

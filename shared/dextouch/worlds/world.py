@@ -153,8 +153,7 @@ class ReconstructingWorld(World[State], Protocol[State]):
     ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 taxels"]]:
         """Encode and decode head images and touch of 1 + 4k consecutive steps.
 
-        Returns:
-            Images and touch of the steps after the first.
+        Returns images and touch of the steps after the first.
         """
         ...
 
@@ -176,10 +175,12 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
     if len(start.observation) != 1:
         raise ShapeError(f"start: observation has {len(start.observation)} steps, expected 1")
     images = start.observation.images
-    wanted = {camera: images[camera] for camera in description.cameras if camera in images}
-    observation = replace(start.observation, images=wanted)
+    more = tuple(camera for camera in description.optional_cameras if camera in images)
+    cameras = description.cameras + more
+    used = {camera: images[camera] for camera in cameras if camera in images}
+    observation = replace(start.observation, images=used)
     size_px = None if description.scales_images else _size_px(description)
-    _check_fits(observation, description, size_px, description.cameras, where="start")
+    _check_fits(observation, description, size_px, cameras, where="start")
     return replace(start, observation=observation)
 
 
@@ -210,9 +211,15 @@ def check_chunk(
 
 def check_selector(selector: ReturnSelector, description: WorldDescription) -> None:
     """Refuse cameras that the world lacks."""
+    known = description.cameras + description.optional_cameras
     for camera in selector.cameras or ():
-        if camera not in description.cameras:
-            raise UnknownNameError("camera", camera, list(description.cameras))
+        if camera not in known:
+            raise UnknownNameError("camera", camera, list(known))
+
+
+def asked_cameras(selector: ReturnSelector, usual: tuple[str, ...]) -> tuple[str, ...]:
+    """Cameras that a selector asks for: the usual ones, or in the order of their names here."""
+    return usual if selector.cameras is None else tuple(dict.fromkeys(selector.cameras))
 
 
 def check_answer(
@@ -231,7 +238,7 @@ def check_answer(
     """
     if selector.steps == "last":
         first_step, num_steps = first_step + num_steps - 1, 1
-    cameras = tuple(camera for camera in description.cameras if selector.wants(camera))
+    cameras = asked_cameras(selector, description.cameras)
     where = f"answer of world {description.name} (the rollout stays as it was)"
     if (observation.first_step, len(observation)) != (first_step, num_steps):
         raise DexTouchError(

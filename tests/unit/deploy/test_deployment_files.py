@@ -337,8 +337,7 @@ def test_units_start_commands_that_exist_on_the_ports_of_the_tls_examples(name, 
     if name in {"store", "dashboard"}:
         for example in ("nginx/dextouch.conf", "caddy/Caddyfile"):
             assert f"127.0.0.1:{flags[1]}" in (ROOT / "deploy" / example).read_text()
-    # Workers of a world replace themselves at SIGHUP; a single one reads no keys anew.
-    assert ("ExecReload=/bin/kill -HUP $MAINPID" in unit) is (name != "world-model")
+    assert "\nExecReload=/bin/kill -HUP $MAINPID\n" in unit
 
 
 def test_the_backup_is_made_by_a_command_that_exists():

@@ -137,8 +137,8 @@ def test_its_figures_of_every_kind_are_kept(judge):
 def test_classifiable_milestones_are_reported(judge):
     assert judge.shape.milestones["reach"] == ("begun", "moved", "there")
     # "begun" holds in every episode, so nothing shows that the judge can tell it.
-    assert "there" in judge.metadata.settings["told_milestones"]["reach"]
-    assert "begun" not in judge.metadata.settings["told_milestones"]["reach"]
+    assert "there" in judge.metadata.settings["classifiable_milestones"]["reach"]
+    assert "begun" not in judge.metadata.settings["classifiable_milestones"]["reach"]
     wins = [e for e in _episodes(range(700, 724)) if e.success and e.task == "reach"]
     told = [judge.verdict(e.final).milestones["there"] for e in wins]
     assert np.mean(told) > 0.7

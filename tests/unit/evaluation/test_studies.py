@@ -27,7 +27,7 @@ from services.evaluation.studies.results import (
     StudyDefinition,
     StudyHeader,
     StudyResults,
-    cells_of,
+    planned_rollouts_of,
     read_definition,
     rollout_episode_id,
     study_report,
@@ -70,8 +70,8 @@ def definition_of(text, folder, **changed):
 def test_a_study_counts_its_rollouts(tmp_path):
     study = definition_of(STUDY, tmp_path, repeats=2)
     # 2 tasks x 3 starts x 2 policies: once in the real world, twice in the other.
-    assert study.num_rollouts == 12 * 3 == len(set(cells_of(study)))
-    assert next(cells_of(study)) == PlannedRollout("real", "reach", 2000, "hold", 0)
+    assert study.num_rollouts == 12 * 3 == len(set(planned_rollouts_of(study)))
+    assert next(planned_rollouts_of(study)) == PlannedRollout("real", "reach", 2000, "hold", 0)
     assert study.digest != definition_of(STUDY, tmp_path).digest
     assert study.digest == study.model_copy(update={"name": "another"}).digest
     again = StudyDefinition.model_validate_json(study.model_dump_json())

@@ -9,7 +9,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.scores import RolloutScore
-from services.evaluation.studies.results import StudyDefinition, StudyResults, cells_of
+from services.evaluation.studies.results import StudyDefinition, StudyResults, planned_rollouts_of
 from services.evaluation.trained_networks import save_checkpoint
 from services.pipelines.study import blocks_of, main, run_block
 from tests.unit.evaluation import toy
@@ -61,7 +61,7 @@ def test_blocks_give_the_outcomes_of_the_whole_study(tmp_path, study_file):
     whole = StudyResults.read(tmp_path / "whole")
     definition = StudyDefinition.model_validate(whole.header.definition)
     store = EpisodeStore(tmp_path / "blocks")
-    missing = list(cells_of(definition))
+    missing = list(planned_rollouts_of(definition))
     blocks = blocks_of(definition, missing, whole.header, store.url)
     # Ten starts and two, of two tasks in two worlds.
     sizes = Counter(len(block.rollouts) for block in blocks)
@@ -83,7 +83,9 @@ def test_blocks_hold_what_is_missing(tmp_path, study_file):
     header = StudyResults.read(tmp_path / "whole").header
     definition = StudyDefinition.model_validate(header.definition)
     some = [
-        one for one in cells_of(definition) if one.seed in {2003, 2007} and one.world == "dream"
+        one
+        for one in planned_rollouts_of(definition)
+        if one.seed in {2003, 2007} and one.world == "dream"
     ]
     blocks = blocks_of(definition, some, header, None)
     assert [len(block.rollouts) for block in blocks] == [4, 4]

@@ -9,7 +9,10 @@ import httpx
 import pytest
 from fastapi import APIRouter, Depends, FastAPI, Request
 from httpx import ASGITransport, AsyncClient
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import BaseModel, SecretStr
+from starlette.datastructures import Headers
 
 from dextouch import __version__, errors
 from dextouch.frozen_model import FrozenModel
@@ -24,6 +27,7 @@ from dextouch.serving import (
     takes,
     timed,
 )
+from dextouch.serving.guard import header
 from dextouch.serving.keys import ApiKey
 
 CASES = [
@@ -315,3 +319,12 @@ async def test_request_id_reaches_the_log(caplog):
         with caplog.at_level(logging.ERROR):
             response = await client.get("/boom", headers={"x-request-id": "abc"})
     assert json.loads(response.content)["request_id"] == "abc"
+
+
+@given(
+    sent=st.lists(st.tuples(st.sampled_from([b"host", b"origin", b"x"]), st.binary())),
+    name=st.sampled_from(["host", "origin", "absent"]),
+)
+def test_headers_are_read_as_starlette_reads_them(sent, name):
+    scope = {"type": "http", "headers": sent}
+    assert header(scope, name.encode()) == Headers(scope=scope).get(name)

@@ -161,6 +161,9 @@ def write_episode(store, episode, image_every=1, *, success=None):
         "camera_head": ("image", episode.images, "rgb8"),
         "action": ("robot_state", episode.actions["measured"], "action67"),
     }
+    for side, images in zip(("left", "right"), episode.further, strict=False):
+        if images is not None:
+            streams[f"camera_wrist_{side}"] = ("image", images, "rgb8")
     if "commanded" in episode.actions:
         streams["action_commanded"] = ("robot_state", episode.actions["commanded"], "action67")
     if episode.object_poses is not None:

@@ -32,7 +32,7 @@ from dextouch.hands.hand_files.models import (
 from dextouch.hands.robot_hand import FingerTable, HandModel, JointRow
 from dextouch.hands.skeleton import CHAINS
 
-MAX_BYTES: Final = 64 * 2**10
+MAX_BYTES: Final = 64 * 2**10  # chosen: for a file that people write
 Name = Annotated[str, Field(min_length=1)]
 ModelFile = UrdfModel | MjcfModel
 # Plausible lengths from knuckle to tip and from wrist to first hinge; detects millimetres.

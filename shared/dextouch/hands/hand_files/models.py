@@ -29,9 +29,9 @@ from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
 from dextouch.hands.robot_hand import Vector3
 
-MAX_BYTES: Final = 8 * 2**20
-MAX_DEPTH: Final = 100
-MAX_ELEMENTS: Final = 20_000
+MAX_BYTES: Final = 8 * 2**20  # chosen: of text; meshes are not read
+MAX_DEPTH: Final = 100  # chosen: hands nest far fewer bodies
+MAX_ELEMENTS: Final = 20_000  # chosen: hands have far fewer
 # Far above any length, angle or direction, yet sums and products stay finite.
 MAX_NUMBER: Final = 1e6
 # float() also accepts "nan", "inf", "1_0" and digits of other scripts.

@@ -24,6 +24,8 @@ from services.world_model.network.video import (
     WanVideoExpert,
 )
 
+NO_PAST = torch.zeros(2, 0, 2, 8, 8)
+
 
 @pytest.fixture
 def latents():
@@ -54,7 +56,7 @@ def velocity(config, transformer, latents, t, text):
     expert = WanVideoExpert(config, transformer)
     tokens = tokens_of(latents)
     conditions = condition.at(condition.of(torch.zeros(*t.shape, config.video_width), text), t)
-    stream = expert.start(tokens, tokens[:, 0], conditions, torch.zeros(2, 9, 2, 8, 8))
+    stream = expert.start(tokens, tokens[:, 0], conditions, torch.zeros(2, 9, 2, 8, 8), NO_PAST)
     width = config.tactile_width
     nothing = Stream(torch.zeros(2, 0, width), torch.zeros(2, 0, 6, width))
     everything = torch.ones(stream.tokens.shape[1], stream.tokens.shape[1], dtype=torch.bool)

@@ -1,6 +1,7 @@
 """Training of the full architecture by several processes, with every option, is that of one."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,7 +27,10 @@ def stored(settings, large_episode, tmp_path):
     """The settings with a store that other processes can read, and more windows a step."""
     store = EpisodeStore(tmp_path / "store")
     for seed in range(4):
-        write_episode(store, large_episode(seed))
+        episode = large_episode(seed)
+        # One has no wrist camera.
+        views = (255 - episode.images,) if seed else ()
+        write_episode(store, replace(episode, further=views))
     more = settings.optimizer.model_copy(update={"batch": 8, "warmup_steps": 2})
     return settings.model_copy(
         update={
@@ -55,6 +59,8 @@ def assert_near(given, log, expected):
         (2, {"freeze_video": True, "precision": "bfloat16"}),
         (4, LEAN),
         (4, {**LEAN, **ADAPTED, "replicas": 2}),
+        (2, {**LEAN, **ADAPTED, "views": True}),
+        (4, {**LEAN, "views": True}),
     ],
     ids=str,
 )
@@ -65,6 +71,11 @@ def test_several_processes_train_as_one(stored, tmp_path, count, changes):
         stored = stored.model_copy(
             update={"network": stored.network.model_copy(update={"wan": wan})}
         )
+    if changes.pop("views", None):
+        seeing = stored.network.model_copy(
+            update={"further_views": ("camera_wrist_left",), "past_images": 2, "past_stride": 4}
+        )
+        stored = stored.model_copy(update={"network": seeing})
     one = {key: changes[key] for key in ("lora", "freeze_video") if key in changes}
     expected = train(TrainSettings.model_validate({**stored.model_dump(), **one}))
     output = tmp_path / "several" / "model.safetensors"
