@@ -17,6 +17,9 @@ MIN_REGULAR_SHARE: Final = 0.85
 MAX_HELD: Final = 20
 MIN_HELD: Final = 1.2
 MIN_CHANGES: Final = 20
+# Of rounded values, only what is held for about so many samples, and a whole number of them.
+MIN_ROUNDED_HELD: Final = 1.9
+MAX_UNEVEN: Final = 0.05
 # Second differences of white noise turn back (a cosine of -2/3), those of a movement do not.
 MAX_NOISE_COSINE: Final = -0.2
 # Noise hardly ever gives a number twice; where numbers repeat they are rounded, and rounded values
@@ -38,9 +41,10 @@ MAX_LOOP: Final = 64
 # White noise has one step of twenty there. Noise below the second share of the largest is none.
 STILL_SHARE: Final = 0.06
 MIN_STILL_STEPS: Final = 12
+MAX_SHORT_SHARE: Final = 0.001
 DEAD_SHARE: Final = 0.004
-# Differences that are smaller come from the arithmetic, in metres or of quaternions.
-ROUNDING: Final = 1e-9
+# Smaller differences, as shares of the values (or of one), come from 32-bit floats.
+ROUNDING: Final = 1e-6
 
 
 @dataclass(frozen=True)
@@ -103,10 +107,14 @@ def implausible_repeats(
     if len(equal) < MIN_STEPS or not columns.any():
         return
     held, times = _held(equal)
+    is_rounded = not is_noisy and _are_rounded(rows[~np.append(False, equal)])
+    if is_rounded and (times < MIN_ROUNDED_HELD or abs(times - round(times)) > MAX_UNEVEN):
+        # Rounded values of a slow movement come several times, too.
+        held, times = held & False, 1.0
     if times > 1:
         message = f"{what} come {times:.3g} times each: the device repeats what it has"
         yield Implausible("repeated", message, spread(held, at, len(values)), factor=times)
-    elif (held := _held_in_parts(equal)).any():
+    elif not is_rounded and (held := _held_in_parts(equal)).any():
         message = f"{what} come several times each for a while, {held.sum()} in all"
         yield Implausible("repeated", message, spread(held, at, len(values)))
     new = np.flatnonzero(~held)
@@ -207,7 +215,9 @@ def still_parts(
     if len(parts) <= max(MIN_STEPS, 3 * NOISE_BLOCK):
         return []
     steps = np.diff(parts, axis=0)
-    lengths, noise = np.linalg.norm(steps, axis=-1), _noise_of(steps)
+    known = np.abs(parts[np.isfinite(parts)])
+    rounding = ROUNDING * max(1.0, float(np.quantile(known, 0.95)) if len(known) else 0.0)
+    lengths, noise = np.linalg.norm(steps, axis=-1), _noise_of(steps, rounding)
     found = []
     for part in np.flatnonzero(noise > 0).tolist():
         still, harmless = np.zeros((2, len(parts)), dtype=bool)
@@ -215,14 +225,21 @@ def still_parts(
             goes_on = stop + 1 < len(parts) and (
                 _apart(parts[stop, part], parts[stop + 1, part]) <= MIN_CATCH_UP
             )
-            (harmless if goes_on else still)[start + 1 : stop + 1] = True
+            # What is rounded rests exactly, and goes on where it was.
+            if not goes_on or (lengths[start:stop, part] > rounding).any():
+                (harmless if goes_on else still)[start + 1 : stop + 1] = True
         if still.any() or harmless.any():
             found.append((part, still, harmless))
     return found
 
 
-def _noise_of(steps: Float64[np.ndarray, "n parts size"]) -> Float64[np.ndarray, " parts"]:
-    """Usual length of second differences where a part is least noisy; 0 of parts without noise."""
+def _noise_of(
+    steps: Float64[np.ndarray, "n parts size"], rounding: float
+) -> Float64[np.ndarray, " parts"]:
+    """Usual length of second differences where a part is least noisy; 0 of parts without noise.
+
+    Rounded values may rest: they have none, either.
+    """
     bends = np.diff(steps, axis=0)
     lengths = np.linalg.norm(bends, axis=-1)
     num_blocks, num_parts = len(bends) // NOISE_BLOCK, steps.shape[1]
@@ -236,9 +253,11 @@ def _noise_of(steps: Float64[np.ndarray, "n parts size"]) -> Float64[np.ndarray,
         scale = lengths[1:rows, part] * lengths[: rows - 1, part]
         alive &= scale > 0
         quiet = float(np.percentile(medians[is_alive[:, part], part], 10))
-        # Rounded numbers may rest. One column is enough: a small rotation has few digits left.
+        if _rests(np.linalg.norm(steps[:, part], axis=1) <= rounding):
+            continue
+        # One column is enough: a small rotation has few digits left.
         gaps = np.diff(np.sort(np.abs(steps[1:rows, part][alive]), axis=0), axis=0)
-        quantum = np.where(gaps > ROUNDING, gaps, np.inf).min(initial=np.inf)
+        quantum = np.where(gaps > rounding, gaps, np.inf).min(initial=np.inf)
         ways = steps[: rows - 1, part] + steps[1:rows, part] + steps[2 : rows + 1, part]
         slow = np.linalg.norm(ways[alive], axis=1)
         dots = (bends[1:rows, part] * bends[: rows - 1, part]).sum(axis=1)[alive] / scale[alive]
@@ -246,6 +265,12 @@ def _noise_of(steps: Float64[np.ndarray, "n parts size"]) -> Float64[np.ndarray,
         if len(dots) >= NOISE_BLOCK and dots.mean() < MAX_NOISE_COSINE:
             noise[part] = quiet if quantum < STILL_SHARE * quiet else 0.0
     return noise
+
+
+def _rests(equal: Bool[np.ndarray, " n"]) -> bool:
+    """Whether values are kept now and then, as rounded ones are, not only for long."""
+    long = sum(stop - start for start, stop in _runs(equal, MIN_STILL_STEPS))
+    return bool(equal.sum() - long > max(2, MAX_SHORT_SHARE * (len(equal) - long)))
 
 
 def _frozen(
@@ -272,16 +297,24 @@ def _frozen(
     return frozen, harmless
 
 
+def _are_rounded(rows: np.ndarray) -> bool:
+    """Whether numbers come again in columns, as those of noise hardly do."""
+    some = rows[:NOISE_ROWS]
+    num_distinct = np.array([len(np.unique(column)) for column in some.T])
+    if not (num_distinct > 1).any():
+        return True
+    # Of a quarter of the columns: a number near one, as of a small rotation, has few digits left.
+    usual = np.percentile(num_distinct[num_distinct > 1], 25)
+    return bool(usual < MIN_DISTINCT_SHARE * len(some))
+
+
 def _is_noisy(rows: np.ndarray, equal: np.ndarray) -> bool:
     """Whether values are noisy: what hardly ever keeps a value keeps none for long."""
     if len(equal) < MIN_STEPS or equal.mean() > MAX_EQUAL_SHARE:
         return False
-    some = rows[:NOISE_ROWS].astype(np.float64)
-    num_distinct = np.array([len(np.unique(column)) for column in some.T])
-    # Half of the columns: a number near one, as of a small rotation, has few digits left.
-    if np.median(num_distinct[num_distinct > 1]) < MIN_DISTINCT_SHARE * len(some):
+    if _are_rounded(rows):
         return False
-    steps = np.diff(some, axis=0)
+    steps = np.diff(rows[:NOISE_ROWS].astype(np.float64), axis=0)
     bends = np.diff(steps, axis=0)
     lengths = np.linalg.norm(bends, axis=1)
     scale = lengths[1:] * lengths[:-1]

@@ -453,9 +453,21 @@ def test_two_worlds_of_a_tracker_are_no_outliers():
     assert lasting_jumps(t_ns, poses, period_ns=round(1e9 / 60)).tolist() == [200, 212]
 
 
-def test_rounded_poses_may_rest():
-    t_ns, poses = movement(120, rests=True)
-    assert found(t_ns, np.round(poses, 3), 120) == []
+@pytest.mark.parametrize("rate_hz", [30, 60, 120])
+@pytest.mark.parametrize("step_m", [0.0001, 0.001, 0.002])
+@pytest.mark.parametrize("step_rad", [0.0, np.radians(0.1)])
+@pytest.mark.parametrize("noise_m", [0.00005, 0.0005])
+def test_rounded_poses_may_rest_and_move_slowly(rate_hz, step_m, step_rad, noise_m):
+    for seed in range(3):
+        for rests, slower in ((True, 1.0), (False, 0.1)):
+            t_ns, poses = movement(rate_hz, seed=seed, noise_m=noise_m, rests=rests)
+            poses[:, :3] = np.round(slower * poses[:, :3] / step_m) * step_m
+            if step_rad:
+                turns_rad = Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_rotvec() * slower
+                turns = Rotation.from_rotvec(np.round(turns_rad / step_rad) * step_rad)
+                poses[:, 3:] = turns.as_quat()[:, [3, 0, 1, 2]]
+            # As they are stored.
+            assert found(t_ns, poses.astype(np.float32), rate_hz) == []
 
 
 @pytest.mark.parametrize("shape", [(0, 7), (1, 7), (2, 7)])
