@@ -239,14 +239,17 @@ def _check_head(bodies: _Bodies, *, of_robot: bool = False) -> ImplausibleBody |
 
 
 def _check_wrists(bodies: _Bodies) -> ImplausibleBody | None:
-    """A person's hand may turn to the face, hardly all the time."""
+    """A person's hand may turn to the face, hardly all the time.
+
+    Conjugates are not tried: a hand that rests turned to the face points forward by them.
+    """
     as_read = {name: bodies.forward(name) for name in WRISTS}
-    for turn, change in _TURNS.items():
-        read = {name: bodies.changed(change, name).forward(name) for name in WRISTS}
-        right = {name: max(as_read[name], read[name]) for name in WRISTS}
-        for name in WRISTS:
-            if as_read[name] <= 1 - ALWAYS_SHARE and min(right.values()) >= ALWAYS_SHARE:
-                return _compared(name, "pointing forward", (as_read[name], read[name]), turn)
+    read = {name: bodies.changed(_TURNS[_XYZW], name).forward(name) for name in WRISTS}
+    if min(max(as_read[name], read[name]) for name in WRISTS) < ALWAYS_SHARE:
+        return None
+    for name in WRISTS:
+        if as_read[name] <= 1 - ALWAYS_SHARE:
+            return _compared(name, "pointing forward", (as_read[name], read[name]), _XYZW)
     return None
 
 
