@@ -14,7 +14,7 @@ from services.alignment.calibration.tactile_tare import (
     TaxelTare,
     measure_tare,
 )
-from services.alignment.calibration.taxel_faults import unusable_taxels
+from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0
@@ -46,7 +46,7 @@ def _non_finite(check: Check) -> None:
     counts = _take(10.0)
     counts[:, _CELLS[3]] = np.nan
     found = _calibration(np.full(360, _GAIN))
-    refused = unusable_taxels(found, [counts])
+    refused = unusable_taxels(found, taxel_faults(found, [counts]))
     kpa = found.to_kpa(counts, refused=refused)
     check.true("an absent taxel is named and zero", refused[3] > 0 and not kpa[:, 3].any())
     check.finite("pressures", kpa)

@@ -223,10 +223,12 @@ def station_overview(station: Station) -> StationOverview:
     """The station in a few values, for a page that shows many stations."""
     health, recorder = station.health.report(), station.recorder.status()
     ages_s = [stream.age_s for stream in health.streams if stream.age_s is not None]
+    widest = next((cause for cause in health.causes if cause.level == health.level), None)
     return StationOverview(
         station=station.name,
         level=health.level,
-        cause=next((c.message for c in health.causes if c.level == health.level), ""),
+        cause=widest.message if widest else "",
+        advice=widest.advice if widest else "",
         recorder=recorder.state,
         task=recorder.prompt.task if recorder.prompt else None,
         duration_s=recorder.duration_s,

@@ -12,7 +12,7 @@ from dextouch.errors import DeviceError, NotFoundError, StaleDataError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.images import encode_jpeg
 from dextouch.schemas import CameraLive, Matrix, SimulatedFault
-from dextouch.streams import H264_UNIT, Sample, StreamDescriptor, StreamKind
+from dextouch.streams import H264_UNIT, MOUNTS, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
@@ -28,12 +28,6 @@ CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.
 LEAST_NORM = 1e-6
 MAX_AGE_NS = 500_000_000
-# Calibration of each tracker's mount on its body (docs/streams.md).
-MOUNTS = {
-    "wrist_left": "T_tracker_left_wrist_left",
-    "wrist_right": "T_tracker_right_wrist_right",
-    "head": "T_tracker_head_camera_head",
-}
 
 
 class Station:

@@ -24,6 +24,7 @@ from dextouch.hands.hand_files import load_hand
 from dextouch.jobs import Workers, run_jobs
 from dextouch.schemas import json_ready, load_scene_objects
 from dextouch.serving import load_settings
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
 from services.alignment.retargeting.hand_retargeter import calibrated_profile
@@ -308,6 +309,11 @@ def _implausible(report: AlignmentReport) -> list[str]:
         for name, count in report.quality.items()
         for what, text in texts.items()
         if name.endswith(f"_num_{what}") and count
+    ]
+    found += [
+        f"{name.removesuffix('_highest_zero_kpa')}: the zero is {kpa:.1f} kPa above the tare"
+        for name, kpa in report.quality.items()
+        if name.endswith("_highest_zero_kpa") and kpa > CONTACT_THRESHOLD_KPA
     ]
     if num_steps := report.quality.get("num_steps_interpolated"):
         found.append(f"{num_steps:.0f} of {report.num_steps} steps interpolated across gaps")

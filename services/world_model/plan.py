@@ -4,16 +4,16 @@ The network runs on torch's meta device, which has shapes but no numbers, so tha
 be planned on a laptop. FLOPs are those of matrix products, convolutions and attention (two per
 multiplication and addition); memory is the largest sum of tensors that are alive at one time.
 Attention counts its whole matrix, which fused kernels do not store; working memory of convolutions,
-which depends on the library, is not counted. Training is planned from a few layers, since memory
-grows with their number linearly; there activations count in float32, also where products are
+which depends on the library, is not counted. Both are planned from a few layers, since they grow
+with their number linearly. In training activations count in float32, also where products are
 bfloat16.
 """
 
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass, replace
-from functools import cache
-from typing import Any, Final
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cache, partial
+from typing import Any, Final, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -37,7 +37,7 @@ _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
 _DECODING: Final = ("decode all images", "decode the last image")
 # Cards that choices of a training are compared with, in 1e9 bytes as all of the plan.
 _CARDS_GB: Final = (24, 80, 141)
-# Layers that training is planned from.
+# Layers that deeper models are planned from.
 _FEW_LAYERS: Final = (3, 4)
 # Text encoder of the published model, UMT5-XXL.
 _TEXT_ENCODER: Final = {
@@ -125,6 +125,9 @@ class TrainingPlan:
         return self.whole + shared // self.shards + gathered + max(self.step, self.encoding)
 
 
+PlanT = TypeVar("PlanT", Plan, TrainingPlan)
+
+
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Largest sum of the tensors made inside the context and alive at one time, in bytes."""
 
@@ -165,8 +168,9 @@ class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 def plan_table(config: NetworkConfig) -> str:
     """Plan as a text; for the full size in both precisions."""
-    plans = {"float32": plan_of(config)}
-    if config.wan is not None:
+    if config.wan is None:
+        plans = {"float32": plan_of(config)}
+    else:
         sizes = {one: config.wan.model_copy(update={"precision": one}) for one in _PRECISIONS}
         plans = {one: plan_of(config.model_copy(update={"wan": wan})) for one, wan in sizes.items()}
     columns = list(plans.values())
@@ -209,6 +213,30 @@ def plan_table(config: NetworkConfig) -> str:
 
 def plan_of(config: NetworkConfig) -> Plan:
     """Plan of one action chunk of the greatest length."""
+    return _of_depth(config.num_layers, partial(_plan_of, config))
+
+
+def _of_depth(depth: int, planned: Callable[[int], PlanT]) -> PlanT:
+    """A plan of many layers from those of few: each further one needs the same."""
+    if depth <= _FEW_LAYERS[-1]:
+        return planned(depth)
+    few, more = (planned(num_layers) for num_layers in _FEW_LAYERS)
+    return cast("PlanT", _further(few, more, depth - _FEW_LAYERS[-1]))
+
+
+def _further(few: object, more: object, num: int) -> object:
+    if isinstance(few, int) and isinstance(more, int):
+        return more + num * (more - few)
+    if isinstance(few, tuple) and isinstance(more, tuple):
+        return tuple(_further(one, other, num) for one, other in zip(few, more, strict=True))
+    if isinstance(few, Plan | TrainingPlan | Part | Work):
+        amounts = {name: _further(one, vars(more)[name], num) for name, one in vars(few).items()}
+        return type(few)(**amounts)  # type: ignore[arg-type]
+    return more
+
+
+def _plan_of(config: NetworkConfig, depth: int) -> Plan:
+    config = config.model_copy(update={"num_layers": depth})
     steps = config.max_steps - 1
     with torch.device("meta"), torch.no_grad():
         model = JointWorldModel(config).eval()
@@ -272,12 +300,7 @@ def training_plan(settings: TrainSettings, num_processes: int = 1) -> TrainingPl
         InvalidInputError: as `TrainSettings.with_adapters`.
     """
     settings = settings.with_adapters()
-    depth = settings.network.num_layers
-    if depth <= _FEW_LAYERS[-1]:
-        return _training_plan(settings, num_processes, depth)
-    few, more = (asdict(_training_plan(settings, num_processes, n)) for n in _FEW_LAYERS)
-    further = depth - _FEW_LAYERS[-1]
-    return TrainingPlan(**{n: more[n] + further * (more[n] - few[n]) for n in more})
+    return _of_depth(settings.network.num_layers, partial(_training_plan, settings, num_processes))
 
 
 def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> TrainingPlan:
@@ -388,20 +411,38 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
 
     context, steps = shared(), config.sampling_steps
     jobs: dict[str, tuple[int, Callable[[], Any]]] = {
-        "encode the first image": (1, lambda: model.first_latents(inputs)),
         "what sampler steps share": (1, shared),
         "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
+    }
+    kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
+    encoded, *decoded = _codec_work(_of_codec(config), num_steps)
+    return (encoded, *_counted(jobs, model, kept.values()), *decoded), memory_of(kept)
+
+
+@cache
+def _codec_work(config: NetworkConfig, num_steps: int) -> tuple[Work, ...]:
+    """Computations of codec and tokenizer, which are equal in both precisions and all depths."""
+    model, inputs = JointWorldModel(config).eval(), _inputs(config, num_steps)
+    first, noisy = _latents(model, num_steps)
+    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
+        "encode the first image": (1, lambda: model.first_latents(inputs)),
         _DECODING[0]: (1, lambda: model.decode(first, noisy)),
         _DECODING[1]: (1, lambda: model.decode(first, noisy, all_images=False)),
     }
-    kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
-    work = []
+    return _counted(jobs, model)
+
+
+def _counted(
+    jobs: Mapping[str, tuple[int, Callable[[], Any]]],
+    model: JointWorldModel,
+    kept: Iterable[Tensor] = (),
+) -> tuple[Work, ...]:
+    work, given = [], (*model.parameters(), *model.buffers(), *kept)
     for name, (times, run) in jobs.items():
-        given = (*model.parameters(), *model.buffers(), *kept.values())
         with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
             run()
         work.append(Work(name, times, counter.get_total_flops(), memory.peak_bytes))
-    return tuple(work), memory_of(kept)
+    return tuple(work)
 
 
 def _tensors_of(kept: object) -> list[Tensor]:

@@ -20,7 +20,10 @@ AT_S = 2.0
 LOOK_S = 7.0
 # About what these streams bring: two gloves of 360 counts, three poses of seven numbers.
 BYTES_A_S = 2 * 60 * 720 + 3 * 100 * 56
-SIMULATED = "This device is simulated: its fault script or the load of this computer causes it."
+SIMULATED = (
+    "This device is simulated: a fault button of the Station page (Unplug: key F), its fault "
+    "script or the load of this computer causes it."
+)
 
 
 class SetWallClock(VirtualClock):

@@ -27,6 +27,8 @@ MAX_EQUAL_IMAGES = 3
 # Cameras that send every image twice repeat half of them; the share is over some 30 images.
 MAX_EQUAL_SHARE = 0.4
 EQUAL_SHARE_IMAGES = 30
+# So many images a buffer may repeat in turn.
+MAX_LOOP, MAX_AGAIN = 30, 10
 BLURRED_BELOW = 0.3
 # Before that many checks there is no session to compare with.
 MIN_SHARPNESSES = 10
@@ -46,7 +48,8 @@ MAX_WAITING_IMAGES = 8
 class ImageQuality:
     """Quality of the newest images of one camera, and counters since the start.
 
-    `frozen`: more than three images in a row were equal, or over 40 % equal the one before;
+    `frozen`: more than three images in a row were equal, more than ten were among the 30 before, or
+    over 40 % equal the one before;
     `blurred`: sharpness is below 0.3 of the session's median; `clipped_ratio`: pixels at the dark
     or the bright end; `gap`: an image is missing in the driver's timestamps within the last second.
     Sharpness and exposure are those of the checked images; dropped ones found the encoder's queue
@@ -110,8 +113,8 @@ class ImageChecker:
     def __init__(self, *, period_ns: int) -> None:
         self._period_ns = period_ns
         self._found = ImageQuality()
-        self._checksum: int | None = None
-        self._num_equal = 0
+        self._checksums: deque[int] = deque(maxlen=MAX_LOOP)
+        self._num_equal = self._num_again = 0
         self._equal_share = 0.0
         self._last_t_ns: int | None = None
         self._gap_seen_ns: int | None = None
@@ -133,15 +136,19 @@ class ImageChecker:
         """The next image as bytes that are equal only for equal images, such as its JPEG bytes."""
         self._found.num_images += 1
         checksum = zlib.crc32(data)
-        is_equal = checksum == self._checksum
+        recent = self._checksums
+        is_equal = bool(recent) and checksum == recent[-1]
+        # Those of a buffer come again in turn.
+        self._num_again = self._num_again + 1 if checksum in recent else 0
         if not is_equal and self._num_equal > MAX_EQUAL_IMAGES:
             # What was frozen is no camera that repeats its images.
             self._equal_share = 0.0
         self._num_equal = self._num_equal + 1 if is_equal else 1
-        self._checksum = checksum
+        self._checksums.append(checksum)
         self._equal_share += (is_equal - self._equal_share) / EQUAL_SHARE_IMAGES
         repeats = self._equal_share > MAX_EQUAL_SHARE
-        self._found.frozen = self._num_equal > MAX_EQUAL_IMAGES or repeats
+        is_held = self._num_equal > MAX_EQUAL_IMAGES
+        self._found.frozen = is_held or repeats or self._num_again > MAX_AGAIN
         self._found.num_frozen += self._found.frozen
         if t_ns is not None:
             self._note_stamp(t_ns)

@@ -43,7 +43,8 @@ CLOCK_CODES: Final = frozenset({"clock_step", "clock_skew", "clock_residual", "r
 MIN_SHARED_DEVICES = 2
 # Of a simulated device there is nothing to plug or to replace.
 SIMULATED_ADVICE: Final = (
-    "This device is simulated: its fault script or the load of this computer causes it."
+    "This device is simulated: a fault button of the Station page (Unplug: key F), its fault "
+    "script or the load of this computer causes it."
 )
 _ORDER: Final = tuple(CAUSES)
 Explained = list[tuple[StreamHealth, RaisedFinding]]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix, TaxelState
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import StreamDescriptor, TaxelFaults, neighbour_share, share_around
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.drivers.base import CellLayout, Decoder
@@ -52,32 +52,6 @@ DRIFT_NS = 10_000_000_000
 MAX_STEP_NS = 1_500_000_000
 PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
-
-
-def neighbour_share(
-    moved: Bool[np.ndarray, " taxels"],
-    layout: TactileLayout = DEXTOUCH_V1,
-    exists: Bool[np.ndarray, " taxels"] | None = None,
-) -> Float64[np.ndarray, " taxels"]:
-    """Share of the up to 8 neighbours on its pad that moved, for each taxel.
-
-    Only taxels that exist are neighbours; by default all do.
-    """
-    others = np.ones_like(moved) if exists is None else exists
-    stacks = zip(layout.split(moved), layout.split(others), strict=True)
-    return layout.join([share_around(*stack) for stack in stacks])
-
-
-def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
-
-    A cell that moved exists.
-    """
-    edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
-    padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
-    blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
-    num_moved, num = blocks.sum(axis=(-2, -1)) - blocks[..., 1, 1]
-    return num_moved / np.maximum(num, 1.0)
 
 
 class _PressureCheck(ABC):
@@ -199,8 +173,56 @@ class TaxelCheck(_PressureCheck):
         self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
         none = np.zeros(layout.num_taxels, dtype=np.bool_)
         self._refused = none if refused is None else refused
+        self._faults, self._faults_ns = self._begin(), 0
+        self._found: list[Finding] = []
+        # The readings at which it was found frozen, and since when.
+        self._frozen: tuple[np.ndarray, int] | None = None
         # Least reading of each half second of the last 10 s, with its time.
         self._lows: deque[tuple[int, np.ndarray]] = deque()
+
+    def __call__(self, evaluation: Evaluation) -> None:
+        """One evaluation."""
+        super().__call__(evaluation)
+        block = evaluation.block
+        if block.values is not None and len(block):
+            self._judge_faults(self._readings(block.values).astype(np.float64), evaluation)
+        evaluation.findings += self._found
+
+    def _begin(self) -> TaxelFaults:
+        return TaxelFaults(
+            self._tare_counts,
+            self._gain_counts_per_kpa,
+            usable=~self._refused & (self._indices != NO_CELL),
+            layout=self._layout,
+        )
+
+    def _judge_faults(self, taxels: np.ndarray, evaluation: Evaluation) -> None:
+        """What alignment finds in whole takes, in parts of 5 s."""
+        now_ns = evaluation.now_ns
+        if self._frozen is not None:
+            if (taxels == self._frozen[0]).all():
+                lasted_s = (now_ns - self._frozen[1]) * 1e-9
+                evaluation.judge("frozen", lasted_s, f"readings are frozen for {lasted_s:.0f} s")
+                return
+            self._frozen = None
+        self._faults.add(taxels)
+        self._faults_ns = self._faults_ns or now_ns
+        if now_ns - self._faults_ns < QUIET_NS:
+            return
+        judged, part = Evaluation(now_ns), self._faults
+        for one in part.repeats():
+            lasted_s = float(one.samples.mean()) * (now_ns - self._faults_ns) * 1e-9
+            judged.judge("frozen", lasted_s, one.message)
+            if one.samples[-1] and one.cause == "frozen":
+                self._frozen = taxels[-1], now_ns - round(lasted_s * 1e9)
+        for reason in ("random", "copied"):
+            if count := int(part.faults()[reason].sum()):
+                is_error = count >= CODES["taxels_dead"].error * self._layout.num_taxels
+                text = f"{count} taxels are {reason}"
+                judged.findings.append(
+                    Finding("implausible", "ERROR" if is_error else "WARN", text)
+                )
+        self._found, self._faults, self._faults_ns = judged.findings, self._begin(), 0
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
         taxels = values[:, self._indices]

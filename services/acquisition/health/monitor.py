@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from dextouch import schemas
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import BODIES, StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.follow_watch import FollowWatch
@@ -32,6 +32,7 @@ from services.acquisition.health.station import (
     tared_unix_s,
 )
 from services.acquisition.health.streams import (
+    BodiesCheck,
     CameraCheck,
     FiniteCheck,
     LinkCheck,
@@ -186,10 +187,13 @@ class HealthMonitor:
         self._supervisors = list(supervisors)
         self._clock = clock
         self._log = EventLog()
-        streams = [stream for s in supervisors for stream in _watch(s, calibration, paths)]
+        descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
+        # Heads and wrists of robots may be anywhere.
+        of_robot = any(descriptor.kind == "robot_state" for descriptor in descriptors)
+        bodies = None if of_robot else BodiesCheck(calibration)
+        streams = [stream for s in supervisors for stream in _watch(s, calibration, paths, bodies)]
         self._streams = {stream.name: stream for stream in streams}
         self.queues = {stream.name: stream.queue for stream in streams}
-        descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
         self.nominal_rates_hz = {d.name: d.nominal_rate_hz for d in descriptors}
         self.history = HealthHistory(list(self._streams))
         host = HostCheck()
@@ -324,7 +328,10 @@ class HealthMonitor:
 
 
 def _watch(
-    supervisor: DeviceSupervisor, calibration: Mapping[str, schemas.Matrix], paths: PathWatch | None
+    supervisor: DeviceSupervisor,
+    calibration: Mapping[str, schemas.Matrix],
+    paths: PathWatch | None,
+    bodies: BodiesCheck | None,
 ) -> list[_WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
@@ -341,6 +348,8 @@ def _watch(
         elif not descriptor.capabilities.sequence:
             judges.append(CountingCheck(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
+        if bodies is not None and descriptor.name in BODIES:
+            judges.append(bodies.of(descriptor.name))
         if "occluded" in driver.events():
             judges.append(TrackingCheck(supervisor.events))
         if paths is not None and paths.num_failures(descriptor.name) is not None:

@@ -47,9 +47,9 @@ MIN_OWN_MOVES = 10
 BLOCK = 600
 
 # Why a taxel of a take is not measured: what the calibration says, that it has no reading, that its
-# readings have nothing to do with those before, or that they lie below its tare.
-REASONS = (*STATES, "absent", "random", "below_tare")
-ABSENT, RANDOM, BELOW_TARE = (len(STATES) + number for number in range(3))
+# readings have nothing to do with those before, lie below its tare, or are those of another one.
+REASONS = (*STATES, "absent", "random", "below_tare", "copied")
+ABSENT, RANDOM, BELOW_TARE, COPIED = (len(STATES) + number for number in range(4))
 NO_CELL = -1
 # A glove of 16 bits has a full scale above 50 kPa.
 MIN_FULL_SCALE_KPA = 50.0

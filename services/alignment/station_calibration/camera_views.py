@@ -166,8 +166,9 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
         width_px, height_px = named_matrix(matrices, f"image_size_{camera}_px", (1, 2))[0]
     except NotFoundError as error:
         raise NotFoundError(
-            f"{error.message}. First: dextouch station calibrate camera --camera {camera} "
-            f"--to {folder} …"
+            f"{folder}: no calibration there of the lens of camera {camera}. "
+            f"First: the row 'Camera {camera}: lens' of the Calibration page, Guided run; or in a "
+            f"shell: dextouch station calibrate camera --camera {camera} --to {folder}"
         ) from error
     K[:2, 2] -= PIXEL_SHIFT_PX
     return Lens(K, distortion[0]), (int(width_px), int(height_px))

@@ -25,7 +25,7 @@ from services.alignment.synchronization.grid_actions import (
 )
 from services.alignment.synchronization.plausible_streams import (
     CheckedStream,
-    check_quaternion_order,
+    check_bodies,
     checked_stream,
 )
 from services.alignment.synchronization.recorded_streams import (
@@ -116,7 +116,7 @@ def build_episode(
         for name, stream in streams.items()
     }
     streams = {name: one.stream for name, one in checked.items()}
-    check_quaternion_order(streams, recording.attributes.domain)
+    check_bodies(streams, recording.attributes.domain)
     stretch = _find_stretch(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded

@@ -20,9 +20,17 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import distortion_of, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
-from dextouch.streams import ENCODED_UNITS, H264_UNIT, HEAD_CAMERA, StreamDescriptor, encoded_values
+from dextouch.streams import (
+    ENCODED_UNITS,
+    H264_UNIT,
+    HEAD_CAMERA,
+    MOUNTS,
+    Implausible,
+    StreamDescriptor,
+    encoded_values,
+)
 from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration
-from services.alignment.calibration.taxel_faults import unusable_taxels
+from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,
@@ -40,12 +48,6 @@ from services.alignment.synchronization.stream_clock import TimedStream, time_st
 if TYPE_CHECKING:
     from services.alignment.markers import TrackedObject
 
-# Where the tracked body sits in what the tracker follows, by stream.
-MOUNTS = {
-    "wrist_left": "T_tracker_left_wrist_left",
-    "wrist_right": "T_tracker_right_wrist_right",
-    "head": "T_tracker_head_camera_head",
-}
 # A robot may report its wrists in its own base, whose pose in the world is calibrated.
 BASE_FRAME = "base"
 BASE_NAME = "T_world_base"
@@ -85,7 +87,7 @@ class DatedStream:
 
     `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
     matrices that the episode carries beside those of the recording. `unseen` are keypoints that are
-    not to be believed, which become NaN.
+    not to be believed, which become NaN, and `implausible` samples that were found on the way.
     """
 
     recording: RecordingReader
@@ -95,6 +97,7 @@ class DatedStream:
     quality: dict[str, float] = field(default_factory=dict)
     calibration: dict[str, Matrix] = field(default_factory=dict)
     unseen: Bool[np.ndarray, "n nodes"] | None = None
+    implausible: tuple[Implausible, ...] = ()
 
     @property
     def name(self) -> str:
@@ -230,16 +233,22 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     glove = TactileCalibration.from_record(
         calibration, side, num_cells=num_cells, stream=name, layout=layout
     )
-    refused = unusable_taxels(glove, (piece.values for piece in raw.pieces()))
+    take = taxel_faults(
+        glove, (piece.values for piece in raw.pieces()), raw.descriptor.tactile_layout
+    )
+    refused = unusable_taxels(glove, take)
     quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
     for state in np.unique(refused[refused > 0]).tolist():
         quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))
+    if len(take.zero_kpa):
+        quality[f"{name}_highest_zero_kpa"] = float(take.zero_kpa.max())
     in_kpa = {"shape": (len(glove.cells),), "dtype": "float32", "unit": "kPa"}
     return replace(
         raw,
         descriptor=raw.descriptor.model_copy(update=in_kpa),
         convert=partial(glove.to_kpa, refused=refused),
         quality=quality,
+        implausible=tuple(take.repeats()),
         calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
 

@@ -17,6 +17,7 @@ from dextouch.clocks import (
 from dextouch.errors import ClockFitError
 from dextouch.schemas import ClockMethod, ClockReport, ClockWarning
 from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
+from services.alignment.synchronization.resampling import runs_of
 
 NS_PER_MS = 1e6
 MIN_COUNTED_SAMPLES = 60
@@ -32,6 +33,8 @@ MAX_STAMPED_LATENESS_NS = 1e6
 MIN_UNIT_RATIO = 20.0
 # Of the blocks of samples between which a clock may step; chosen: all but one of ten.
 MIN_OFF_SHARE = 0.9
+# So many blocks in turn show a unit that changes within the take.
+MIN_OFF_BLOCKS = 3
 UNITS = {
     1e3: "microseconds taken for nanoseconds",
     1e6: "milliseconds taken for nanoseconds",
@@ -40,7 +43,7 @@ UNITS = {
     1e-6: "nanoseconds taken for milliseconds",
 }
 # Stamps of consecutive samples that are cut to a step take several multiples of it, each as often.
-MIN_CUT_SHARE = 0.05
+MIN_CUT_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,8 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     stamped = numbered = None
     if has_time and not (has_sequence and prefers_sequence(tick_ns, period_ns)):
         device_ns = _unwrap(batch.t_device_ns, bits, tick_ns, batch)
-        _check_unit(device_ns, batch.t_host_ns, period_ns)
+        has_time = _keeps_unit(device_ns, batch.t_host_ns, period_ns, may_change=has_sequence)
+    if has_time and not (has_sequence and prefers_sequence(tick_ns, period_ns)):
         stamped = _fitted(device_ns, batch, descriptor, "device")
         # A stamp is cut down to whole ticks: on average the sample lies half a tick later. The fit
         # does not see it, as it hangs on the stamps that were cut least.
@@ -158,27 +162,39 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     return _counted(batch, period_ns)
 
 
-def _check_unit(device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int) -> None:
-    """Refuse stamps of another unit, by blocks of samples: the clock may step between them."""
+def _keeps_unit(
+    device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int, *, may_change: bool
+) -> bool:
+    """Refuse stamps of another unit, by blocks of samples: the clock may step between them.
+
+    Returns:
+        False where the unit is another one for a part of the time, and `may_change`.
+    """
     edges = np.arange(0, len(device_ns), MIN_COUNTED_SAMPLES)
     if len(edges) < 2:
-        return
+        return True
     device_ns, host_ns = (
         np.diff(times[edges]) / MIN_COUNTED_SAMPLES for times in (device_ns, t_host_ns)
     )
     known = (device_ns > 0) & (host_ns > 0)
     if not known.any():
-        return
-    ratios = np.stack([period_ns / device_ns[known], host_ns[known] / device_ns[known]])
+        return True
+    device_ns, host_ns = device_ns[known], host_ns[known]
+    ratios = np.stack([period_ns / device_ns, host_ns / device_ns])
     is_off = (ratios > MIN_UNIT_RATIO).all(axis=0) | (ratios < 1 / MIN_UNIT_RATIO).all(axis=0)
-    if is_off.mean() < MIN_OFF_SHARE:
-        return
+    lasts = (
+        max((stop - start for start, stop in runs_of(np.asarray(is_off))), default=0)
+        >= MIN_OFF_BLOCKS
+    )
+    if is_off.mean() < MIN_OFF_SHARE and (not lasts or may_change):
+        return not lasts
+    ratios, device_ns, host_ns = ratios[:, is_off], device_ns[is_off], host_ns[is_off]
     ratio = float(np.median(ratios[0]))
     alike = [what for unit, what in UNITS.items() if 0.5 < ratio / unit < 2]
     hint = f": these look like {alike[0]}" if alike else ""
     raise ClockFitError(
-        f"got {np.median(device_ns[known]):.4g} ns between the device's stamps, expected "
-        f"{period_ns:.4g} ns (samples arrive every {np.median(host_ns[known]):.4g} ns){hint}; send "
+        f"got {np.median(device_ns):.4g} ns between the device's stamps, expected "
+        f"{period_ns:.4g} ns (samples arrive every {np.median(host_ns):.4g} ns){hint}; send "
         "stamps in the declared unit (docs/device_packets.md)",
         fault="unit",
     )

@@ -86,6 +86,7 @@ function choose(item) {
   const hasBoard = isOfCamera({ request: item.run });
   setText(find("begin_title"), runTitle(item.run));
   setText(find("begin_step"), item.step);
+  setText(find("begin_note"), "");
   find("board").value = isPractised ? "chessboard:9x6:25mm" : kept("board") ?? "charuco:5x7:30mm:22mm";
   for (const id of ["board_field", "board_help"]) find(id).hidden = !hasBoard;
   const numKept = item.num_kept_places;
@@ -112,11 +113,10 @@ async function begin(event) {
 
 async function act(action) {
   try {
-    setText(find("run_message"), "");
-    setText(find("calibration_note"), "");
+    for (const id of ["run_message", "begin_note", "calibration_note"]) setText(find(id), "");
     await action();
   } catch (error) {
-    const place = find("run").hidden ? find("calibration_note") : find("run_message");
+    const place = find(!find("run").hidden ? "run_message" : find("begin").hidden ? "calibration_note" : "begin_note");
     place.dataset.level = "ERROR";
     setText(place, error.message);
   }

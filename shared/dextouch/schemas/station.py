@@ -327,14 +327,15 @@ class StationHealth(FrozenModel):
 class StationOverview(FrozenModel):
     """A station in a few values.
 
-    `cause` is the widest cause of its level, `age_s` that of the newest sample of any stream.
-    `layouts` are those of its gloves by hand, where they are not `dextouch_v1`; in messages each is
-    one JSON text.
+    `cause` is the widest cause of its level and `advice` what to do about it, `age_s` the age of
+    the newest sample of any stream. `layouts` are those of its gloves by hand, where they are not
+    `dextouch_v1`; in messages each is one JSON text.
     """
 
     station: str
     level: HealthLevel
     cause: str
+    advice: str = ""
     recorder: RecorderState
     task: str | None = None
     duration_s: float | None = None

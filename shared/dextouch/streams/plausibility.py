@@ -6,18 +6,27 @@ unit, for example) is named with the values that were found.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, chain_indices
+from dextouch.streams.repeats import (
+    MIN_STEPS,
+    MIN_STILL_STEPS,
+    Implausible,
+    ImplausibleCause,
+    implausible_repeats,
+    spread,
+    still_parts,
+)
 from dextouch.streams.samples import StreamDescriptor
 from dextouch.tactile.layout import SIDES
 
-ImplausibleCause = Literal["unit", "norm", "speed", "limits", "jump", "frozen", "repeated"]
 # World records of throwing reach 8 m/s at the wrist; what people do with objects stays below 3.
 MAX_SPEED_M_S: Final = 10.0
 MAX_TURN_RAD_S: Final = 60.0
@@ -33,33 +42,21 @@ MAX_WRONG_SHARE: Final = 0.05
 # to where a hand (of 3 m/s at most) is meanwhile, and is off the way there by more than noise.
 MAX_OUTLIER_NS: Final = 300_000_000
 MAX_RETURN_M_S: Final = 3.0
-MIN_AWAY_M: Final = 0.05
+MIN_AWAY_M: Final = 0.02
 MIN_OUTLIER_M: Final = 0.005
 OUTLIER_SIGMAS: Final = 12.0
+# Of turns of the wrist, whose speeds reach 60 rad/s within 20 ms at most.
+MIN_LEAP_RAD: Final = 0.05
+MAX_ACCELERATION_RAD_S2: Final = 3000.0
+# Across lost samples, mean speeds differ by less from those before and after.
+MAX_CHANGE_M_S: Final = 2.0
+MAX_CHANGE_RAD_S: Final = 15.0
 MAX_NORM_ERROR: Final = 0.1
-# As many equal steps may be a frozen stream.
-MIN_FROZEN_STEPS: Final = 5
-MAX_EQUAL_SHARE: Final = 0.01
-MIN_STEPS: Final = 60
-# A held value: so many of the intervals between changes are as long as the mean, up or down.
-MIN_REGULAR_SHARE: Final = 0.85
-MAX_HELD: Final = 20
-MIN_HELD: Final = 1.2
-MIN_CHANGES: Final = 20
-# Second differences of white noise turn back (a cosine of -2/3), those of a movement do not.
-MAX_NOISE_COSINE: Final = -0.2
-# Noise hardly ever gives a number twice; where numbers repeat they are rounded, and rounded values
-# may rest.
-MIN_DISTINCT_SHARE: Final = 0.9
-NOISE_ROWS: Final = 20_000
-# A device that was frozen leaps: its steps before were no less than so much of those after, and the
-# leap is as many of these, and a centimetre (or a hundredth of a radian) at least, or very many.
-STOP_SHARE: Final = 0.25
-CATCH_UP_STEPS: Final = 4.0
-MIN_CATCH_UP: Final = 0.01
-SURE_CATCH_UP_STEPS: Final = 20.0
 # Focal lengths in widths of the image: fisheyes have 0.2, telephoto lenses 10.
 FOCAL_WIDTHS: Final = (0.1, 20.0)
+# Lenses are centred to some percent of the image's size; the matrix of an image of half the size is
+# off by a quarter.
+MAX_OFF_CENTRE: Final = 0.2
 # How far joints of a real hand are beyond the limits of its model.
 LIMIT_SLACK_RAD: Final = 0.35
 # Inches are too near to centimetres to be known by their size.
@@ -70,27 +67,9 @@ _USUAL_DISTANCE_M: Final = 0.7
 _USUAL_SPEED_M_S: Final = 0.4
 _USUAL_RATIO: Final = 50.0
 _NS_PER_S: Final = 1e9
-
-
-@dataclass(frozen=True)
-class Implausible:
-    """One reason not to believe samples of a stream.
-
-    Attributes:
-        cause: what is wrong.
-        message: what was found and what was expected.
-        samples: those concerned; they can be left out unless `whole`.
-        whole: the values mean something else throughout.
-        factor: how many samples a held value has on average; 1 of all else.
-        harmless: they may as well be kept, since the device went on where it was.
-    """
-
-    cause: ImplausibleCause
-    message: str
-    samples: Bool[np.ndarray, " n"]
-    whole: bool = False
-    factor: float = 1.0
-    harmless: bool = False
+# A tracker on a person is centimetres off the joints about which it turns.
+MIN_LEVER_M: Final = 1e-3
+MIN_LEVER_RAD: Final = 0.2
 
 
 def implausible_values(
@@ -113,6 +92,8 @@ def implausible_values(
     elif descriptor.kind == "keypoints":
         # Gloves whose sensors are coarse rest, too.
         found = list(implausible_repeats(values, what="keypoints", may_lock=True))
+        if values.shape[1:] == (NUM_KEYPOINTS, 3):
+            found += _standing_nodes(values, found)
     elif descriptor.kind == "robot_state" and descriptor.unit == "rad":
         lower_rad, upper_rad = _limits_rad()
         if values.shape[1:] != lower_rad.shape:
@@ -164,9 +145,31 @@ def implausible_poses(
             return found
     known = np.flatnonzero(is_seen & ~is_wrong)
     seen, seen_ns = values[known], np.asarray(t_ns)[known]
-    speeds_m_s, turns_rad_s = _speeds(seen_ns, seen, period_ns)
+    if (wrong := _implausible_size(seen_ns, seen, period_ns)) is not None:
+        cause, message = wrong
+        return [Implausible(cause, message, everything, whole=True)]
+    # Only a leap between samples that follow each other shows that one was frozen before.
+    follows = np.diff(seen_ns) < 1.5 * period_ns
+    repeats = list(implausible_repeats(seen, can_rest=can_rest, follows=follows))
+    if not can_rest:
+        repeats += _standing(seen, repeats)
+    found += [replace(one, samples=spread(one.samples, known, len(values))) for one in repeats]
+    new = known[~np.any([one.samples[known] for one in found], axis=0)] if found else known
+    jumps = spread(_outliers(np.asarray(t_ns)[new], values[new], period_ns), new, len(values))
+    if jumps.any():
+        num, more = int(jumps.sum()), ("" if jumps.sum() == 1 else "s")
+        message = f"{num} pose{more} away from those before and after, as nothing can move"
+        found.append(Implausible("jump", message, jumps))
+    return found
+
+
+def _implausible_size(
+    t_ns: np.ndarray, poses: np.ndarray, period_ns: int
+) -> tuple[ImplausibleCause, str] | None:
+    """Distances or speeds that no hand has: cause and message."""
+    speeds_m_s, turns_rad_s = _speeds(t_ns, poses, period_ns)
     fast = _is_fast(speeds_m_s, turns_rad_s)
-    distance_m = float(np.median(np.linalg.norm(seen[:, :3], axis=1)))
+    distance_m = float(np.median(np.linalg.norm(poses[:, :3], axis=1)))
     is_often = len(fast) >= 1 / MAX_WRONG_SHARE and fast.mean() > MAX_WRONG_SHARE
     if distance_m > MAX_DISTANCE_M or is_often:
         # Drivers drop what is too fast: there may be a single pose.
@@ -181,25 +184,62 @@ def implausible_poses(
         )
         hint = f": these look like {unit}, send metres" if unit else ""
         cause: ImplausibleCause = "unit" if unit else "speed"
-        return [Implausible(cause, f"{got}, {expected}{hint}", everything, whole=True)]
-    # Only a leap between samples that follow each other shows that one was frozen before.
-    follows = np.diff(seen_ns) < 1.5 * period_ns
-    repeats = implausible_repeats(seen, can_rest=can_rest, follows=follows)
-    found += [replace(one, samples=_spread(one.samples, known, len(values))) for one in repeats]
-    new = known[~np.any([one.samples[known] for one in found], axis=0)] if found else known
-    jumps = _spread(_outliers(np.asarray(t_ns)[new], values[new], period_ns), new, len(values))
-    if jumps.any():
-        num, more = int(jumps.sum()), ("" if jumps.sum() == 1 else "s")
-        message = f"{num} pose{more} away from those before and after, as nothing can move"
-        found.append(Implausible("jump", message, jumps))
-    return found
+        return cause, f"{got}, {expected}{hint}"
+    return None
 
 
-def _spread(marked: np.ndarray, at: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
-    """Marks of some samples among all of them."""
-    everywhere = np.zeros(count, dtype=bool)
-    everywhere[at[marked]] = True
-    return everywhere
+def _standing_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+    """Fingers that repeat what they were, and nodes that stand still though they are noisy."""
+    moved, rested = np.zeros((2, *keypoints.shape[:2]), dtype=bool)
+    for chain in CHAINS:
+        nodes = np.array(chain_indices(chain))
+        for one in implausible_repeats(keypoints[:, nodes], what=chain, may_lock=True):
+            (rested if one.harmless else moved)[np.ix_(one.samples, nodes)] = True
+    for node, gone, harmless in still_parts(keypoints.astype(np.float64)):
+        moved[:, node] |= gone
+        rested[:, node] |= harmless
+    known = np.any([one.samples for one in repeats], axis=0) if repeats else False
+    for found, is_harmless in ((moved, False), (rested & ~moved, True)):
+        nodes = found & ~np.reshape(known, (-1, 1))
+        if nodes.any():
+            chains = [c for c in CHAINS if nodes[:, list(chain_indices(c))].any()]
+            message = f"{', '.join(chains)} frozen in {nodes.any(axis=1).sum()} samples"
+            yield Implausible(
+                "frozen", message, nodes.any(axis=1), harmless=is_harmless, nodes=nodes
+            )
+
+
+def _standing(poses: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+    """One axis or the rotation stands still while the others move, or all of it does nearly."""
+    flips = (poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0
+    turns = poses[:, 3:] * np.cumprod(np.append(1, 1 - 2 * flips))[:, None]
+    moved, rested = np.zeros((2, len(poses)), dtype=bool)
+    names = []
+    for parts, of in ((poses[:, :3, None], "xyz"), (turns[:, None], ("rotation",))):
+        for part, gone, harmless in still_parts(parts):
+            moved, rested = moved | gone, rested | harmless
+            names.append(of[part])
+    known = np.any([one.samples for one in repeats], axis=0) if repeats else moved & False
+    for samples, is_harmless in ((moved & ~known, False), (rested & ~moved & ~known, True)):
+        if samples.sum() >= MIN_STILL_STEPS:
+            message = f"{', '.join(names)} of poses stand still in {samples.sum()} samples"
+            yield Implausible("frozen", message, samples, harmless=is_harmless)
+    way_m, turned_rad = _extent(poses)
+    if len(poses) >= MIN_STEPS and way_m < MIN_LEVER_M and turned_rad > MIN_LEVER_RAD:
+        message = (
+            f"poses turn by {np.degrees(turned_rad):.0f} degrees but stay within "
+            f"{way_m * 1e3:.2g} mm: positions are not tracked, or are in another unit"
+        )
+        yield Implausible("frozen", message, np.ones(len(poses), dtype=bool), whole=True)
+
+
+def _extent(poses: np.ndarray) -> tuple[float, float]:
+    """How far 95 % of the poses are from the middle, in m and rad."""
+    way_m = np.linalg.norm(poses[:, :3] - np.median(poses[:, :3], axis=0), axis=1)
+    middle = poses[len(poses) // 2, 3:]
+    lengths = np.linalg.norm(poses[:, 3:], axis=1) * np.linalg.norm(middle)
+    turns_rad = 2 * np.arccos(np.abs(poses[:, 3:] @ middle / lengths).clip(max=1.0))
+    return float(np.percentile(way_m, 95)), float(np.percentile(turns_rad, 95))
 
 
 def lasting_jumps(
@@ -211,8 +251,7 @@ def lasting_jumps(
     """
     if len(poses) < 2:
         return np.zeros(0, dtype=np.int64)
-    fast = _is_fast(*_speeds(t_ns, np.asarray(poses, dtype=np.float64), period_ns))
-    return np.flatnonzero(fast) + 1
+    return np.flatnonzero(_leaps(t_ns, np.asarray(poses, dtype=np.float64), period_ns)) + 1
 
 
 def implausible_joints(
@@ -242,159 +281,26 @@ def implausible_joints(
     return found
 
 
-def implausible_repeats(
-    values: np.ndarray,
-    *,
-    what: str = "values",
-    can_rest: bool = False,
-    may_lock: bool = False,
-    follows: Bool[np.ndarray, " steps"] | None = None,
-) -> Iterator[Implausible]:
-    """Values [n, …] that a device repeats: every one several times, or the last one for a while.
-
-    Equal values of a device whose values are not noisy are frozen only if it leaps afterwards.
-    Samples are consecutive: `follows` says whether each but the first came right after the one
-    before, None if all did. What is missing (NaN) in a tenth of them or more is left aside, and the
-    samples that miss anything else are none. Robots `can_rest`: they keep values exactly, though
-    they are noisy in motion. Gloves with coarse sensors `may_lock`: what they keep without a leap
-    is harmless.
-    """
-    rows = np.asarray(values).reshape(len(values), int(np.prod(np.shape(values)[1:])))
-    finite = np.isfinite(rows)
-    columns = finite.mean(axis=0) > 0.9 if len(rows) else finite.all(axis=0)
-    at = np.flatnonzero(finite[:, columns].all(axis=1))
-    rows = rows[np.ix_(at, columns)]
-    is_next = np.diff(at) == 1
-    if follows is not None:
-        is_next &= follows[at[1:] - 1]
-    equal = (rows[1:] == rows[:-1]).all(axis=1)
-    if len(equal) < MIN_STEPS or not equal.any() or not columns.any():
-        return
-    held, times = _held(equal)
-    if times > 1:
-        message = f"{what} come {times:.3g} times each: the device repeats what it has"
-        yield Implausible("repeated", message, _spread(held, at, len(values)), factor=times)
-    new = np.flatnonzero(~held)
-    rows, is_next = (
-        rows[new],
-        np.logical_and.reduceat(np.append(is_next, [True]), new)[: len(new) - 1],
-    )
-    frozen, harmless = _frozen(rows, is_next, can_rest=can_rest, may_lock=may_lock)
-    if frozen.any():
-        message = f"{what} are frozen in {frozen.sum()} samples, though they move before or after"
-        yield Implausible("frozen", message, _spread(frozen, at[new], len(values)))
-    if harmless.any():
-        message = (
-            f"{what} are the same in {harmless.sum()} samples, though they are noisy otherwise"
-        )
-        same = _spread(harmless, at[new], len(values))
-        yield Implausible("frozen", message, same, harmless=True)
-
-
-def _held(equal: np.ndarray) -> tuple[Bool[np.ndarray, " n"], float]:
-    """Samples that only repeat a value which is held for a number of samples, and this number.
-
-    A device that is at rest as well repeats its value for longer: of that, samples at that distance
-    remain.
-    """
-    none = np.zeros(len(equal) + 1, dtype=bool)
-    begins = np.concatenate([[0], np.flatnonzero(~equal) + 1])
-    lengths = np.diff(np.append(begins, len(none)))
-    usual = lengths[lengths <= 3 * np.median(lengths)]
-    if len(usual) < MIN_CHANGES:
-        return none, 1.0
-    times = float(usual[1:-1].mean())
-    is_regular = (usual == np.floor(times)) | (usual == np.ceil(times))
-    if not (MIN_HELD <= times <= MAX_HELD and is_regular.mean() >= MIN_REGULAR_SHARE):
-        return none, 1.0
-    since = np.arange(len(none)) - np.repeat(begins, lengths)
-    is_long = np.repeat(lengths > 3 * np.median(lengths), lengths)
-    again = np.where(is_long, since % max(1, round(times)) != 0, since > 0)
-    return np.asarray(again), times
-
-
-def _frozen(
-    rows: np.ndarray, is_next: np.ndarray, *, can_rest: bool, may_lock: bool
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Rows that repeat the one before for long: where the device moved, and where it rested.
-
-    At rest, only devices that are noisy otherwise are meant.
-    """
-    frozen, harmless = np.zeros((2, len(rows)), dtype=bool)
-    equal = (rows[1:] == rows[:-1]).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], equal, [False]]).astype(np.int8)))
-    runs = edges.reshape(-1, 2)
-    long = runs[runs[:, 1] - runs[:, 0] >= MIN_FROZEN_STEPS].tolist()
-    for start, stop in long:
-        frozen[start + 1 : stop + 1] = True
-    is_noisy = not can_rest and _is_noisy(rows[~frozen], equal[~frozen[1:]])
-    for start, stop in long:
-        kept = slice(start + 1, stop + 1)
-        # What goes on where it was has lost nothing; of what ends so, nobody knows.
-        is_off = stop + 1 == len(rows) or _apart(rows[stop], rows[stop + 1]) > MIN_CATCH_UP
-        is_lost = is_noisy and is_off and not may_lock
-        frozen[kept] = is_lost or _catches_up(rows, is_next, start, stop)
-        harmless[kept] = is_noisy and not frozen[stop]
-    return frozen, harmless
-
-
-def _is_noisy(rows: np.ndarray, equal: np.ndarray) -> bool:
-    """Whether values are noisy: what hardly ever keeps a value keeps none for long."""
-    if len(equal) < MIN_STEPS or equal.mean() > MAX_EQUAL_SHARE:
-        return False
-    some = rows[:NOISE_ROWS].astype(np.float64)
-    num_distinct = np.array([len(np.unique(column)) for column in some.T])
-    # Half of the columns: a number near one, as of a small rotation, has few digits left.
-    if np.median(num_distinct[num_distinct > 1]) < MIN_DISTINCT_SHARE * len(some):
-        return False
-    steps = np.diff(some, axis=0)
-    bends = np.diff(steps, axis=0)
-    lengths = np.linalg.norm(bends, axis=1)
-    scale = lengths[1:] * lengths[:-1]
-    # A third of the steps, the smallest: noise shows where movement is slow.
-    slow = np.linalg.norm(steps[1:-1], axis=1)
-    known = (scale > 0) & (slow <= np.quantile(slow, 1 / 3))
-    cosines = (bends[1:] * bends[:-1]).sum(axis=1)[known] / scale[known]
-    return len(cosines) >= MIN_STEPS / 3 and bool(np.median(cosines) < MAX_NOISE_COSINE)
-
-
-def _apart(some: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(other.astype(np.float64) - some))
-
-
-def _catches_up(rows: np.ndarray, is_next: np.ndarray, start: int, stop: int) -> bool:
-    """Whether a value kept from `start` to `stop` was left at speed, and leaps to where that led.
-
-    What comes to rest is slow before, and a step after lost samples is no leap.
-    """
-    if start < 1 or not is_next[start - 1 : stop + 1].all() or stop + 3 > len(rows):
-        return False
-    steps = np.linalg.norm(np.diff(rows[start - 1 : stop + 7].astype(np.float64), axis=0), axis=1)
-    before, leap, after = steps[0], steps[stop - start + 1], steps[stop - start + 2 :]
-    usual = float(np.median(after)) if len(after) else 0.0
-    is_leap = leap > min(max(CATCH_UP_STEPS * usual, MIN_CATCH_UP), SURE_CATCH_UP_STEPS * usual)
-    return usual > 0 and bool(is_leap and before > STOP_SHARE * after.max())
-
-
 def check_camera_matrix(
     K: Float64[np.ndarray, "3 3"], size_px: tuple[int, int], *, where: str
 ) -> None:
     """Refuse a camera matrix (px) that no lens before images of width and height `size_px` has.
 
     Raises:
-        InvalidInputError: not finite, not of this form, a principal point outside the image, or
+        InvalidInputError: not finite, not of this form, a principal point far from the middle, or
             focal lengths below 0.1 or above 20 of its width, or unlike each other.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     width, height = size_px
     has_form = np.isfinite(K).all() and (K[[1, 2, 2, 2], [0, 0, 1, 2]] == [0, 0, 0, 1]).all()
-    is_inside = has_form and 0 < cx < width and 0 < cy < height
+    off = max(abs(cx / width - 0.5), abs(cy / height - 0.5)) if has_form else np.inf
     low, high = (width * factor for factor in FOCAL_WIDTHS)
-    if not (is_inside and low <= fx <= high and 0.5 <= fy / fx <= 2):
+    if not (off <= MAX_OFF_CENTRE and low <= fx <= high and 0.5 <= fy / fx <= 2):
         raise InvalidInputError(
             f"{where}: got focal lengths {fx:.4g}, {fy:.4g} and the principal point {cx:.4g}, "
             f"{cy:.4g} px for images of {width} by {height} px, expected {low:g} … {high:g} and a "
-            "point inside the image (rows fx 0 cx, 0 fy cy, 0 0 1); calibrate the camera again",
+            f"point within {MAX_OFF_CENTRE:g} of the image's size from its middle (rows fx 0 cx, "
+            "0 fy cy, 0 0 1); is it of another resolution? calibrate the camera again",
             fault="camera_matrix",
         )
 
@@ -424,13 +330,42 @@ def _unit(distance_m: float, speed_m_s: float | None) -> str | None:
     return name if off[name].max() <= np.log(_USUAL_RATIO) else None
 
 
+def _leaps(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.ndarray, " steps"]:
+    """Steps that are too fast, or further than those before and after lead at any acceleration.
+
+    A hand that hits something goes on at the speed before, the one after, or one between.
+    """
+    leaps = _is_fast(*_speeds(t_ns, poses, period_ns))
+    if len(poses) < MIN_STEPS:
+        return leaps
+    step_s = np.maximum(np.diff(t_ns), period_ns)[:, None] / _NS_PER_S
+    q = poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    cosines = (q[1:] * q[:-1]).sum(axis=1, keepdims=True)
+    # Twice the part of a quaternion that is across the one before: its turn, up to its cube.
+    turns_rad = 2 * (q[1:] * np.sign(cosines) - np.abs(cosines) * q[:-1])
+    for moves, least, change, acceleration in (
+        (np.diff(poses[:, :3], axis=0), MIN_OUTLIER_M, MAX_CHANGE_M_S, MAX_ACCELERATION_M_S2),
+        (turns_rad, MIN_LEAP_RAD, MAX_CHANGE_RAD_S, MAX_ACCELERATION_RAD_S2),
+    ):
+        speeds = moves / step_s
+        before, after = speeds[:-2] * step_s[1:-1], speeds[2:] * step_s[1:-1]
+        way = after - before
+        along = ((moves[1:-1] - before) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1e-18)
+        nearest = before + along.clip(0, 1)[:, None] * way
+        off = np.linalg.norm(moves[1:-1] - nearest, axis=1)
+        span_s = step_s[1:-1, 0]
+        possible = np.minimum(0.25 * acceleration * span_s, change) * span_s
+        needed = np.maximum(possible, max(least, OUTLIER_SIGMAS * float(np.median(off))))
+        leaps[1:-1] |= off > needed
+    return leaps
+
+
 def _outliers(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.ndarray, " n"]:
     """Poses between a way there and a way back that nothing can move."""
     outliers = np.zeros(len(poses), dtype=bool)
     if len(poses) < 2:
         return outliers
-    fast = _is_fast(*_speeds(t_ns, poses, period_ns))
-    steps = np.flatnonzero(fast)
+    steps = np.flatnonzero(_leaps(t_ns, poses, period_ns))
     at = 0
     while at + 1 < len(steps):
         first, last = int(steps[at]), int(steps[at + 1])

@@ -12,6 +12,7 @@ from services.acquisition.drivers.images import ImageQuality
 from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbour_share
 from services.acquisition.health.streams import (
+    BodiesCheck,
     CameraCheck,
     FiniteCheck,
     PlausibilityCheck,
@@ -22,6 +23,7 @@ from services.acquisition.health.streams import (
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
+from tests.unit.streams.test_bodies import person
 
 TARE, GAIN = 120.0, 40.0
 
@@ -72,6 +74,55 @@ def test_a_taxel_that_does_not_follow_its_neighbours_is_named(value, code):
     for _ in range(3):
         hand()
     assert hand().findings == []
+
+
+def test_random_copied_and_frozen_readings_of_a_noisy_glove_are_named():
+    rng = np.random.default_rng(0)
+    hand, last = Hand(pressed=False), np.zeros((60, 320))
+
+    def change(taxels, kind):
+        taxels += np.rint(2 * rng.standard_normal(taxels.shape))
+        if kind == "random":
+            taxels[:, 40:44] = rng.integers(0, 4000, (60, 4))
+        if kind == "copied":
+            taxels[:, 40] = taxels[:, 90]
+        if kind == "frozen":
+            taxels[:] = last[0]
+        last[:] = taxels
+
+    def told(kind, seconds=12):
+        found = {}
+        for _ in range(seconds):
+            found |= {f.code: f.message for f in hand(lambda taxels: change(taxels, kind)).findings}
+        return found
+
+    assert told("") == {}
+    assert told("random")["implausible"] == "4 taxels are random"
+    told("")
+    assert told("copied")["implausible"] == "2 taxels are copied"
+    told("")
+    # Half of the part of 5 s in which it begins.
+    told("", seconds=2)
+    assert "frozen" in told("frozen")
+
+
+def test_head_and_wrists_that_are_not_of_one_person_are_named_live():
+    poses = person()
+    t_s = np.arange(600) / 100
+    for change, named in (({}, None), ({"wrist_left": 39.37}, "wrist_left")):
+        check, found = BodiesCheck({}), {}
+        for name, of in poses.items():
+            scale = [change.get(name, 1)] * 3 + [1] * 4
+            for start in range(0, 600, 100):
+                part = slice(start, start + 100)
+                sent = block(t_s[part], of[part] * scale)
+                found[name] = judged(check.of(name), sent, round(t_s[part][-1] * 1e9)).findings
+        # Once more, when all are known.
+        for name in poses:
+            found[name] += judged(
+                check.of(name), block(t_s[:0], poses[name][:0]), 6 * 10**9
+            ).findings
+        assert {name for name, some in found.items() if some} == ({named} if named else set())
 
 
 def test_five_per_cent_a_whole_pad_or_a_whole_line_is_an_error():

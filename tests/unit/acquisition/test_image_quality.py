@@ -58,13 +58,21 @@ def test_frozen_means_more_than_three_equal_images_in_a_row(rng):
 
 
 def test_a_camera_that_sends_every_image_twice_is_frozen(rng):
-    some = [scene(rng) for _ in range(6)]
-    found = checked([some[number // 2 % 6] for number in range(120)])
+    some = [scene(rng) for _ in range(40)]
+    found = checked([some[number // 2 % 40] for number in range(120)])
     assert found[-1].frozen
     assert found[-1].num_frozen > 40
     # One of four that comes twice is a camera in a dim room, for example.
-    found = checked([some[number * 3 // 4 % 6] for number in range(240)])
+    found = checked([some[number * 3 // 4 % 40] for number in range(240)])
     assert not found[-1].frozen
+
+
+@pytest.mark.parametrize("num", [2, 3, 10, 30])
+def test_a_camera_that_sends_its_buffer_again_and_again_is_frozen(rng, num):
+    loop = [scene(rng) for _ in range(num)]
+    images = [*(scene(rng) for _ in range(40)), *(loop * (20 // num + 2))]
+    found = checked([*images, scene(rng)])
+    assert [found[at].frozen for at in (39, 40 + num + 11, -1)] == [False, True, False]
 
 
 def test_one_changed_pixel_in_an_edge_of_eight_is_a_new_image():

@@ -23,8 +23,13 @@ ROBOT = ("wrist_left", "wrist_right", "head", "joints_measured")
 def add_camera(store, recording_id, unit, t_ns, values):
     """The same recording with a camera, under another id."""
     old = store.recording(recording_id)
+    K_head = ((60.0, 0.0, 160.0), (0.0, 60.0, 120.0), (0.0, 0.0, 1.0))
     attributes = old.attributes.model_copy(
-        update={"recording_id": f"{recording_id}-camera", "streams": ()}
+        update={
+            "recording_id": f"{recording_id}-camera",
+            "streams": (),
+            "calibration": {"K_head": K_head},
+        }
     )
     camera = StreamDescriptor(
         name="camera_head",

@@ -1,5 +1,7 @@
 """Implausible values of a recording are left out of its episode, or refuse it, by their cause."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -8,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.schemas import matrix_rows
-from dextouch.streams import ClockCapabilities
+from dextouch.streams import NO_SEQUENCE, ClockCapabilities
 from services.alignment.calibration.tactile_tare import (
     BELOW_TARE,
     DEAD,
@@ -17,11 +19,11 @@ from services.alignment.calibration.tactile_tare import (
     STUCK,
     TactileCalibration,
 )
-from services.alignment.calibration.taxel_faults import unusable_taxels
+from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 from services.alignment.command_line import report_line
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization.plausible_streams import check_quaternion_order
+from services.alignment.synchronization.plausible_streams import check_bodies
 from services.alignment.synchronization.recorded_streams import date_stream
 from services.alignment.synchronization.stream_clock import time_stream
 from tests.unit.alignment import recordings
@@ -182,12 +184,12 @@ def swapped(poses):
 )
 def test_another_order_of_quaternions_is_refused_by_name(tmp_path, domain, stream):
     with pytest.raises(InvalidInputError, match=f"{stream}.*x, y, z, w; expected w") as refused:
-        check_quaternion_order(*dated(tmp_path, domain, only(stream, swapped)))
+        check_bodies(*dated(tmp_path, domain, only(stream, swapped)))
     assert refused.value.details["fault"] == "quaternion_order"
 
 
 def test_a_robot_that_a_camera_faces_and_bodies_without_rotation_are_accepted(tmp_path):
-    check_quaternion_order(*dated(tmp_path / "0", "robot", only("wrist_left", swapped)))
+    check_bodies(*dated(tmp_path / "0", "robot", only("wrist_left", swapped)))
 
     def unturned(name, values):
         if values.shape[1] == 7:
@@ -195,7 +197,7 @@ def test_a_robot_that_a_camera_faces_and_bodies_without_rotation_are_accepted(tm
         return values
 
     for domain in ("human", "robot"):
-        check_quaternion_order(*dated(tmp_path / domain, domain, unturned))
+        check_bodies(*dated(tmp_path / domain, domain, unturned))
 
 
 def test_order_of_quaternions_of_all_trackers(tmp_path):
@@ -227,7 +229,7 @@ def readings(calibration, *, noise=1.0, num=1200):
 
 def reasons_of(calibration, counts):
     # In pieces, as a recording is read.
-    states = unusable_taxels(calibration, np.array_split(counts, 7))
+    states = unusable_taxels(calibration, taxel_faults(calibration, np.array_split(counts, 7)))
     return {REASONS[code]: np.flatnonzero(states == code) for code in set(states.tolist()) - {0}}
 
 
@@ -274,8 +276,44 @@ def test_random_and_too_low_readings_of_some_taxels_and_of_all():
         (0 * counts + 900, "stuck"),
     ):
         with pytest.raises(InvalidInputError, match="left glove: readings of") as refused:
-            unusable_taxels(calibration, [bad])
+            unusable_taxels(calibration, taxel_faults(calibration, [bad]))
         assert refused.value.details["fault"] == fault
+
+
+def test_cells_that_copy_others_loose_and_deaf_ones_are_named():
+    _, calibration = glove()
+    cells, rng = calibration.cells, np.random.default_rng(2)
+    counts = readings(calibration)
+    # All that is around these moves; they show their noise only.
+    counts[:, cells[80:320]] += 2000 * np.clip(np.sin(np.arange(1200) / 40), 0, 1)[:, None]
+    counts[:, cells[200:204]] = np.rint(500 + rng.standard_normal((1200, 4)))
+    counts[:, cells[10]] = counts[:, cells[60]]
+    counts[:, cells[20]] *= rng.random(1200) < 0.8
+    found = {name: taxels.tolist() for name, taxels in reasons_of(calibration, counts).items()}
+    assert found == {"dead": [200, 201, 202, 203], "copied": [10, 60], REASONS[RANDOM]: [20]}
+
+
+def test_samples_that_a_glove_repeats_and_a_zero_that_has_moved():
+    _, calibration = glove()
+    counts = readings(calibration, num=1800)
+    assert taxel_faults(calibration, [counts]).repeats() == []
+    frozen = counts.copy()
+    frozen[700:900] = frozen[700]
+    (one,) = taxel_faults(calibration, np.array_split(frozen, 7)).repeats()
+    assert (one.cause, np.flatnonzero(one.samples).tolist()) == ("frozen", list(range(701, 900)))
+    looped = counts.copy()
+    looped[700:900] = looped[700 + np.arange(200) % 3]
+    (one,) = taxel_faults(calibration, np.array_split(looped, 7)).repeats()
+    assert (one.cause, one.samples.sum()) == ("frozen", 197)
+    (one,) = taxel_faults(calibration, [counts[np.arange(1800) // 3 * 3]]).repeats()
+    assert (one.cause, one.factor) == ("repeated", 3)
+    # A glove without noise may rest.
+    assert taxel_faults(calibration, [np.rint(0 * counts + 500)]).repeats() == []
+    moved = taxel_faults(calibration, [counts + np.linspace(0, 400, 1800)[:, None]])
+    assert moved.zero_kpa.max() == pytest.approx(8.3, abs=0.3)
+    with pytest.raises(InvalidInputError, match="tare the glove again") as refused:
+        unusable_taxels(calibration, taxel_faults(calibration, [65535 - counts]))
+    assert refused.value.details["fault"] == "baseline"
 
 
 def of_gain(factor):
@@ -289,12 +327,13 @@ def of_gain(factor):
 def test_gains_of_another_unit_are_refused_by_name():
     with pytest.raises(InvalidInputError, match="these look like counts/MPa"):
         of_gain(1e3)
+    large, counts = of_gain(1e-3)
     with pytest.raises(InvalidInputError, match="its gain looks like counts/Pa"):
-        unusable_taxels(*of_gain(1e-3))
+        unusable_taxels(large, taxel_faults(large, counts))
     # Gloves of 8 bits have small gains.
     few, (counts,) = of_gain(1 / 80)
     eight = np.rint(500 + (counts - 500) / 80)
-    assert not unusable_taxels(few, [eight]).any()
+    assert not unusable_taxels(few, taxel_faults(few, [eight])).any()
 
 
 def test_readings_that_are_missing_hide_no_change():
@@ -408,6 +447,21 @@ def test_stamps_of_another_unit_are_refused_by_name(unit):
     batch, descriptor = recordings.stamped(true_s, stamps_ns, 100)
     with pytest.raises(ClockFitError, match="taken for nanoseconds") as refused:
         time_stream(batch, descriptor)
+    assert refused.value.details["fault"] == "unit"
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e-3])
+def test_a_unit_that_changes_within_a_take(unit):
+    true_s = np.arange(3000) / 100
+    stamps_ns = np.rint(np.where(true_s < 10, true_s, true_s / unit) * 1e9).astype(np.int64)
+    batch, descriptor = recordings.stamped(true_s, stamps_ns, 100)
+    timed = time_stream(batch, descriptor)
+    assert (timed.report.method, len(timed.kept)) == ("sequence", 3000)
+    error_s = timed.t_host_ns / 1e9 - (recordings.START_NS / 1e9 + true_s)
+    assert np.abs(error_s - np.median(error_s)).max() < 1e-3
+    unnumbered = replace(batch, sequence=np.full(3000, NO_SEQUENCE))
+    with pytest.raises(ClockFitError, match="expected 1e") as refused:
+        time_stream(unnumbered, descriptor)
     assert refused.value.details["fault"] == "unit"
 
 

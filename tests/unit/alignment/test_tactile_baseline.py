@@ -10,7 +10,7 @@ from services.alignment.calibration.tactile_tare import (
     REASONS,
     TactileCalibration,
 )
-from services.alignment.calibration.taxel_faults import unusable_taxels
+from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 RNG = np.random.default_rng(0)
 TARE, GAIN = RNG.uniform(110, 130, 360), RNG.uniform(38, 42, 360)
@@ -24,7 +24,7 @@ def record(side, tare=TARE, gain=GAIN):
 
 
 def refused_taxels(glove, counts):
-    return unusable_taxels(glove, [counts])
+    return unusable_taxels(glove, taxel_faults(glove, [counts]))
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -92,11 +92,17 @@ async def test_a_tile_shows_the_take():
 async def test_a_glove_of_the_largest_layout_is_drawn_by_it():
     layout = largest_layout()
     overview = StationOverview(
-        station="a", level="OK", cause="", recorder="idle", layouts={"left": layout}
+        station="a",
+        level="OK",
+        cause="",
+        advice="Plug it in.",
+        recorder="idle",
+        layouts={"left": layout},
     )
     station = FakeStation("OK", **overview.model_dump(mode="json", exclude={"level"}))
     ((tile,), _) = await tiles(fleet_of({"a": station.upstream}))
     assert tile["layouts"] == {"left": json.loads(layout.model_dump_json())}
+    assert tile["advice"] == "Plug it in."
 
 
 async def test_a_station_that_hangs_is_stale_and_holds_up_no_other():

@@ -195,6 +195,95 @@ def test_a_noisy_stream_that_goes_on_where_it_was_lost_nothing():
     assert np.flatnonzero(one.samples).tolist() == list(range(321, 400))
 
 
+NOISE_RAD = 5e-4
+
+
+def noisy(rate_hz, seed=0):
+    """The same with noise of the rotation, too."""
+    t_ns, poses = movement(rate_hz, seed=seed)
+    noise = NOISE_RAD * np.random.default_rng([seed, 1]).standard_normal((len(poses), 3))
+    turn = Rotation.from_quat(poses[:, [4, 5, 6, 3]]) * Rotation.from_rotvec(noise)
+    poses[:, 3:] = turn.as_quat()[:, [3, 0, 1, 2]]
+    return t_ns, poses
+
+
+@pytest.mark.parametrize("columns", [[2], [0, 1, 2], [3, 4, 5, 6]], ids=["z", "position", "turn"])
+@pytest.mark.parametrize("dither", [0.0, 1e-7])
+@pytest.mark.parametrize("rate_hz", [100, 250])
+def test_a_part_of_noisy_poses_that_stands_still_is_located(rate_hz, columns, dither):
+    for seed in range(3):
+        t_ns, poses = noisy(rate_hz, seed)
+        assert found(t_ns, poses, rate_hz) == []
+        half = len(poses) // 2
+        ticks = np.random.default_rng(seed).integers(-1, 2, (half, len(columns)))
+        poses[half:, columns] = poses[half, columns] + dither * ticks
+        frozen = [one.samples for one in found(t_ns, poses, rate_hz) if one.cause == "frozen"]
+        # Runs begin and end where neighbours differ.
+        assert abs(np.any(frozen, axis=0).sum() - half) <= 3
+
+
+@pytest.mark.parametrize("lag", [2, 3, 10, 50])
+def test_a_buffer_that_comes_again_and_again_is_frozen(lag):
+    t_ns, poses = noisy(100)
+    poses[200:400] = poses[200 + np.arange(200) % lag]
+    (one,) = (one for one in found(t_ns, poses, 100) if one.cause == "frozen")
+    assert np.flatnonzero(one.samples).tolist() == list(range(200 + lag, 400))
+
+
+def test_values_held_for_a_part_of_the_time():
+    t_ns, poses = noisy(100)
+    at = np.arange(300, 600)
+    poses[at] = poses[300 + (at - 300) // 3 * 3]
+    (one,) = (one for one in found(t_ns, poses, 100) if one.cause == "repeated")
+    assert np.array_equal(np.flatnonzero(one.samples), at[(at - 300) % 3 > 0])
+    assert one.factor == 1
+
+
+def test_a_tracker_that_turns_in_one_place_knows_no_positions():
+    t_ns, poses = noisy(100)
+    poses[:, :3] *= 1e-3
+    whole = [one for one in found(t_ns, poses, 100) if one.whole]
+    assert [one.cause for one in whole] == ["frozen"]
+
+
+@pytest.mark.parametrize(("rate_hz", "leap_m"), [(30, 0.12), (60, 0.06), (100, 0.03), (250, 0.02)])
+def test_small_leaps_of_a_trackers_world_are_found(rate_hz, leap_m):
+    for seed in range(5):
+        t_ns, poses = noisy(rate_hz, seed)
+        period_ns = round(1e9 / rate_hz)
+        assert lasting_jumps(t_ns, poses, period_ns=period_ns).tolist() == []
+        poses[200:, 1] += leap_m
+        assert lasting_jumps(t_ns, poses, period_ns=period_ns).tolist() == [200]
+
+
+def test_noise_that_rises_and_quick_motion_are_no_standstill():
+    t_ns, poses = noisy(100)
+    poses[400:, :3] += 0.01 * np.random.default_rng(3).standard_normal((len(poses) - 400, 3))
+    assert [one.cause for one in found(t_ns, poses, 100) if one.cause == "frozen"] == []
+    # 3 m/s and 40 m/s², to and fro.
+    t_ns, poses = noisy(100)
+    poses[:, 0] += 3**2 / 40 * np.sin(40 / 3 * t_ns / 1e9)
+    assert found(t_ns, poses, 100) == []
+    assert len(lasting_jumps(t_ns, poses, period_ns=10**7)) == 0
+
+
+def test_nodes_of_a_hand_that_stand_still_are_named():
+    rng = np.random.default_rng(0)
+    waves = gaussian_filter1d(rng.standard_normal((900, 25, 3)), 40, axis=0)
+    keypoints = 0.02 * waves / waves.std() + 4e-4 * rng.standard_normal(waves.shape)
+    descriptor = StreamDescriptor(
+        name="keypoints_left", kind="keypoints", shape=(25, 3), dtype="float32", unit="m",
+        nominal_rate_hz=120,
+    )  # fmt: skip
+    t_ns = np.rint(np.arange(900) * 1e9 / 120).astype(np.int64)
+    assert implausible_values(descriptor, t_ns, keypoints) == []
+    keypoints[300:, 9] = keypoints[300, 9] + 1e-7 * rng.standard_normal((600, 3))
+    (one,) = implausible_values(descriptor, t_ns, keypoints)
+    assert "index" in one.message
+    assert np.flatnonzero(one.nodes.any(axis=0)).tolist() == [9]
+    assert abs(one.nodes[:, 9].sum() - 599) <= 1
+
+
 @pytest.mark.parametrize("times", [2, 3, 4])
 def test_values_that_come_several_times(times):
     t_ns, poses = movement(120)
@@ -270,13 +359,14 @@ def test_a_real_hand_is_not_frozen_until_it_is():
     "change",
     [
         {(0, 2): 700.0},
+        {(0, 0): 250.0, (1, 1): 250.0, (0, 2): 160.0, (1, 2): 120.0},
         {(1, 2): -3.0},
         {(0, 0): 5.0},
         {(0, 0): 1500.0},
         {(2, 2): 0.0},
         {(0, 0): 1e9},
     ],
-    ids=["right of it", "above it", "short", "unequal", "form", "long"],
+    ids=["right of it", "of half the size", "above it", "short", "unequal", "form", "long"],
 )
 def test_camera_matrices_that_no_lens_has(change):
     K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -363,9 +453,21 @@ def test_two_worlds_of_a_tracker_are_no_outliers():
     assert lasting_jumps(t_ns, poses, period_ns=round(1e9 / 60)).tolist() == [200, 212]
 
 
-def test_rounded_poses_may_rest():
-    t_ns, poses = movement(120, rests=True)
-    assert found(t_ns, np.round(poses, 3), 120) == []
+@pytest.mark.parametrize("rate_hz", [30, 60, 120])
+@pytest.mark.parametrize("step_m", [0.0001, 0.001, 0.002])
+@pytest.mark.parametrize("step_rad", [0.0, np.radians(0.1)])
+@pytest.mark.parametrize("noise_m", [0.00005, 0.0005])
+def test_rounded_poses_may_rest_and_move_slowly(rate_hz, step_m, step_rad, noise_m):
+    for seed in range(3):
+        for rests, slower in ((True, 1.0), (False, 0.1)):
+            t_ns, poses = movement(rate_hz, seed=seed, noise_m=noise_m, rests=rests)
+            poses[:, :3] = np.round(slower * poses[:, :3] / step_m) * step_m
+            if step_rad:
+                turns_rad = Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_rotvec() * slower
+                turns = Rotation.from_rotvec(np.round(turns_rad / step_rad) * step_rad)
+                poses[:, 3:] = turns.as_quat()[:, [3, 0, 1, 2]]
+            # As they are stored.
+            assert found(t_ns, poses.astype(np.float32), rate_hz) == []
 
 
 @pytest.mark.parametrize("shape", [(0, 7), (1, 7), (2, 7)])

@@ -15,6 +15,7 @@ from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import LoraSettings, TrainCommand
 from services.world_model.plan import (
     PeakMemory,
+    _plan_of,
     _training_plan,
     plan_of,
     plan_table,
@@ -117,6 +118,21 @@ def _peak_of_allocator(job, mode=torch.no_grad):
         now += event.nbytes()
         peak = max(peak, now)
     return peak
+
+
+@pytest.mark.parametrize("past_images", [0, 2])
+def test_a_deep_model_is_planned_from_few_layers(full_config, past_images):
+    wan = full_config.wan.model_copy(update={"precision": "bfloat16"})
+    more = {"num_layers": 7, "past_images": past_images, "wan": wan}
+    deep = full_config.model_copy(update=more)
+    assert plan_of(deep) == _plan_of(deep, 7)
+    # Of a small network the peak may be elsewhere with few layers.
+    small = NetworkConfig(num_layers=7, past_images=past_images)
+    plan, traced = plan_of(small), _plan_of(small, 7)
+    assert (plan.parts, plan.kept_bytes) == (traced.parts, traced.kept_bytes)
+    for work, all_layers in zip(plan.work, traced.work, strict=True):
+        assert replace(work, memory_bytes=0) == replace(all_layers, memory_bytes=0)
+        assert work.memory_bytes == pytest.approx(all_layers.memory_bytes, rel=0.03)
 
 
 @pytest.mark.slow
