@@ -24,12 +24,12 @@ from services.networks.weight_files import (
     memory_of,
     refuse_non_finite,
 )
+from services.world_model.network.codecs import WanVideoCodec
 from services.world_model.network.configuration import NetworkConfig, WanFiles
 from services.world_model.network.low_rank import is_adapter
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.video import (
     WanBlock,
-    WanVideoCodec,
     WanVideoCondition,
     WanVideoExpert,
 )

@@ -28,6 +28,7 @@ from services.world_model.devices import claimed_device
 from services.world_model.dynamics.features import FREE_KPA, NUM_POINTS, hand_motion
 from services.world_model.dynamics.model import REST_LATENTS, Stillness, stillness
 from services.world_model.network.attention import split_axis
+from services.world_model.network.codecs import WanVideoCodec, to_uint8, to_unit
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
     GloveNetworkConfig,
@@ -37,7 +38,6 @@ from services.world_model.network.configuration import (
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Sampling, stack_noise
 from services.world_model.network.past import MAX_KEPT, PastImages, PastRule, kept_bytes
-from services.world_model.network.video import WanVideoCodec, to_uint8, to_unit
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld

@@ -20,6 +20,7 @@ from services.world_model.network.attention import (
     clean_mask,
     split_axis,
 )
+from services.world_model.network.codecs import VisualCodec, WanVideoCodec, to_unit
 from services.world_model.network.conditioning import (
     ActionNormalizer,
     Condition,
@@ -43,13 +44,10 @@ from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
     ViewTokens,
-    VisualCodec,
     WanBlock,
-    WanVideoCodec,
     WanVideoCondition,
     WanVideoExpert,
     empty_transformer,
-    to_unit,
 )
 
 _EXACT_PARTS = (

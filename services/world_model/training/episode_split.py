@@ -8,7 +8,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model import checkpoints
 from services.world_model.paper_settings import TrainSettings
-from services.world_model.training import dataset, tokenizer_trainer
+from services.world_model.training import dataset, episode_sets, tokenizer_trainer
 
 
 def load_split(
@@ -31,14 +31,17 @@ def load_split(
     else:
         trained, stored = _split(trained, settings)
         heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
-    trained = dataset.subset_by_hash(trained, settings.robot_episodes, what="robot")
+    trained = episode_sets.subset_by_hash(trained, settings.robot_episodes, what="robot")
     people: list[dataset.TrainingEpisode] = []
     for url in settings.human if settings.human_episodes != 0 else ():
         people += read(url, domain="human")
-    together = [*trained, *dataset.subset_by_hash(people, settings.human_episodes, what="human")]
+    together = [
+        *trained,
+        *episode_sets.subset_by_hash(people, settings.human_episodes, what="human"),
+    ]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     ids = [episode.episode_id for episode in together]
-    dataset.check_stores([settings.episodes, *settings.human], ids, rates_hz)
+    episode_sets.check_stores([settings.episodes, *settings.human], ids, rates_hz)
     _check_views([*together, *heldout], settings)
     return together, heldout
 

@@ -15,9 +15,9 @@ from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from services.world_model.network.codecs import to_uint8, to_unit
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,

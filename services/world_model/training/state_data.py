@@ -42,7 +42,7 @@ from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.dataset import check_stores, check_tasks, subset_by_hash
+from services.world_model.training.episode_sets import check_stores, check_tasks, subset_by_hash
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 

@@ -38,7 +38,7 @@ from services.world_model.rendering.network import RendererNetwork, uses_bfloat1
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import core_training, state_data
-from services.world_model.training.dataset import training_sets
+from services.world_model.training.episode_sets import training_sets
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,

@@ -21,12 +21,12 @@ from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
+from services.world_model.network.codecs import to_unit
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel, from_first
 from services.world_model.network.past import PastRule
 from services.world_model.network.tactile import TactileTokenizer
-from services.world_model.network.video import to_unit
 from services.world_model.paper_settings import TrainSettings, command_line
 from services.world_model.pretrained_video import (
     freeze_pretrained,
@@ -34,7 +34,7 @@ from services.world_model.pretrained_video import (
     is_pretrained,
     share_texts,
 )
-from services.world_model.training import dataset, tokenizer_trainer, training_state
+from services.world_model.training import dataset, episode_sets, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
 from services.world_model.training.episode_split import check_disjoint, load_split
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
@@ -396,7 +396,7 @@ def train_on(
     known_tasks: set[str] = set()
     if ancestor is not None:
         known_tasks = {*ancestor.metadata.tasks, *checkpoints.learned_tasks(ancestor.metadata.sets)}
-    dataset.check_tasks((*trained, *heldout), settings, known_tasks)
+    episode_sets.check_tasks((*trained, *heldout), settings, known_tasks)
     if ancestor is not None:
         # Episodes that the initial checkpoint was trained on cannot be held out either.
         refuse_trained(heldout, ancestor.metadata.train_fingerprints, "the initial checkpoint")
@@ -470,7 +470,7 @@ def _metadata(
         ),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
-        sets=dataset.training_sets(
+        sets=episode_sets.training_sets(
             trained,
             heldout,
             human_share=settings.share_of_human,

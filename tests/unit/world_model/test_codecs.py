@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from services.world_model.dynamics.features import principal_axes, root_scale
+from services.world_model.network.codecs import VisualCodec, to_uint8, to_unit
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import PrincipalAxesTokenizer
-from services.world_model.network.video import VisualCodec, to_uint8, to_unit
 
 
 def _images(num_windows=6, num_steps=9, px=32):

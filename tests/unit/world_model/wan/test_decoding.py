@@ -5,8 +5,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from dextouch.errors import InvalidInputError
+from services.world_model.network.codecs import WanVideoCodec, last_images
 from services.world_model.network.configuration import SPATIAL_FACTOR, NetworkConfig, WanConfig
-from services.world_model.network.video import WanVideoCodec, last_images
 from services.world_model.plan import plan_of
 from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import paper_form_checkpoint

@@ -15,8 +15,9 @@ from dextouch.errors import (
 )
 from services.networks.weight_files import memory_of
 from services.world_model import pretrained_video
+from services.world_model.network.codecs import empty_autoencoder
 from services.world_model.network.configuration import WanConfig
-from services.world_model.network.video import empty_autoencoder, empty_transformer
+from services.world_model.network.video import empty_transformer
 from services.world_model.pretrained_video import load_weights
 
 STEM = "diffusion_pytorch_model"

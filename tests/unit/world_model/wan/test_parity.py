@@ -16,10 +16,10 @@ from services.world_model.network.attention import (
     tactile_positions,
     video_positions,
 )
+from services.world_model.network.codecs import WanVideoCodec
 from services.world_model.network.configuration import LATENT_MEAN, LATENT_STD
 from services.world_model.network.video import (
     WanBlock,
-    WanVideoCodec,
     WanVideoCondition,
     WanVideoExpert,
 )
