@@ -49,7 +49,7 @@ def busy(station):
     """Every thread of the station waits 0.18 s for a processor; so do samples after their read."""
     judge, late_ns = host_judge(station), 180_000_000
     judge._load = lambda: (15.0, 2)
-    station.health._ticks._on_wake = lambda now_ns, _: judge.note(now_ns, late_ns)
+    station.health._ticks.on_wake = lambda now_ns, _: judge.note(now_ns, late_ns)
     for queue in station.health.queues.values():
         add = queue.add
         queue.add = lambda samples, now_ns, add=add: add(samples, now_ns + late_ns)
