@@ -188,7 +188,7 @@ def errors(model: JointWorldModel, examples: Examples, precision: Precision) -> 
         guess = model(examples.inputs, examples.first, examples.noisy, examples.t)
     target = examples.target
     video_error = (guess.video - target.video)[:, 1:].square()
-    if examples.inputs.missing.any():
+    if model.config.further_views:
         # Tokens of missing views are right, whatever they are.
         shown = functional.pad(~examples.inputs.missing, (1, 0), value=True)
         counted = shown.repeat_interleave(model.config.tokens_per_latent, dim=1)
