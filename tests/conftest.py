@@ -53,9 +53,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Tests of `LONG_FOLDERS` are long, but for those that have a mark of their own."""
+    """Tests of `LONG_FOLDERS` are long, but for those that have a mark of their own, whose time has no limit."""
     is_in_folder = item.path.relative_to(ROOT / "tests").parts[0] in LONG_FOLDERS
-    if is_in_folder and not any(item.get_closest_marker(name) for name in OTHER_MARKS):
+    if any(item.get_closest_marker(name) for name in OTHER_MARKS):
+        item.add_marker(pytest.mark.timeout(0))
+    elif is_in_folder:
         item.add_marker("long")
 
 
