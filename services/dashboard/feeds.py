@@ -1,7 +1,7 @@
 """Panels of the page: what each shows, polled from the other services for all viewers.
 
 A new panel is a topic here with the function that fetches it, a section in
-`templates/station.html`, and a function in `static/` that `static/main.js` calls with the data.
+`templates/station.html`, and a function in `static/` that `static/station.js` calls with the data.
 """
 
 import asyncio
@@ -64,7 +64,7 @@ def skeleton_bones() -> list[tuple[int, int]]:
 def heatmap_layout() -> dict[str, object]:
     """Positions of the taxels of `dextouch_v1` and the colour map, from `dextouch.tactile`.
 
-    Those of other gloves the page finds from their layout (`static/layouts.js`).
+    Those of other gloves the page finds from their layout (`static/taxels.js`).
     """
     layout = DEXTOUCH_V1
     taxels = np.arange(layout.num_taxels, dtype=np.float32)

@@ -22,9 +22,9 @@ export function beforeNextFrame(draw) {
   return () => {
     if (isWaiting) return;
     isWaiting = true;
-    requestAnimationFrame(() => {
+    requestAnimationFrame((now_ms) => {
       isWaiting = false;
-      draw();
+      draw(now_ms);
     });
   };
 }

@@ -1,7 +1,8 @@
 // A 2-D canvas that shows points in space: drag or arrow keys turn, wheel, pinch or + and - zoom, double click or 0 resets.
 
 import { beforeNextFrame, cleared, css } from "./canvas.js";
-import { apply, fitted, orbitCamera, project, turned, zoomed } from "./projection.js";
+import { isModified } from "./dom.js";
+import { apply, fitted, orbitCamera, project, turned, zoomed } from "./poses.js";
 
 const HOME = { target_m: [0, 0, 1], distance_m: 1.5, azimuth_rad: -2.2, elevation_rad: 0.4 };
 const AXIS_M = 0.05;
@@ -13,13 +14,7 @@ const ZOOMS = { "+": 0.9, "-": 1 / 0.9 };
 export class OrbitCanvas {
   // `paint` draws into this, which is then a pen; `view` is an orbit to begin with; `onMove` tells that somebody turned or zoomed.
   constructor(canvas, { paint, view = null, onMove = () => {} }) {
-    this.canvas = canvas;
-    this.paint = paint;
-    this.onMove = onMove;
-    this.isMoved = view !== null;
-    this.orbit = { ...HOME, ...view };
-    this.fits = false;
-    this.floor_m = 0;
+    Object.assign(this, { canvas, paint, onMove, isMoved: view !== null, orbit: { ...HOME, ...view }, fits: false, floor_m: 0 });
     this.request = beforeNextFrame(() => this.draw());
     this.listen();
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -47,7 +42,7 @@ export class OrbitCanvas {
     }, { passive: false });
     this.canvas.addEventListener("dblclick", () => this.reset());
     this.canvas.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (isModified(event)) return;
       if (event.key in KEYS) this.move(turned(this.orbit, ...KEYS[event.key]));
       else if (event.key in ZOOMS) this.move(zoomed(this.orbit, ZOOMS[event.key]));
       else if (event.key === "0") this.reset();
@@ -71,12 +66,18 @@ export class OrbitCanvas {
     this.onMove();
   }
 
-  // The first points, and those after a reset, choose what the picture shows; later ones move in it.
+  isInside(point) {
+    const at = project(orbitCamera(this.orbit), point, this.size);
+    return at !== null && at.x_px >= 0 && at.x_px <= this.size.width_px && at.y_px >= 0 && at.y_px <= this.size.height_px;
+  }
+
+  // The first points, and those after a reset, choose what the picture shows; later ones move in it. Until somebody chose a view, it follows those that leave it.
   fit(points) {
     const known = points.filter((point) => point.every(Number.isFinite));
-    if (this.fits || known.length === 0) return;
-    const { target_m, distance_m } = fitted(this.orbit, known);
-    this.orbit = { ...this.orbit, target_m, distance_m: this.isMoved ? this.orbit.distance_m : distance_m };
+    if (known.length === 0 || (this.fits && (this.isMoved || known.every((point) => this.isInside(point))))) return;
+    const { target_m, distance_m } = fitted(this.orbit, known, this.size.width_px / this.size.height_px);
+    const least_m = this.fits ? this.orbit.distance_m : 0;
+    this.orbit = { ...this.orbit, target_m, distance_m: this.isMoved ? this.orbit.distance_m : Math.max(distance_m, least_m) };
     this.floor_m = GRID_M * Math.floor(Math.min(...known.map((point) => point[2])) / GRID_M);
     this.fits = true;
   }

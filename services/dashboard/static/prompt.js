@@ -1,7 +1,6 @@
 // Fields of the next take: task and instruction from the list or as free text, domain, operator, consent.
 
-import { element } from "./dom.js";
-import { keep, kept } from "./kept.js";
+import { element, keep, kept } from "./dom.js";
 
 const OTHER = "";
 const KEPT = "prompt";
@@ -9,8 +8,7 @@ const KEPT = "prompt";
 // A list with "other", which shows a text field in its place of choice.
 class Choice {
   constructor(select, input) {
-    this.select = select;
-    this.input = input;
+    Object.assign(this, { select, input });
     select.addEventListener("change", () => {
       this.show();
       if (this.isOther) input.focus();

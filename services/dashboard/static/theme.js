@@ -1,6 +1,6 @@
 // The theme of every page, kept in this browser: auto (as the system says), light or dark.
 
-import { keep, kept } from "./kept.js";
+import { keep, kept } from "./dom.js";
 
 const ORDER = ["auto", "light", "dark"];
 const { dataset } = document.documentElement;

@@ -1,7 +1,7 @@
 // What the list shows ↔ the page's address, and the request to the store. No DOM here.
 
 export const PAGE_ROWS = 50;
-export const VIEWS = ["take", "recording", "episode", "trash"];
+const VIEWS = ["take", "recording", "episode", "trash"];
 export const FILTERS = ["text", "task", "operator", "station", "domain", "outcome", "origin", "review", "from", "to"];
 const SORTS = ["time", "task", "id", "operator", "station", "duration", "findings"];
 // `station` in an address is the page's own, also on this page.

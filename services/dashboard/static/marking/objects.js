@@ -1,11 +1,48 @@
 // Mark objects: the first images of a task's episodes one after the other, each click saved at once.
 
-import { get, post } from "../catalog/api.js";
-import { element, find, say, setText } from "../dom.js";
+import { button, element, find, isModified, newestOnly, say, setText } from "../dom.js";
 import { unpack } from "../packed.js";
-import { ask, checked, pagePath } from "../session.js";
-import { counts, isDone, nextEpisode, nextOpen, stateOf, withClick, withState } from "./clicks.js";
+import { ask, checked, get, pagePath, post } from "../requests.js";
 import { Stage } from "./stage.js";
+
+// What is said of an object: "open", "heading" (the first click is there, the second not), or "done".
+function stateOf(object, click) {
+  if (!click) return "open";
+  const needs = click.state === "seen" && !object.click?.symmetric && !click.heading_px;
+  return needs ? "heading" : "done";
+}
+
+function isDone(objects, clicks) {
+  return objects.every((object) => stateOf(object, clicks[object.name]) === "done");
+}
+
+// The object after this one that has something left to click; the same if none has.
+function nextOpen(objects, clicks, active) {
+  const order = [...objects.keys()].map((step) => (active + step) % objects.length);
+  return order.find((index) => stateOf(objects[index], clicks[objects[index].name]) !== "done") ?? active;
+}
+
+// Clicks with one more on an object: its point, its heading, or a new point in place of both.
+function withClick(object, clicks, pixel) {
+  const old = clicks[object.name];
+  const click = stateOf(object, old) === "heading" ? { ...old, heading_px: pixel } : { state: "seen", point_px: pixel };
+  return { ...clicks, [object.name]: click };
+}
+
+function withState(object, clicks, state) {
+  return { ...clicks, [object.name]: { state } };
+}
+
+// The next episode that is not done, after the current one and around; the one after it if all are.
+function nextEpisode(objects, episodes, current) {
+  const order = episodes.map((_, step) => (current + 1 + step) % episodes.length);
+  const open = (index) => !isDone(objects, episodes[index].clicks?.objects ?? {});
+  return order.find((index) => index !== current && open(index)) ?? order[0] ?? 0;
+}
+
+function counts(objects, episodes) {
+  return { done: episodes.filter((one) => one.clicks && isDone(objects, one.clicks.objects)).length, all: episodes.length };
+}
 
 const STORE = "/v1/episode_store";
 const ACTIVE = "#ffd24a";
@@ -14,7 +51,6 @@ const task = find("task");
 const state = { objects: [], episodes: [], current: 0, active: 0, history: [] };
 let saving = Promise.resolve();
 let pending = 0;
-let asked = 0;
 
 const stage = new Stage(find("image"), (pixel) => change((object, clicks) => withClick(object, clicks, pixel)));
 const episode = () => state.episodes[state.current];
@@ -31,10 +67,8 @@ const WORDS = {
 function objectRow(object, index) {
   const click = clicksOf(episode())[object.name];
   const now = stateOf(object, click);
-  const button = element("button", { type: "button", "data-key": object.name, "data-state": now, "aria-pressed": index === state.active },
-    element("span", { class: "digit" }, index + 1), element("span", { class: "name" }, object.name), element("span", { class: "quiet" }, WORDS[now](object, click)));
-  button.addEventListener("click", () => choose(index));
-  return button;
+  const words = [element("span", { class: "digit" }, index + 1), element("span", { class: "name" }, object.name), element("span", { class: "quiet" }, WORDS[now](object, click))];
+  return button(words, () => choose(index), { "data-key": object.name, "data-state": now, "aria-pressed": index === state.active });
 }
 
 function show() {
@@ -101,32 +135,33 @@ function save(objects) {
 }
 
 async function go(index) {
-  const number = ++asked;
   Object.assign(state, { current: index, history: [] });
   const one = episode();
   stage.show(null);
   say(find("message"), "");
   state.active = one ? nextOpen(state.objects, clicksOf(one), 0) : 0;
   show();
-  if (!one) return;
-  try {
-    await saving;
-    const id = encodeURIComponent(one.episode_id);
-    const about = await get(`${STORE}/episodes/${id}/clicks`);
-    const span = `start_ns=${about.image_t_ns}&stop_ns=${about.image_t_ns + 1}`;
-    const answer = await checked(await ask(`${STORE}/playback/episode/${id}/images/camera_head?${span}`));
-    const { arrays } = unpack(await answer.arrayBuffer());
-    const image = await createImageBitmap(new Blob([arrays.data.values], { type: "image/jpeg" }), { imageOrientation: "none" });
-    if (number !== asked) return image.close();
-    Object.assign(one, { clicks: about.clicks, kept: about.clicks.objects, boxes: about.boxes_px });
-    state.active = nextOpen(state.objects, clicksOf(one), 0);
-    stage.show(image);
-    if (about.problem) say(find("message"), about.problem, "ERROR");
-    show();
-  } catch (error) {
-    if (number === asked) say(find("message"), error.message, "ERROR");
-  }
+  await load(one);
 }
+
+const load = newestOnly(async (one) => {
+  if (!one) return null;
+  await saving;
+  const id = encodeURIComponent(one.episode_id);
+  const about = await get(`${STORE}/episodes/${id}/clicks`);
+  const span = `start_ns=${about.image_t_ns}&stop_ns=${about.image_t_ns + 1}`;
+  const answer = await checked(await ask(`${STORE}/playback/episode/${id}/images/camera_head?${span}`));
+  const { arrays } = unpack(await answer.arrayBuffer());
+  return { one, about, image: await createImageBitmap(new Blob([arrays.data.values], { type: "image/jpeg" }), { imageOrientation: "none" }) };
+}, (found) => {
+  if (!found) return;
+  const { one, about, image } = found;
+  Object.assign(one, { clicks: about.clicks, kept: about.clicks.objects, boxes: about.boxes_px });
+  state.active = nextOpen(state.objects, clicksOf(one), 0);
+  stage.show(image);
+  if (about.problem) say(find("message"), about.problem, "ERROR");
+  show();
+}, (error) => say(find("message"), error.message, "ERROR"));
 
 async function open(name) {
   const query = new URLSearchParams({ limit: find("limit").value, ...(name && { task: name }) });
@@ -175,7 +210,7 @@ for (const [name, act] of Object.entries(ACTIONS)) {
 }
 document.addEventListener("keydown", (event) => {
   const isOfButton = event.target.matches("button") && ["Enter", " "].includes(event.key);
-  if (isOfButton || event.target.matches("input, select, a") || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (isOfButton || event.target.matches("input, select, a") || isModified(event)) return;
   const name = event.key === "Enter" && event.shiftKey ? "previous" : KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   const digit = Number(event.key);
   if (!name && !(digit >= 1)) return;

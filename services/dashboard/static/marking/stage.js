@@ -9,12 +9,7 @@ const EDGES = [1, 2, 4].flatMap((bit) => [...Array(8).keys()].filter((corner) =>
 
 export class Stage {
   constructor(canvas, onClick) {
-    this.canvas = canvas;
-    this.image = null;
-    this.marks = [];
-    this.zoom = 1;
-    this.left = this.top = 0;
-    this.held = null;
+    Object.assign(this, { canvas, image: null, marks: [], zoom: 1, left: 0, top: 0, held: null });
     canvas.addEventListener("pointerdown", (event) => this.hold(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     canvas.addEventListener("pointercancel", () => { this.held = null; });

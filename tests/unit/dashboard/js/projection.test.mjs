@@ -5,10 +5,8 @@ import { readFileSync } from "node:fs";
 import { test } from "node:test";
 
 const { STATIC, CASES } = process.env;
-const { fitted, orbitCamera, project, turned, zoomed } = await import(`${STATIC}/projection.js`);
-const { readPoses, scene } = await import(`${STATIC}/poses.js`);
-const { PADS, padForces, statesOf, taxelName, trusted } = await import(`${STATIC}/taxels.js`);
-const { withLayout } = await import(`${STATIC}/layouts.js`);
+const { fitted, orbitCamera, project, readPoses, scene, turned, zoomed } = await import(`${STATIC}/poses.js`);
+const { PADS, padForces, statesOf, taxelName, trusted, withLayout } = await import(`${STATIC}/taxels.js`);
 const { cameras, message, sides, pressures, forces, names, heatmap, layout, canvases, own_layout, own_canvases } = JSON.parse(readFileSync(CASES, "utf8"));
 
 const near = (got, expected, tolerance) => got.forEach((value, index) => assert.ok(Math.abs(value - expected[index]) < tolerance, `got ${got}, expected ${expected}`));
