@@ -279,25 +279,16 @@ class Comparisons:
         """Add the steps of a chunk: their errors to the view, their images for the page."""
         added, message = await asyncio.to_thread(compared, real, imagined)
         run.messages.append(message)
-        view = run.view
-        joined = {name: getattr(view, name) + values for name, values in added.items()}
-        unreliable = ChunkUncertainty(
-            first_step=real.first_step,
-            last_step=real.first_step + len(real) - 1,
-            uncertainty=imagined.uncertainty,
-            bound_share=bound_share,
-        )
-        run.view = view.model_copy(
-            update=joined
-            | {
-                "num_chunks": len(run.messages),
-                "real_success": real.success,
-                # The start is given, not imagined.
-                "uncertainties": (*view.uncertainties, unreliable)
-                if real.first_step
-                else view.uncertainties,
-            }
-        )
+        changes = {name: getattr(run.view, name) + values for name, values in added.items()}
+        changes |= {"num_chunks": len(run.messages), "real_success": real.success}
+        # The start is given, not imagined.
+        if real.first_step:
+            steps = {"first_step": real.first_step, "last_step": real.last_step}
+            newest = ChunkUncertainty(
+                **steps, uncertainty=imagined.uncertainty, bound_share=bound_share
+            )
+            changes["uncertainties"] = (*run.view.uncertainties, newest)
+        run.view = run.view.model_copy(update=changes)
 
 
 async def _replayed(actions: np.ndarray, size: int) -> AsyncIterator[np.ndarray]:

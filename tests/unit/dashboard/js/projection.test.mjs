@@ -54,6 +54,28 @@ test("after a fit every point is in the picture", () => {
   }
 });
 
+test("a flat picture follows points that leave it, until somebody chose a view", async () => {
+  Object.assign(globalThis, { ResizeObserver: class { observe() {} }, requestAnimationFrame() {} });
+  const { OrbitCanvas } = await import(`${STATIC}/orbit_canvas.js`);
+  for (const size of [{ width_px: 500, height_px: 120 }, { width_px: 120, height_px: 400 }]) {
+    const view = new OrbitCanvas({ addEventListener() {} }, { paint() {} });
+    const isInside = (point) => {
+      const { x_px, y_px } = project(orbitCamera(view.orbit), point, size);
+      return x_px >= 0 && x_px <= size.width_px && y_px >= 0 && y_px <= size.height_px;
+    };
+    view.size = size;
+    view.fit([[0, 0, 1], [0.1, 0, 1.1]]);
+    const near_m = view.orbit.distance_m;
+    const fingers = [[-0.5, 0.2, 0.7], [0.5, -0.2, 1.6]];
+    view.fit(fingers);
+    assert.ok(fingers.every(isInside) && view.orbit.distance_m > near_m);
+    view.move(zoomed(view.orbit, 0.5));
+    const chosen = view.orbit;
+    view.fit([[-0.5, 0.2, 0.7], [0.5, -0.2, 1.6]]);
+    assert.equal(view.orbit, chosen);
+  }
+});
+
 test("keypoints of the dashboard's message are where NumPy says", () => {
   const bytes = Uint8Array.from(Buffer.from(message, "base64"));
   const streams = readPoses(bytes.buffer);
