@@ -19,6 +19,7 @@ from starlette.requests import HTTPConnection
 from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from dextouch.episodes import sync_folder, write_parts
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import StationEnrolments
@@ -127,19 +128,13 @@ class RotatedLines:
         try:
             size = os.fstat(descriptor).st_size
             is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
-            rest = memoryview((b"\n" if is_torn else b"") + line + b"\n")
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
+            write_parts(descriptor, b"\n" if is_torn else b"", line, b"\n")
             if self._sync:
                 os.fsync(descriptor)
         finally:
             os.close(descriptor)
         if is_new and self._sync:
-            descriptor = os.open(self._folder, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync_folder(self._folder)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{self._name}-{number:09}.jsonl"
