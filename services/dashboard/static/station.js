@@ -1,13 +1,12 @@
 // The station's page: one live link feeds the panels; a panel that is out of sight is not sent.
 
 import { CameraPanel } from "./cameras.js";
-import { css } from "./canvas.js";
+import { css, OrbitCanvas } from "./canvas.js";
 import { DevicesPanel } from "./devices.js";
 import { attempt, button, cell, element, find, levelBadge, say, setText, showChildren, showRows, why } from "./dom.js";
 import { age } from "./format.js";
 import { drawScale, HandCanvas, readTaxels, showLegend } from "./hands.js";
 import { Freshness, LiveLink } from "./live.js";
-import { OrbitCanvas } from "./orbit_canvas.js";
 import { readPoses, scene } from "./poses.js";
 import { RecorderPanel } from "./recorder.js";
 import { ask, pagePath, post } from "./requests.js";

@@ -121,8 +121,8 @@ function load(offset) {
   });
 }
 
-function open(wanted) {
-  filter = wanted;
+function open(chosen) {
+  filter = chosen;
   find("rollouts_title").scrollIntoView({ block: "start", behavior: "smooth" });
   return load(0);
 }

@@ -6,7 +6,7 @@ import { get, send } from "../requests.js";
 import { subjectOf } from "./items.js";
 import { FILTERS, midnight, storeQuery } from "./query.js";
 
-export const OF_EPISODES = ["lerobot", "umi"];
+const OF_EPISODES = ["lerobot", "umi"];
 
 function kindsOf(format) {
   return OF_EPISODES.includes(format) ? ["episode"] : ["episode", "recording"];

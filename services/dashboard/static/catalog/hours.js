@@ -60,7 +60,7 @@ function row(field, data, drawn) {
 
 // Newest days first.
 function show(field, rows) {
-  const listed = field === "task" ? withGoals(rows, wantedGoals()) : rows.map((one) => ({ ...one, goal_h: null }));
+  const listed = field === "task" ? withGoals(rows, shownGoals()) : rows.map((one) => ({ ...one, goal_h: null }));
   if (field === "day") listed.reverse();
   const drawn = bars(listed);
   find(`${field}_rows`).replaceChildren(...listed.map((one, index) => row(field, one, drawn[index])));
@@ -68,7 +68,7 @@ function show(field, rows) {
   return listed;
 }
 
-function wantedGoals() {
+function shownGoals() {
   const task = form.elements.task.value;
   return task ? Object.fromEntries(Object.entries(goals).filter(([name]) => name === task)) : goals;
 }

@@ -1,9 +1,8 @@
 // Panes of the player at the playhead: images, taxel maps, the action, and hands in the world, each with its sample's own time.
 
-import { cleared, css } from "../canvas.js";
+import { cleared, css, OrbitCanvas } from "../canvas.js";
 import { element, setText } from "../dom.js";
 import { HandCanvas } from "../hands.js";
-import { OrbitCanvas } from "../orbit_canvas.js";
 import { apply, IDENTITY, matrixOfPose, NUM_KEYPOINTS, TIPS } from "../poses.js";
 import { componentWords } from "./plots.js";
 import { secondsText, stampOf } from "./times.js";

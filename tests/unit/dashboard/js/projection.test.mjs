@@ -56,7 +56,7 @@ test("after a fit every point is in the picture", () => {
 
 test("a flat picture follows points that leave it, until somebody chose a view", async () => {
   Object.assign(globalThis, { ResizeObserver: class { observe() {} }, requestAnimationFrame() {} });
-  const { OrbitCanvas } = await import(`${STATIC}/orbit_canvas.js`);
+  const { OrbitCanvas } = await import(`${STATIC}/canvas.js`);
   for (const size of [{ width_px: 500, height_px: 120 }, { width_px: 120, height_px: 400 }]) {
     const view = new OrbitCanvas({ addEventListener() {} }, { paint() {} });
     const isInside = (point) => {
