@@ -300,7 +300,8 @@ def _forwarder(
             )
         if query:
             path += f"?{query}"
-        known, content = request.headers.get("if-none-match"), await request.body()
+        known = request.headers.get("if-none-match")
+        content = await request.body() if route.action else b""
         answer = await feeds.upstream(route.service).send(
             route.method,
             path,

@@ -16,8 +16,8 @@ from dextouch.schemas import Problem, error_from_problem, first_problems
 from dextouch.tracing import trace_headers
 
 Form = TypeVar("Form")
+# Scopes of operators, and of administrators, who have theirs beside it.
 SCOPE: Final = "operate"
-# Of administrators, who have it beside that of operators.
 ENROL: Final = "enrol"
 SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
