@@ -22,7 +22,7 @@ from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.free_text import printable
 from dextouch.hands.hand_files import load_hand
 from dextouch.jobs import Workers, run_jobs
-from dextouch.schemas import json_ready, load_scene_objects
+from dextouch.schemas import SceneObjects, json_ready
 from dextouch.serving import load_settings
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
@@ -168,7 +168,7 @@ def _markers(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     del settings
     from services.alignment.markers import marker_sheet
 
-    page = marker_sheet(load_scene_objects(parsed.objects))
+    page = marker_sheet(SceneObjects.load(parsed.objects))
     with disk_errors(f"write {parsed.to}"):
         parsed.to.write_text(page, encoding="utf-8")
     print(f"{parsed.to}: print at 100 %, then measure the side of one marker")

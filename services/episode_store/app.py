@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import DexTouchError
-from dextouch.schemas import load_object_clicks
+from dextouch.schemas import ObjectClicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.deletions import deletions_router
@@ -147,7 +147,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
     catalog = Catalog(store)
-    objects = None if settings.objects is None else load_object_clicks(settings.objects)
+    objects = None if settings.objects is None else ObjectClicks.load(settings.objects)
     ingest = Ingest(store, settings)
     limits = StorageLimits(ingest.folder, settings, recordings=catalog.bytes_by_station)
     admission = Admission(

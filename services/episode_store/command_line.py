@@ -48,11 +48,11 @@ from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
+    ObjectClicks,
     RecordingAttributes,
     SceneObject,
     SceneObjects,
     json_ready,
-    load_object_clicks,
 )
 from dextouch.serving import configure_logging, load_settings
 from services.episode_store.catalog import Catalog, ListedRow
@@ -278,7 +278,7 @@ def clicks(context: Context) -> Outcome:
 
     The result is a file of all clicks.
     """
-    given = load_object_clicks(context.options.clicks)
+    given = ObjectClicks.load(context.options.clicks)
     names = sorted({*given.episodes, *context.store.list()})
     found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
     rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]

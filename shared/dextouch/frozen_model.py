@@ -32,6 +32,11 @@ class FrozenModel(BaseModel):
         return made
 
 
+def is_none(value: object) -> bool:
+    """For `exclude_if` of fields that are not written where they are unknown."""
+    return value is None
+
+
 def attribute_docs(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
     """Docstring of a model without its attributes, and these by their names on the wire."""
     text, _, section = inspect.cleandoc(model.__doc__ or "").partition("\n\nAttributes:\n")

@@ -37,7 +37,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
+from dextouch.schemas import Domain, ObjectClicks, SceneObjects
 from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
@@ -260,7 +260,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
             differ.
         InvalidInputError: held-out scenes that are trained on, or too few episodes.
     """
-    clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
+    clicks = None if settings.clicks is None else ObjectClicks.load(settings.clicks)
     heldout_urls = () if settings.heldout is None else (settings.heldout,)
     urls = (*settings.episodes, *settings.human, *heldout_urls)
     _check_clicked(clicks, urls)

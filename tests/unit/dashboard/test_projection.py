@@ -18,7 +18,7 @@ from services.dashboard.app import STATIC
 from services.dashboard.feeds import heatmap_layout, pose_message, skeleton_bones
 from tests.unit.other_gloves import small_layout
 
-# Vertical field of view of static/projection.js.
+# Vertical field of view of static/poses.js.
 FOVY_RAD = 0.7
 NODE = shutil.which("node")
 

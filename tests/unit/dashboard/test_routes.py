@@ -19,7 +19,7 @@ KEY = "a-key-of-some-length"
 @pytest.mark.parametrize(
     ("screen", "module"),
     [
-        ("/", "/static/main.js"),
+        ("/", "/static/station.js"),
         ("/episodes", "/static/catalog/episodes.js"),
         ("/objects", "/static/marking/objects.js"),
         ("/review", "/static/catalog/review.js"),
