@@ -9,7 +9,6 @@ import ctypes
 import struct
 import time
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
@@ -54,7 +53,6 @@ class LslStream(Source):
         super().__init__()
         self._value, self._by = value, by
         self._clock = clock or StationClock()
-        self._lsl: ModuleType | None = None
         self._inlet: Any = None
         self._correction_s = self._uncertainty_s = self._corrected_s = 0.0
 
@@ -66,7 +64,7 @@ class LslStream(Source):
             InvalidInputError: several, or one without numbers.
             UnavailableError: pylsl is not installed.
         """
-        self._lsl = lsl = import_sdk("pylsl", install=INSTALL)
+        lsl = import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)
         if not found:
             raise DeviceError(
@@ -126,7 +124,7 @@ class LslStream(Source):
 
     def present(self) -> list[str]:
         """Name, type, source_id and shape of every outlet of the network."""
-        self._lsl = lsl = import_sdk("pylsl", install=INSTALL)
+        lsl = import_sdk("pylsl", install=INSTALL)
         return [
             f"{info.name()} (type {info.type()}, source_id {info.source_id()}, "
             f"{info.channel_count()} channels, {info.nominal_srate():g} Hz, {info.hostname()})"

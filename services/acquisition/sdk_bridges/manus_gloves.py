@@ -29,6 +29,7 @@ from services.acquisition.sdk_bridges.source import (
     hand_reading,
     hello,
     load_library,
+    structure,
     wrist_axes,
 )
 
@@ -56,74 +57,32 @@ READ_S = 0.02
 REPLACED_NS = 1_000_000_000
 
 
-class Vec3(ctypes.Structure):
-    """`ManusVec3`."""
-
-    _fields_ = (("x", c_float), ("y", c_float), ("z", c_float))
-
-
-class Quaternion(ctypes.Structure):
-    """`ManusQuaternion`: w first."""
-
-    _fields_ = (("w", c_float), ("x", c_float), ("y", c_float), ("z", c_float))
-
-
-class SkeletonNode(ctypes.Structure):
-    """`SkeletonNode` with its `ManusTransform`."""
-
-    _fields_ = (
-        ("id", c_uint32),
-        ("position", Vec3),
-        ("rotation", Quaternion),
-        ("scale", Vec3),
-    )
-
-
-class NodeInfo(ctypes.Structure):
-    """`NodeInfo`."""
-
-    _fields_ = (
-        ("nodeId", c_uint32),
-        ("parentId", c_uint32),
-        ("chainType", c_int),
-        ("side", c_int),
-        ("fingerJointType", c_int),
-    )
-
-
-class RawSkeletonInfo(ctypes.Structure):
-    """`RawSkeletonInfo`."""
-
-    _fields_ = (("gloveId", c_uint32), ("nodesCount", c_uint32), ("publishTime", c_uint64))
-
-
-class SkeletonStreamInfo(ctypes.Structure):
-    """`SkeletonStreamInfo`."""
-
-    _fields_ = (("publishTime", c_uint64), ("skeletonsCount", c_uint32))
-
-
-class CoordinateSystemVUH(ctypes.Structure):
-    """`CoordinateSystemVUH`: view, up, handedness, and metres of the unit."""
-
-    _fields_ = (
-        ("view", c_int),
-        ("up", c_int),
-        ("handedness", c_int),
-        ("unitScale", c_float),
-    )
-
-
-class ManusHost(ctypes.Structure):
-    """`ManusHost`: name and address, and the version, whose size differs between releases.
-
-    It is filled by the SDK and passed back to it, by value on the stack, so the largest form serves
-    for all.
-    """
-
-    _fields_ = (("hostName", c_char * 256), ("ipAddress", c_char * 40), ("version", c_uint32 * 15))
-
-
+Vec3 = structure("ManusVec3", x=c_float, y=c_float, z=c_float)
+Quaternion = structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
+# With its `ManusTransform`.
+SkeletonNode = structure(
+    "SkeletonNode", id=c_uint32, position=Vec3, rotation=Quaternion, scale=Vec3
+)
+NodeInfo = structure(
+    "NodeInfo",
+    nodeId=c_uint32,
+    parentId=c_uint32,
+    chainType=c_int,
+    side=c_int,
+    fingerJointType=c_int,
+)
+RawSkeletonInfo = structure(
+    "RawSkeletonInfo", gloveId=c_uint32, nodesCount=c_uint32, publishTime=c_uint64
+)
+SkeletonStreamInfo = structure("SkeletonStreamInfo", publishTime=c_uint64, skeletonsCount=c_uint32)
+CoordinateSystemVUH = structure(
+    "CoordinateSystemVUH", view=c_int, up=c_int, handedness=c_int, unitScale=c_float
+)
+# The size of the version differs between releases. It is filled by the SDK and passed back to it,
+# by value on the stack, so that the largest form serves for all.
+ManusHost = structure(
+    "ManusHost", hostName=c_char * 256, ipAddress=c_char * 40, version=c_uint32 * 15
+)
 RawSkeletonCallback = ctypes.CFUNCTYPE(None, POINTER(SkeletonStreamInfo))
 FUNCTIONS: Functions = {
     "CoreSdk_InitializeIntegrated": (c_int, ()),
@@ -147,10 +106,10 @@ class _Skeleton:
     t_ns: int
     glove_id: int
     publish_time: int
-    nodes: ctypes.Array[SkeletonNode]
+    nodes: ctypes.Array[ctypes.Structure]
 
 
-def _node_name(node: NodeInfo) -> tuple[str, str]:
+def _node_name(node: ctypes.Structure) -> tuple[str, str]:
     """Chain and joint of a node. The thumb has one joint less, under either of two names."""
     chain, joint = CHAINS[node.chainType], JOINTS[node.fingerJointType]
     return chain, "distal" if (chain, joint) == ("thumb", "intermediate") else joint
@@ -257,7 +216,7 @@ class ManusGloves(Source):
                 "licence and the permission to open it (udev rules of MANUS) there?"
             )
 
-    def _copy(self, stream: "ctypes._Pointer[SkeletonStreamInfo]") -> None:
+    def _copy(self, stream: "ctypes._Pointer[ctypes.Structure]") -> None:
         """The SDK's callback, in a thread of the SDK."""
         t_ns, library = self._clock.now_ns(), self._library
         if library is None:

@@ -33,6 +33,7 @@ from services.acquisition.sdk_bridges.source import (
     hello,
     load_library,
     station_offset_ns,
+    structure,
     wrist_axes,
 )
 
@@ -59,122 +60,56 @@ STATE_READY, STATE_STOPPING, STATE_LOSS_PENDING, STATE_EXITING = 2, 6, 7, 8
 EVENT_UNAVAILABLE = 4
 API_VERSION_1_0 = 1 << 48
 Handle = c_uint64
-# Begin of every structure that names its type.
-HEADER: Final = (("type", c_int), ("next", ctypes.c_void_p))
 
 
-class ApplicationInfo(ctypes.Structure):
-    """`XrApplicationInfo`."""
-
-    _fields_ = (
-        ("applicationName", c_char * 128),
-        ("applicationVersion", c_uint32),
-        ("engineName", c_char * 128),
-        ("engineVersion", c_uint32),
-        ("apiVersion", c_uint64),
-    )
+def _typed(name: str, **fields: object) -> type[ctypes.Structure]:
+    """A structure that begins with its type, as all that the functions take."""
+    return structure(name, type=c_int, next=ctypes.c_void_p, **fields)
 
 
-class InstanceCreateInfo(ctypes.Structure):
-    """`XrInstanceCreateInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("createFlags", c_uint64),
-        ("applicationInfo", ApplicationInfo),
-        ("enabledApiLayerCount", c_uint32),
-        ("enabledApiLayerNames", POINTER(c_char_p)),
-        ("enabledExtensionCount", c_uint32),
-        ("enabledExtensionNames", POINTER(c_char_p)),
-    )
-
-
-class SystemGetInfo(ctypes.Structure):
-    """`XrSystemGetInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("formFactor", c_int),
-    )
-
-
-class SessionCreateInfo(ctypes.Structure):
-    """`XrSessionCreateInfo`; without a graphics binding, as headless sessions are."""
-
-    _fields_ = (*HEADER, ("createFlags", c_uint64), ("systemId", c_uint64))
-
-
-class SessionBeginInfo(ctypes.Structure):
-    """`XrSessionBeginInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("primaryViewConfigurationType", c_int),
-    )
-
-
-class Posef(ctypes.Structure):
-    """`XrPosef`: quaternion x y z w, then position."""
-
-    _fields_ = (("orientation", c_float * 4), ("position", c_float * 3))
-
-
-class ReferenceSpaceCreateInfo(ctypes.Structure):
-    """`XrReferenceSpaceCreateInfo`."""
-
-    _fields_ = (*HEADER, ("referenceSpaceType", c_int), ("poseInReferenceSpace", Posef))
-
-
-class EventDataBuffer(ctypes.Structure):
-    """`XrEventDataBuffer`, which holds an event of any kind."""
-
-    _fields_ = (
-        *HEADER,
-        ("varying", ctypes.c_uint8 * 4000),
-    )
-
-
-class SessionStateChanged(ctypes.Structure):
-    """`XrEventDataSessionStateChanged`."""
-
-    _fields_ = (*HEADER, ("session", Handle), ("state", c_int), ("time", c_int64))
-
-
-class HandTrackerCreateInfo(ctypes.Structure):
-    """`XrHandTrackerCreateInfoEXT`."""
-
-    _fields_ = (*HEADER, ("hand", c_int), ("handJointSet", c_int))
-
-
-class HandJointsLocateInfo(ctypes.Structure):
-    """`XrHandJointsLocateInfoEXT`."""
-
-    _fields_ = (*HEADER, ("baseSpace", Handle), ("time", c_int64))
-
-
-class HandJointLocation(ctypes.Structure):
-    """`XrHandJointLocationEXT`."""
-
-    _fields_ = (("locationFlags", c_uint64), ("pose", Posef), ("radius", c_float))
-
-
-class HandJointLocations(ctypes.Structure):
-    """`XrHandJointLocationsEXT`."""
-
-    _fields_ = (
-        *HEADER,
-        ("isActive", c_uint32),
-        ("jointCount", c_uint32),
-        ("jointLocations", POINTER(HandJointLocation)),
-    )
-
-
-class Timespec(ctypes.Structure):
-    """`struct timespec`."""
-
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
+ApplicationInfo = structure(
+    "XrApplicationInfo",
+    applicationName=c_char * 128,
+    applicationVersion=c_uint32,
+    engineName=c_char * 128,
+    engineVersion=c_uint32,
+    apiVersion=c_uint64,
+)
+InstanceCreateInfo = _typed(
+    "XrInstanceCreateInfo",
+    createFlags=c_uint64,
+    applicationInfo=ApplicationInfo,
+    enabledApiLayerCount=c_uint32,
+    enabledApiLayerNames=POINTER(c_char_p),
+    enabledExtensionCount=c_uint32,
+    enabledExtensionNames=POINTER(c_char_p),
+)
+SystemGetInfo = _typed("XrSystemGetInfo", formFactor=c_int)
+# Without a graphics binding, as headless sessions are.
+SessionCreateInfo = _typed("XrSessionCreateInfo", createFlags=c_uint64, systemId=c_uint64)
+SessionBeginInfo = _typed("XrSessionBeginInfo", primaryViewConfigurationType=c_int)
+# Quaternion x y z w, then position.
+Posef = structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
+ReferenceSpaceCreateInfo = _typed(
+    "XrReferenceSpaceCreateInfo", referenceSpaceType=c_int, poseInReferenceSpace=Posef
+)
+# It holds an event of any kind.
+EventDataBuffer = _typed("XrEventDataBuffer", varying=ctypes.c_uint8 * 4000)
+SessionStateChanged = _typed(
+    "XrEventDataSessionStateChanged", session=Handle, state=c_int, time=c_int64
+)
+HandTrackerCreateInfo = _typed("XrHandTrackerCreateInfoEXT", hand=c_int, handJointSet=c_int)
+HandJointsLocateInfo = _typed("XrHandJointsLocateInfoEXT", baseSpace=Handle, time=c_int64)
+HandJointLocation = structure(
+    "XrHandJointLocationEXT", locationFlags=c_uint64, pose=Posef, radius=c_float
+)
+HandJointLocations = _typed(
+    "XrHandJointLocationsEXT",
+    isActive=c_uint32,
+    jointCount=c_uint32,
+    jointLocations=POINTER(HandJointLocation),
+)
+Timespec = structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
 FUNCTIONS: Functions = {
     "xrCreateInstance": (c_int, (POINTER(InstanceCreateInfo), POINTER(Handle))),
     "xrDestroyInstance": (c_int, (Handle,)),

@@ -123,6 +123,11 @@ def import_sdk(module: str, *, install: str) -> ModuleType:
         ) from error
 
 
+def structure(name: str, **fields: object) -> type[ctypes.Structure]:
+    """The C structure of these fields, in their order."""
+    return type(name, (ctypes.Structure,), {"_fields_": tuple(fields.items())})
+
+
 def load_library(path: str, functions: Functions, *, install: str) -> ctypes.CDLL:
     """A shared library with the types of its functions set.
 
@@ -177,11 +182,6 @@ def placed_devices(places: Mapping[str, str]) -> dict[str, BridgedDevice]:
         raise InvalidInputError(f"--device: {first_problems(error)}") from error
 
 
-def place_of(device: BridgedDevice) -> int:
-    """The place of a device by its number in packets."""
-    return SOURCES[device.source]
-
-
 def pose_reading(
     device: BridgedDevice,
     t_device_ns: int,
@@ -200,7 +200,7 @@ def pose_reading(
         is_valid: what the SDK says of the pose.
     """
     payload = POSE_PAYLOAD.pack(device.index, is_valid, result, t_device_ns / 1e9, *numbers)
-    return Reading(device.serial_number, place_of(device), t_device_ns, payload)
+    return Reading(device.serial_number, SOURCES[device.source], t_device_ns, payload)
 
 
 def hand_reading(
@@ -219,7 +219,7 @@ def hand_reading(
     """
     bits = sum(1 << int(node) for node in np.flatnonzero(is_tracked))
     payload = VALIDITY.pack(bits) + points.astype("<f4").tobytes()
-    return Reading(device.serial_number, place_of(device), t_device_ns, payload)
+    return Reading(device.serial_number, SOURCES[device.source], t_device_ns, payload)
 
 
 def wrist_axes(
