@@ -1,25 +1,26 @@
-"""The application of one station; its devices, recorder and uploads live as long as it."""
+"""Application of one station, and of the practice station that a mock one starts when wanted."""
 
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from fastapi import FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from dextouch.data_folder import practice_spool
 from dextouch.episodes import disk_errors
-from dextouch.errors import InvalidInputError
-from dextouch.serving import create_service_app, serve
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas import PracticeStatus
+from dextouch.serving import RequireScope, create_service_app, serve
 from dextouch.tactile import TactileLayout, read_layout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.health.metrics import HealthCollector, RecorderCollector
-from services.acquisition.memory import keep_for_life
-from services.acquisition.practice import PRACTICE_PATH, Practice
-from services.acquisition.recorder import Recorder
+from services.acquisition.recorder import Recorder, keep_for_life
 from services.acquisition.retention import (
     DeletedTakes,
     OperatorNames,
@@ -39,6 +40,89 @@ from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
 
 if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
+
+PRACTICE_PATH: Final = "/practice"
+
+
+class Practice:
+    """An ASGI application that serves the practice station while there is one.
+
+    Args:
+        make: makes the application of the practice station; None where devices are real.
+    """
+
+    def __init__(self, make: Callable[[], FastAPI] | None) -> None:
+        self._make = make
+        self._lock = asyncio.Lock()
+        self._running: AsyncExitStack | None = None
+        self._app: FastAPI | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            NotFoundError: the practice devices are off.
+        """
+        if self._app is None:
+            raise NotFoundError("practice devices: they are off; POST /v1/practice/start first")
+        await self._app(scope, receive, send)
+
+    @property
+    def status(self) -> PracticeStatus:
+        """Whether the practice devices run."""
+        if self._make is None:
+            return PracticeStatus(state="unavailable")
+        return PracticeStatus(state="off" if self._app is None else "on")
+
+    async def start(self) -> PracticeStatus:
+        """Start the devices, which takes seconds; nothing happens if they run.
+
+        Raises:
+            ConflictError: the station has real devices.
+        """
+        if self._make is None:
+            raise ConflictError(
+                "practice devices: this station has real devices; practise with "
+                "`dextouch up --mock` in another data folder"
+            )
+        async with self._lock:
+            if self._app is None:
+                app = await run_in_threadpool(self._make)
+                self._running = AsyncExitStack()
+                await self._running.enter_async_context(app.router.lifespan_context(app))
+                self._app = app
+        return self.status
+
+    async def stop(self) -> PracticeStatus:
+        """Stop the devices; nothing happens if they do not run."""
+        async with self._lock:
+            self._app, running, self._running = None, self._running, None
+            if running is not None:
+                await running.aclose()
+        return self.status
+
+    def router(self) -> APIRouter:
+        """Routes that start and stop it."""
+        router = APIRouter(
+            prefix="/v1/practice", tags=["station"], dependencies=[Depends(RequireScope("station"))]
+        )
+
+        @router.get("")
+        async def get_practice() -> PracticeStatus:
+            """Whether devices to practise calibration with run, below `/practice`."""
+            return self.status
+
+        @router.post("/start")
+        async def start_practice() -> PracticeStatus:
+            """Start the practice devices."""
+            return await self.start()
+
+        @router.post("/stop")
+        async def stop_practice() -> PracticeStatus:
+            """Stop the practice devices."""
+            return await self.stop()
+
+        return router
 
 
 def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> Station:

@@ -17,7 +17,7 @@ import numpy as np
 from dextouch.tactile.layout import Side
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     BridgeFingerTrackerSource,
     BridgePoseSource,
     BridgeSource,

@@ -25,11 +25,6 @@ from services.acquisition.devices.kinds import (
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.mocks.cameras_and_robot import (
-    CameraSource,
-    RobotStateSource,
-    video_camera,
-)
 from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
@@ -40,7 +35,13 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
-from services.acquisition.mocks.trackers import mock_finger_tracker, mock_pose_tracker
+from services.acquisition.mocks.trackers_and_cameras import (
+    CameraSource,
+    RobotStateSource,
+    mock_finger_tracker,
+    mock_pose_tracker,
+    video_camera,
+)
 from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
 

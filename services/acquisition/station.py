@@ -17,7 +17,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
 from services.acquisition.follow_watch import FollowWatch, MakeFollowCheck
-from services.acquisition.glove_record import NO_CELL, glove_record
+from services.acquisition.health.cells import NO_CELL, glove_record
 from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder

@@ -33,7 +33,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import StreamDescriptor, decode_body, frame_body
 from dextouch.tracing import in_trace, new_trace
-from services.acquisition.memory import give_back_free_memory
+from services.acquisition.recorder import give_back_free_memory
 from services.acquisition.retention import (
     RECORDING_FILE,
     REFUSED_FILE,

@@ -13,7 +13,7 @@ import numpy as np
 from dextouch.schemas import Matrix
 from dextouch.streams import TAXEL_UNIT, StreamDescriptor
 from services.acquisition.clock import HostWatch, StationClock
-from services.acquisition.glove_record import is_ours
+from services.acquisition.health.cells import is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     CountWindow,

@@ -27,7 +27,6 @@ SUMMARIES: Final = {
 PLACES: Final = ("left", "right", "head", "none")
 # TCP has 16 bits for it.
 MAX_PORT: Final = 65_535
-HANDS: Final = ("left", "right")
 
 _NEEDS: Final = {
     "openvr": """\
@@ -168,7 +167,7 @@ def _add_choices(parser: argparse.ArgumentParser, source: str) -> None:
         parser.add_argument(
             "--side",
             dest="sides",
-            choices=HANDS,
+            choices=("left", "right"),
             action="append",
             help="a hand to serve; repeat it (default: both)",
         )
@@ -194,6 +193,7 @@ def build_source(options: argparse.Namespace) -> "Source":
     Raises:
         InvalidInputError: no device or outlet is named, or a device twice.
     """
+    from dextouch.tactile.layout import SIDES
     from services.acquisition.sdk_bridges import lighthouse_trackers as lighthouse
     from services.acquisition.sdk_bridges import lsl_stream, manus_gloves, openxr_hands
 
@@ -214,7 +214,7 @@ def build_source(options: argparse.Namespace) -> "Source":
         if options.stream is None and not options.list:
             raise InvalidInputError("no outlet is named: give --stream; --list shows those present")
         return lsl_stream.LslStream(options.stream or "", by=options.by)
-    sides = tuple(side for side in HANDS if side in (options.sides or HANDS))
+    sides = tuple(side for side in SIDES if side in (options.sides or SIDES))
     if name == "manus":
         return manus_gloves.ManusGloves(sides, library=options.library or manus_gloves.LIBRARY)
     return openxr_hands.OpenXrHands(sides, library=options.library or openxr_hands.LIBRARY)
