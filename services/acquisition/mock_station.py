@@ -15,26 +15,14 @@ from dextouch.errors import ConflictError, DeviceError, InvalidInputError
 from dextouch.schemas import Matrix, SaveTake, SimulatedFault, TakeCheck, TakePrompt
 from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.devices import kinds
 from services.acquisition.devices.camera import CameraDecoder
-from services.acquisition.devices.kinds import (
-    ENTRY_POINT_GROUP,
-    IMPORT_FAILURES,
-    device_kind,
-    kind_names,
-)
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.follow_watch import MakeFollowCheck
+from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
-from services.acquisition.mocks.replay import (
-    MockDevice,
-    MockPair,
-    MockSlot,
-    PacketSource,
-    ReplayStream,
-    device_rng,
-)
 from services.acquisition.mocks.trackers_and_cameras import (
     CameraSource,
     RobotStateSource,
@@ -57,29 +45,29 @@ SLOW_S = 0.1
 DEAD_CELL = 9
 
 
-def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
+def mock_glove_of(kind_name: str, place: replay.MockSlot) -> replay.MockPair:
     """A simulated glove of a kind of this package or another one.
 
     Raises:
         UnknownNameError: no package brings the kind.
         InvalidInputError: the kind has no mock, it cannot be imported, or it gives something else.
     """
-    kind = device_kind(kind_name)
+    kind = kinds.device_kind(kind_name)
     if kind.mock is None:
         raise InvalidInputError(
             f"kind of device {kind_name!r}: got no mock, expected one to simulate it; choose "
-            f"another kind for the mock station ({', '.join(kind_names())}) or write its mock"
+            f"another kind for the mock station ({', '.join(kinds.kind_names())}) or write its mock"
         )
     where = f"mock of kind {kind_name!r} ({kind.mock})"
     try:
-        make = EntryPoint(kind_name, kind.mock, ENTRY_POINT_GROUP).load()
-    except IMPORT_FAILURES as error:
+        make = EntryPoint(kind_name, kind.mock, kinds.ENTRY_POINT_GROUP).load()
+    except kinds.IMPORT_FAILURES as error:
         raise InvalidInputError(
             f"{where}: got {type(error).__name__}: {error}, expected a function 'module:function' "
             "of a MockSlot; fix the package that provides the kind"
         ) from error
     pair: object = make(place)
-    if not isinstance(pair, MockPair):
+    if not isinstance(pair, replay.MockPair):
         raise InvalidInputError(
             f"{where}: gave {type(pair).__name__}, expected a services.acquisition.mocks.MockPair; "
             "fix the package that provides the kind"
@@ -88,14 +76,14 @@ def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
 
 
 def build_mocks(
-    streams: Sequence[ReplayStream],
+    streams: Sequence[replay.ReplayStream],
     *,
     faults: FaultScript,
     seed: int,
     clock: StationClock,
     links: MockLinks | None = None,
     unit_seed: int | None = None,
-) -> list[MockPair]:
+) -> list[replay.MockPair]:
     """The mock devices that a set of streams needs.
 
     Streams of ground truth alone are left out. `unit_seed` is that of the devices' own offsets and
@@ -108,8 +96,8 @@ def build_mocks(
     if len(named) != len(streams):
         raise InvalidInputError("mock station: two streams of the same name")
 
-    def place(name: str, stream: str) -> MockSlot:
-        return MockSlot(
+    def place(name: str, stream: str) -> replay.MockSlot:
+        return replay.MockSlot(
             name, named[stream], faults.of(name), seed, clock, links.trackers, unit_seed
         )
 
@@ -136,7 +124,7 @@ def build_mocks(
     return pairs
 
 
-def _camera(place: MockSlot, links: MockLinks) -> MockPair:
+def _camera(place: replay.MockSlot, links: MockLinks) -> replay.MockPair:
     if links.cameras == "station":
         return video_camera(place, encoding=links.images)
     height_px, width_px = place.stream.descriptor.shape[:2]
@@ -146,14 +134,16 @@ def _camera(place: MockSlot, links: MockLinks) -> MockPair:
     return _on_socket(place, CameraSource(place.stream, encoding=links.images), decoder)
 
 
-def _on_socket(place: MockSlot, source: PacketSource, decoder: Decoder) -> MockPair:
+def _on_socket(
+    place: replay.MockSlot, source: replay.PacketSource, decoder: Decoder
+) -> replay.MockPair:
     port = SocketPort(place.name)
     driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return MockPair(MockDevice(place, source, port), driver)
+    return replay.MockPair(replay.MockDevice(place, source, port), driver)
 
 
 def _known_of(
-    pairs: Sequence[MockPair], seed: int, *, error_ms: float = LATENCY_SIGMA_MS
+    pairs: Sequence[replay.MockPair], seed: int, *, error_ms: float = LATENCY_SIGMA_MS
 ) -> dict[str, Matrix]:
     """What a calibrated station knows of these devices.
 
@@ -163,7 +153,7 @@ def _known_of(
     known: dict[str, Matrix] = {}
     for pair in pairs:
         known |= pair.calibration
-        rng, faults = device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
+        rng, faults = replay.device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
         wrong_ms = error_ms * rng.standard_normal() if faults.path_delay_ms else 0.0
         measured_ns = round(max(0.0, faults.path_delay_ms + wrong_ms) * 1e6)
         for descriptor in pair.driver.descriptors:
@@ -197,7 +187,7 @@ class MockStation:
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
         self,
-        streams: Sequence[ReplayStream],
+        streams: Sequence[replay.ReplayStream],
         faults: FaultScript,
         seed: int,
         clock: StationClock,
@@ -356,7 +346,7 @@ class MockStation:
         for thread, _ in self._players:
             thread.start()
 
-    def _run(self, pair: MockPair, waiter: Waiter, offset_ns: int, forever: bool) -> None:  # noqa: FBT001 - of a thread
+    def _run(self, pair: replay.MockPair, waiter: Waiter, offset_ns: int, forever: bool) -> None:  # noqa: FBT001 - of a thread
         device, epoch_ns = pair.device, self._epoch_ns
         with closing(waiter):
             try:

@@ -20,22 +20,11 @@ import numpy as np
 import structlog
 from pydantic import ValidationError
 
+from dextouch import schemas
 from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, StorageError
-from dextouch.schemas import (
-    Matrix,
-    RecorderAction,
-    RecorderSession,
-    RecorderState,
-    RecorderStatus,
-    RecordingAttributes,
-    SavedTakes,
-    SaveTake,
-    TakeCheck,
-    TakePrompt,
-)
 from dextouch.serving import ServedFolder
 from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
@@ -57,7 +46,7 @@ logger = structlog.get_logger(__name__)
 SESSION_FILE: Final = "session.json"
 # Takes of these tasks show devices and a board; guided runs record them without an operator.
 CALIBRATION: Final = ("calibrate-glove", "calibrate-time")
-ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
+ACTIONS: Mapping[schemas.RecorderState, tuple[schemas.RecorderAction, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
     "recording": ("stop", "discard", "rerecord"),
@@ -66,7 +55,7 @@ ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
     "discarded": ("arm",),
 }
 # The state that each action leads to.
-NEXT: Mapping[RecorderAction, RecorderState] = {
+NEXT: Mapping[schemas.RecorderAction, schemas.RecorderState] = {
     "arm": "armed",
     "record": "recording",
     "stop": "checking",
@@ -102,7 +91,7 @@ class Recorder:
         spool_root: Path,
         drivers: Sequence[Driver],
         clock: StationClock,
-        calibration: Mapping[str, Matrix],
+        calibration: Mapping[str, schemas.Matrix],
         safety: SpoolSafety | None = None,
         device_events: Callable[[], DeviceEvents] | None = None,
         health: HealthMonitor | None = None,
@@ -122,19 +111,19 @@ class Recorder:
         self._stated: frozenset[str] = frozenset()
         # Held for a whole action, disk included; readers never take it.
         self._lock = threading.RLock()
-        self._state: RecorderState = "idle"
+        self._state: schemas.RecorderState = "idle"
         self._discarded_id: str | None = None
         self._session = SessionCount(spool_root)
         self.needs_consent = False
         self._arm(None)
 
-    def status(self) -> RecorderStatus:
+    def status(self) -> schemas.RecorderStatus:
         """Where it stands."""
         with self._lock:
             self._settle()
             take, check = self.take, self._check
             problems = [problem.message for problem in check.problems] if check else []
-            return RecorderStatus(
+            return schemas.RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
                 recording_id=self._recording_id(),
@@ -149,7 +138,7 @@ class Recorder:
                 needs_consent=self.needs_consent,
             )
 
-    def arm(self, prompt: TakePrompt) -> RecorderStatus:
+    def arm(self, prompt: schemas.TakePrompt) -> schemas.RecorderStatus:
         """Set the prompt of the next take.
 
         Raises:
@@ -164,7 +153,7 @@ class Recorder:
             )
         return self._act("arm", None, partial(self._arm, prompt))
 
-    def record(self, recording_id: str | None = None) -> RecorderStatus:
+    def record(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Start the take.
 
         Raises:
@@ -173,11 +162,11 @@ class Recorder:
         """
         return self._act("record", recording_id, partial(self._record, recording_id))
 
-    def stop(self, recording_id: str | None = None) -> RecorderStatus:
+    def stop(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """End the take and check it."""
         return self._act("stop", recording_id, self._stop)
 
-    def save(self, how: SaveTake) -> RecorderStatus:
+    def save(self, how: schemas.SaveTake) -> schemas.RecorderStatus:
         """Keep the take: its spool is closed and waits for the upload.
 
         Raises:
@@ -193,11 +182,11 @@ class Recorder:
                 )
             return status
 
-    def discard(self, recording_id: str | None = None) -> RecorderStatus:
+    def discard(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Throw the take away, spool included."""
         return self._act("discard", recording_id, self._discard)
 
-    def rerecord(self, recording_id: str | None = None) -> RecorderStatus:
+    def rerecord(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Throw the take away and arm its prompt again."""
         with self._lock:
             again = recording_id is not None and recording_id == self._discarded_id
@@ -205,7 +194,7 @@ class Recorder:
                 return self.status()
             return self._act("rerecord", recording_id, self._rerecord)
 
-    def begin_session(self) -> RecorderStatus:
+    def begin_session(self) -> schemas.RecorderStatus:
         """Count saved takes from zero again; what was saved stays."""
         with self._lock:
             self._session.begin()
@@ -228,8 +217,8 @@ class Recorder:
                 self.take.release()
 
     def _act(
-        self, action: RecorderAction, recording_id: str | None, do: Callable[[], None]
-    ) -> RecorderStatus:
+        self, action: schemas.RecorderAction, recording_id: str | None, do: Callable[[], None]
+    ) -> schemas.RecorderStatus:
         """Do what is possible now and was not done to the named take before."""
         with self._lock:
             self._settle()
@@ -252,7 +241,7 @@ class Recorder:
             self._state = "checking"
             self._done.add("stop")
 
-    def _is_done(self, action: RecorderAction, recording_id: str | None) -> bool:
+    def _is_done(self, action: schemas.RecorderAction, recording_id: str | None) -> bool:
         """Whether the action was done to the named take; an unnamed one is never a repetition."""
         present = self._recording_id()
         if recording_id is None or (action == "record" and present is None):
@@ -265,12 +254,12 @@ class Recorder:
             )
         return action in self._done
 
-    def _arm(self, prompt: TakePrompt | None) -> None:
+    def _arm(self, prompt: schemas.TakePrompt | None) -> None:
         self._prompt = prompt
         self.take: Take | None = None
-        self._check: TakeCheck | None = None
+        self._check: schemas.TakeCheck | None = None
         self._saved_as: bool | None = None
-        self._done: set[RecorderAction] = set()
+        self._done: set[schemas.RecorderAction] = set()
 
     def _record(self, recording_id: str | None) -> None:
         attributes = self._attributes(recording_id)
@@ -301,7 +290,7 @@ class Recorder:
             stop_ns = take.watch.started_ns + round(take.watch.duration_s * 1e9)
             self._health.history.end_take(take.spool.attributes.recording_id, stop_ns)
 
-    def _save(self, how: SaveTake) -> None:
+    def _save(self, how: schemas.SaveTake) -> None:
         take, check = self.take, self._check
         if take is None or check is None:
             raise ConflictError("recorder: there is no take; record one first")
@@ -345,7 +334,7 @@ class Recorder:
         self._discard()
         self._arm(self._prompt)
 
-    def _attributes(self, recording_id: str | None) -> RecordingAttributes:
+    def _attributes(self, recording_id: str | None) -> schemas.RecordingAttributes:
         prompt = self._prompt
         if prompt is None:
             raise ConflictError("record: nothing was armed; arm first")
@@ -354,7 +343,7 @@ class Recorder:
         for driver in self._drivers.values():
             stated |= driver.begin_take()
         self._stated = frozenset(stated)
-        return RecordingAttributes(
+        return schemas.RecordingAttributes(
             recording_id=recording_id or f"{now:%Y%m%d-%H%M%S}-{token_hex(3)}",
             station=self._station,
             started_at=now,
@@ -376,20 +365,20 @@ class SessionCount:
 
     def __init__(self, spool_root: Path) -> None:
         self._path = spool_root / SESSION_FILE
-        self.now = self._read() or RecorderSession(started_at=datetime.now(UTC))
+        self.now = self._read() or schemas.RecorderSession(started_at=datetime.now(UTC))
 
     def begin(self) -> None:
         """Begin a new session, in which nothing was saved yet."""
         fresh = {"started_at": datetime.now(UTC), "saved": ()}
         self._write(self.now.model_copy(update=fresh))
 
-    def add(self, prompt: TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
+    def add(self, prompt: schemas.TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
         """Count a saved take; `incomplete` says why it is, if it is."""
         key = (prompt.task, prompt.operator)
         counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
         counts[key] = counts.get(key, 0) + 1
         saved = tuple(
-            SavedTakes(task=task, operator=operator, num_saved=count)
+            schemas.SavedTakes(task=task, operator=operator, num_saved=count)
             for (task, operator), count in counts.items()
         )
         last = {"last_saved": recording_id, "last_incomplete": incomplete}
@@ -405,7 +394,7 @@ class SessionCount:
         saved = tuple(item for item in self.now.saved if item.operator != operator)
         self._write(self.now.model_copy(update={"saved": saved}))
 
-    def _write(self, session: RecorderSession) -> None:
+    def _write(self, session: schemas.RecorderSession) -> None:
         self.now = session
         try:
             with disk_errors(f"write {self._path.name}"):
@@ -414,9 +403,9 @@ class SessionCount:
         except StorageError as error:
             logger.warning("fail_session_count", error=error.message)
 
-    def _read(self) -> RecorderSession | None:
+    def _read(self) -> schemas.RecorderSession | None:
         try:
-            return RecorderSession.model_validate_json(self._path.read_bytes())
+            return schemas.RecorderSession.model_validate_json(self._path.read_bytes())
         except FileNotFoundError:
             return None
         except (OSError, ValidationError) as error:

@@ -17,14 +17,7 @@ from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import (
-    CellLayout,
-    Driver,
-    StreamDecoder,
-    check_raw_cells,
-    glove_stream,
-    raw_unit,
-)
+from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -132,7 +125,7 @@ class JustFloatFrames(PortionedSearch[bytes]):
             )
 
 
-class JustFloatGloveDecoder(StreamDecoder[bytes]):
+class JustFloatGloveDecoder(base.StreamDecoder[bytes]):
     """Decodes one glove's byte stream to float32 [num_values], without stamp and number.
 
     Without a sequence, losses cannot be counted.
@@ -157,11 +150,11 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
         layout: TactileLayout | None = None,
     ) -> None:
         if layout is not None:
-            check_raw_cells(layout, num_values, device=f"glove_{side}")
+            base.check_raw_cells(layout, num_values, device=f"glove_{side}")
         frames = JustFloatFrames(num_values, full_scale)
         # The device sends neither its unit nor its time.
-        unit = "raw" if layout is None else raw_unit(layout)
-        descriptor = glove_stream(
+        unit = "raw" if layout is None else base.raw_unit(layout)
+        descriptor = base.glove_stream(
             side,
             label,
             shape=(num_values,),
@@ -172,7 +165,7 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
             capabilities=ClockCapabilities(),
         )
         super().__init__(descriptor, frames)
-        self.cells = CellLayout(full_scale, grid=None)
+        self.cells = base.CellLayout(full_scale, grid=None)
 
     def _sample(self, packet: bytes, t_host_ns: int) -> Sample:
         return Sample(t_host_ns, np.frombuffer(packet, _VALUE))
@@ -225,7 +218,7 @@ class JustFloatGloveSettings(GloveSettings):
         return self
 
 
-def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
+def build(settings: JustFloatGloveSettings, clock: StationClock) -> base.Driver:
     """The driver of one glove."""
     transport = serial_transport(settings, device=settings.device)
     layout = settings.read_layout()
@@ -246,7 +239,7 @@ def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
         label=settings.label,
         layout=layout,
     )
-    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
+    return base.Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(

@@ -17,15 +17,7 @@ from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import (
-    Driver,
-    Readings,
-    StreamDecoder,
-    check_packet,
-    glove_stream,
-    hand_name,
-    raw_unit,
-)
+from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import (
     SEQUENCE_MODULUS,
     SOURCES,
@@ -164,23 +156,23 @@ def glove_descriptor(
     about = DEXTOUCH_V1 if layout is None else layout
     if about.full_scale > FULL_SCALE_COUNTS:
         raise InvalidInputError(
-            f"glove_{hand_name(side, label)}: got layout {about.name!r} with full_scale "
+            f"glove_{base.hand_name(side, label)}: got layout {about.name!r} with full_scale "
             f"{about.full_scale:g}, expected at most {FULL_SCALE_COUNTS}, since its packets hold "
             "16 bits a cell"
         )
-    return glove_stream(
+    return base.glove_stream(
         side,
         label,
         shape=(about.num_raw_cells,),
         dtype="uint16",
-        unit=raw_unit(about),
+        unit=base.raw_unit(about),
         nominal_rate_hz=about.nominal_rate_hz,
         layout=layout,
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
 
-class TactileGloveDecoder(StreamDecoder[Packet]):
+class TactileGloveDecoder(base.StreamDecoder[Packet]):
     """Decodes one glove's byte stream to uint16 counts [cells] in raw scan order.
 
     Args:
@@ -209,7 +201,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
         )
         super().__init__(descriptor, packets)
         self._side: Side | None = side
-        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
+        self._device = f"glove_{'any' if side is None else base.hand_name(side, label)}"
         self._on_reply = on_reply
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
@@ -217,7 +209,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
             if self._on_reply is not None:
                 self._on_reply(packet, t_host_ns)
             return None
-        check_packet(packet, device=self._device, source=self._side)
+        base.check_packet(packet, device=self._device, source=self._side)
         counts = np.frombuffer(packet.payload, _COUNT)
         return Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence)
 
@@ -235,7 +227,7 @@ class Answer(NamedTuple):
     t_answered_host_ns: int
 
 
-class TactileGlove(Driver):
+class TactileGlove(base.Driver):
     """Reads one glove and asks it things.
 
     Every opening asks who it is: a glove of another serial number or of the other hand is
@@ -261,7 +253,7 @@ class TactileGlove(Driver):
         layout: TactileLayout | None = None,
     ) -> None:
         decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label, layout=layout)
-        name = f"glove_{hand_name(side, label)}"
+        name = f"glove_{base.hand_name(side, label)}"
         super().__init__(name, transport=transport, decoder=decoder, clock=clock)
         self._side: Side = side
         self._serial_number = serial_number
@@ -269,7 +261,7 @@ class TactileGlove(Driver):
         # The requests under way, and the replies to them with their arrivals.
         self._asked: dict[int, Reply] = {}
         self._writing = threading.Lock()
-        self._held: Readings = {}
+        self._held: base.Readings = {}
         self._reader: int | None = None
 
     def open(self) -> None:
@@ -283,7 +275,7 @@ class TactileGlove(Driver):
         super().open()
         self._check(self.identify())
 
-    def read(self) -> Readings:
+    def read(self) -> base.Readings:
         """New samples by stream; those that came during a request of this thread go first."""
         self._reader = threading.get_ident()
         if self._held:

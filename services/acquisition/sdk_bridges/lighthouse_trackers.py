@@ -26,20 +26,7 @@ from services.acquisition.devices.pose_tracker import (
     TrackingResult,
 )
 from services.acquisition.drivers.sdk_link import BridgedDevice, BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Y_UP_AXES,
-    Functions,
-    Pace,
-    Reading,
-    Source,
-    hello,
-    import_sdk,
-    load_library,
-    placed_devices,
-    pose_reading,
-    structure,
-)
+from services.acquisition.sdk_bridges import source
 
 Origin = Literal["standing", "raw"]
 OPENVR_INSTALL = "install SteamVR, and `pip install openvr`"
@@ -59,8 +46,8 @@ READ_S = 0.02
 LIST_S = 3.0
 _NO_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 # `SurvivePose` (LinmathPose) of a build in double precision, which is the default.
-SurvivePose = structure("SurvivePose", Pos=ctypes.c_double * 3, Rot=ctypes.c_double * 4)
-FUNCTIONS: Functions = {
+SurvivePose = source.structure("SurvivePose", Pos=ctypes.c_double * 3, Rot=ctypes.c_double * 4)
+FUNCTIONS: source.Functions = {
     "survive_simple_init": (
         ctypes.c_void_p,
         (ctypes.c_int, ctypes.POINTER(ctypes.c_char_p)),
@@ -80,7 +67,7 @@ FUNCTIONS: Functions = {
 }
 
 
-class OpenVrTrackers(Source):
+class OpenVrTrackers(source.Source):
     """Trackers of a running SteamVR.
 
     OpenVR has no stamps of measurements: it extrapolates every pose to the moment of the request
@@ -106,10 +93,10 @@ class OpenVrTrackers(Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = placed_devices(devices)
+        self._devices = source.placed_devices(devices)
         self._origin = origin
         self._clock = clock or StationClock()
-        self._pace = Pace(NOMINAL_RATE_HZ, self._clock)
+        self._pace = source.Pace(NOMINAL_RATE_HZ, self._clock)
         self._longest_call_ns = 0
         self._sdk: ModuleType | None = None
         self._system: Any = None
@@ -128,14 +115,14 @@ class OpenVrTrackers(Source):
         """
         sdk = self._connect()
         self._scan()
-        return hello(
+        return source.hello(
             kind="pose_tracker",
             software=f"OpenVR, Python module {getattr(sdk, '__version__', 'openvr')}",
             devices=tuple(self._devices.values()),
-            frame=Y_UP_AXES,
+            frame=source.Y_UP_AXES,
         )
 
-    def read(self) -> Sequence[Reading]:
+    def read(self) -> Sequence[source.Reading]:
         """The poses of now, 100 times a second.
 
         Raises:
@@ -189,7 +176,7 @@ class OpenVrTrackers(Source):
         return [f"longest call of OpenVR: {self._longest_call_ns / 1e6:.2f} ms"]
 
     def _connect(self) -> ModuleType:
-        self._sdk = sdk = import_sdk("openvr", install=OPENVR_INSTALL)
+        self._sdk = sdk = source.import_sdk("openvr", install=OPENVR_INSTALL)
         try:
             # As a background application, which does not start SteamVR.
             self._system = sdk.init(sdk.VRApplication_Background)
@@ -230,7 +217,7 @@ class OpenVrTrackers(Source):
             if serial in self._devices
         }
 
-    def _reading(self, index: int, device: BridgedDevice, t_ns: int) -> Reading | None:
+    def _reading(self, index: int, device: BridgedDevice, t_ns: int) -> source.Reading | None:
         pose = self._poses[index]
         if not pose.bDeviceIsConnected:
             self.not_sent["disconnected"] += 1
@@ -242,10 +229,10 @@ class OpenVrTrackers(Source):
             self.not_sent["unchanged"] += 1
             return None
         self._last[device.serial_number] = measured
-        return pose_reading(device, t_ns, numbers, result=result, is_valid=is_valid)
+        return source.pose_reading(device, t_ns, numbers, result=result, is_valid=is_valid)
 
 
-class LibsurviveTrackers(Source):
+class LibsurviveTrackers(source.Source):
     """Trackers of libsurvive, which this process runs.
 
     libsurvive gives a pose only after an update, and none while a tracker is not seen. A pose whose
@@ -272,7 +259,7 @@ class LibsurviveTrackers(Source):
         arguments: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._devices = placed_devices(devices)
+        self._devices = source.placed_devices(devices)
         self._path, self._arguments = library, ("dextouch", *arguments)
         self._library: ctypes.CDLL | None = None
         self._context: int | None = None
@@ -287,14 +274,14 @@ class LibsurviveTrackers(Source):
             UnavailableError: the library is not there.
         """
         self._start()
-        return hello(
+        return source.hello(
             kind="pose_tracker",
             software=f"libsurvive, {self._path}",
             devices=tuple(self._devices.values()),
-            frame=OUR_AXES,
+            frame=source.OUR_AXES,
         )
 
-    def read(self) -> Sequence[Reading]:
+    def read(self) -> Sequence[source.Reading]:
         """Poses of updated trackers.
 
         Raises:
@@ -341,7 +328,9 @@ class LibsurviveTrackers(Source):
             self.close()
 
     def _start(self) -> None:
-        self._library = library = load_library(self._path, FUNCTIONS, install=LIBSURVIVE_INSTALL)
+        self._library = library = source.load_library(
+            self._path, FUNCTIONS, install=LIBSURVIVE_INSTALL
+        )
         words = [word.encode() for word in self._arguments]
         argv = (ctypes.c_char_p * (len(words) + 1))(*words)
         self._context = library.survive_simple_init(len(words), argv)
@@ -369,7 +358,7 @@ class LibsurviveTrackers(Source):
             self._found[updated] = self._devices.get(serial) or self._devices.get(name)
         return self._found[updated]
 
-    def _reading(self, updated: int, device: BridgedDevice) -> Reading:
+    def _reading(self, updated: int, device: BridgedDevice) -> source.Reading:
         library, _ = self._opened()
         pose = SurvivePose()
         seconds = library.survive_simple_object_get_latest_pose(updated, ctypes.byref(pose))
@@ -379,8 +368,8 @@ class LibsurviveTrackers(Source):
             abs(float(np.linalg.norm(q_wxyz)) - 1.0) <= NORM_TOLERANCE
         )
         if not is_pose:
-            return pose_reading(
+            return source.pose_reading(
                 device, t_ns, _NO_POSE, result=TrackingResult.UNINITIALIZED, is_valid=False
             )
         T = np.column_stack([rotation_from_quaternion(q_wxyz), position])
-        return pose_reading(device, t_ns, T.ravel().tolist())
+        return source.pose_reading(device, t_ns, T.ravel().tolist())

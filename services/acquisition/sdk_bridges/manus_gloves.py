@@ -20,18 +20,7 @@ from dextouch.hands import NODES, NUM_KEYPOINTS, node_order
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Functions,
-    Reading,
-    Source,
-    hand_device,
-    hand_reading,
-    hello,
-    load_library,
-    structure,
-    wrist_axes,
-)
+from services.acquisition.sdk_bridges import source
 
 LIBRARY = "libManusSDK_Integrated.so"
 INSTALL = (
@@ -57,13 +46,13 @@ READ_S = 0.02
 REPLACED_NS = 1_000_000_000
 
 
-Vec3 = structure("ManusVec3", x=c_float, y=c_float, z=c_float)
-Quaternion = structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
+Vec3 = source.structure("ManusVec3", x=c_float, y=c_float, z=c_float)
+Quaternion = source.structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
 # With its `ManusTransform`.
-SkeletonNode = structure(
+SkeletonNode = source.structure(
     "SkeletonNode", id=c_uint32, position=Vec3, rotation=Quaternion, scale=Vec3
 )
-NodeInfo = structure(
+NodeInfo = source.structure(
     "NodeInfo",
     nodeId=c_uint32,
     parentId=c_uint32,
@@ -71,20 +60,22 @@ NodeInfo = structure(
     side=c_int,
     fingerJointType=c_int,
 )
-RawSkeletonInfo = structure(
+RawSkeletonInfo = source.structure(
     "RawSkeletonInfo", gloveId=c_uint32, nodesCount=c_uint32, publishTime=c_uint64
 )
-SkeletonStreamInfo = structure("SkeletonStreamInfo", publishTime=c_uint64, skeletonsCount=c_uint32)
-CoordinateSystemVUH = structure(
+SkeletonStreamInfo = source.structure(
+    "SkeletonStreamInfo", publishTime=c_uint64, skeletonsCount=c_uint32
+)
+CoordinateSystemVUH = source.structure(
     "CoordinateSystemVUH", view=c_int, up=c_int, handedness=c_int, unitScale=c_float
 )
 # The size of the version differs between releases. It is filled by the SDK and passed back to it,
 # by value on the stack, so that the largest form serves for all.
-ManusHost = structure(
+ManusHost = source.structure(
     "ManusHost", hostName=c_char * 256, ipAddress=c_char * 40, version=c_uint32 * 15
 )
 RawSkeletonCallback = ctypes.CFUNCTYPE(None, POINTER(SkeletonStreamInfo))
-FUNCTIONS: Functions = {
+FUNCTIONS: source.Functions = {
     "CoreSdk_InitializeIntegrated": (c_int, ()),
     "CoreSdk_ShutDown": (c_int, ()),
     "CoreSdk_InitializeCoordinateSystemWithVUH": (c_int, (CoordinateSystemVUH, c_bool)),
@@ -115,7 +106,7 @@ def _node_name(node: ctypes.Structure) -> tuple[str, str]:
     return chain, "distal" if (chain, joint) == ("thumb", "intermediate") else joint
 
 
-class ManusGloves(Source):
+class ManusGloves(source.Source):
     """Hands of MANUS gloves on this host.
 
     The SDK's callback copies the nodes and returns; all else happens in the thread of the bridge.
@@ -141,7 +132,7 @@ class ManusGloves(Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = {side: hand_device(i, side, "manus") for i, side in enumerate(sides)}
+        self._devices = {side: source.hand_device(i, side, "manus") for i, side in enumerate(sides)}
         self._path = library
         self._clock = clock or StationClock()
         self._library: ctypes.CDLL | None = None
@@ -161,7 +152,7 @@ class ManusGloves(Source):
             DeviceError: it does not start.
             UnavailableError: the library is not there.
         """
-        self._library = library = load_library(self._path, FUNCTIONS, install=INSTALL)
+        self._library = library = source.load_library(self._path, FUNCTIONS, install=INSTALL)
         self._call("CoreSdk_InitializeIntegrated")
         self._call("CoreSdk_RegisterCallbackForRawSkeletonStream", self._callback)
         axes = CoordinateSystemVUH(X_FROM_VIEWER, POSITIVE_Z, RIGHT_HANDED, METRES)
@@ -171,15 +162,15 @@ class ManusGloves(Source):
         library.ManusHost_Init(ctypes.byref(host))
         self._call("CoreSdk_ConnectToHost", host)
         self._call("CoreSdk_SetRawSkeletonHandMotion", NO_HAND_MOTION)
-        return hello(
+        return source.hello(
             kind="finger_tracker",
             software=f"MANUS Core SDK, {self._path}",
             devices=tuple(self._devices.values()),
-            frame=OUR_AXES,
+            frame=source.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[Reading]:
+    def read(self) -> Sequence[source.Reading]:
         """Hands that the SDK has published since the last call.
 
         Raises:
@@ -235,7 +226,7 @@ class ManusGloves(Source):
                 self._skeletons.append(_Skeleton(t_ns, info.gloveId, info.publishTime, nodes))
         self._has_some.set()
 
-    def _reading(self, skeleton: _Skeleton) -> Reading | None:
+    def _reading(self, skeleton: _Skeleton) -> source.Reading | None:
         side, places = self._glove(skeleton)
         owner, owner_ns = self._owners.get(side, (skeleton.glove_id, 0))
         is_other = owner != skeleton.glove_id and skeleton.t_ns - owner_ns < REPLACED_NS
@@ -257,8 +248,8 @@ class ManusGloves(Source):
         if not np.isfinite(q_wxyz).all() or abs(float(np.linalg.norm(q_wxyz)) - 1.0) > 1e-3:
             self.not_sent["no wrist"] += 1
             return None
-        relative = wrist_axes(points, wrist, q_wxyz)
-        return hand_reading(
+        relative = source.wrist_axes(points, wrist, q_wxyz)
+        return source.hand_reading(
             self._devices[side], skeleton.t_ns, relative, np.isfinite(relative).all(axis=1)
         )
 

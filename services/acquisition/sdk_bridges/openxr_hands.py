@@ -22,20 +22,7 @@ from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import NOMINAL_RATE_HZ
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Functions,
-    Pace,
-    Reading,
-    Source,
-    hand_device,
-    hand_reading,
-    hello,
-    load_library,
-    station_offset_ns,
-    structure,
-    wrist_axes,
-)
+from services.acquisition.sdk_bridges import source
 
 LIBRARY = "libopenxr_loader.so.1"
 INSTALL = "install it (Debian: apt install libopenxr-loader1), or name it with --library"
@@ -64,10 +51,10 @@ Handle = c_uint64
 
 def _typed(name: str, **fields: object) -> type[ctypes.Structure]:
     """A structure that begins with its type, as all that the functions take."""
-    return structure(name, type=c_int, next=ctypes.c_void_p, **fields)
+    return source.structure(name, type=c_int, next=ctypes.c_void_p, **fields)
 
 
-ApplicationInfo = structure(
+ApplicationInfo = source.structure(
     "XrApplicationInfo",
     applicationName=c_char * 128,
     applicationVersion=c_uint32,
@@ -89,7 +76,7 @@ SystemGetInfo = _typed("XrSystemGetInfo", formFactor=c_int)
 SessionCreateInfo = _typed("XrSessionCreateInfo", createFlags=c_uint64, systemId=c_uint64)
 SessionBeginInfo = _typed("XrSessionBeginInfo", primaryViewConfigurationType=c_int)
 # Quaternion x y z w, then position.
-Posef = structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
+Posef = source.structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
 ReferenceSpaceCreateInfo = _typed(
     "XrReferenceSpaceCreateInfo", referenceSpaceType=c_int, poseInReferenceSpace=Posef
 )
@@ -100,7 +87,7 @@ SessionStateChanged = _typed(
 )
 HandTrackerCreateInfo = _typed("XrHandTrackerCreateInfoEXT", hand=c_int, handJointSet=c_int)
 HandJointsLocateInfo = _typed("XrHandJointsLocateInfoEXT", baseSpace=Handle, time=c_int64)
-HandJointLocation = structure(
+HandJointLocation = source.structure(
     "XrHandJointLocationEXT", locationFlags=c_uint64, pose=Posef, radius=c_float
 )
 HandJointLocations = _typed(
@@ -109,8 +96,8 @@ HandJointLocations = _typed(
     jointCount=c_uint32,
     jointLocations=POINTER(HandJointLocation),
 )
-Timespec = structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
-FUNCTIONS: Functions = {
+Timespec = source.structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
+FUNCTIONS: source.Functions = {
     "xrCreateInstance": (c_int, (POINTER(InstanceCreateInfo), POINTER(Handle))),
     "xrDestroyInstance": (c_int, (Handle,)),
     "xrGetSystem": (c_int, (Handle, POINTER(SystemGetInfo), POINTER(c_uint64))),
@@ -133,7 +120,7 @@ EXTENSION_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 }
 
 
-class OpenXrHands(Source):
+class OpenXrHands(source.Source):
     """Tracked hands of an OpenXR runtime with headless sessions, such as Monado.
 
     Every joint whose position is not both valid and tracked is sent as not seen, and all of them
@@ -160,10 +147,12 @@ class OpenXrHands(Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = {side: hand_device(i, side, "openxr") for i, side in enumerate(sides)}
+        self._devices = {
+            side: source.hand_device(i, side, "openxr") for i, side in enumerate(sides)
+        }
         self._path = library
         self._clock = clock or StationClock()
-        self._pace = Pace(NOMINAL_RATE_HZ, self._clock)
+        self._pace = source.Pace(NOMINAL_RATE_HZ, self._clock)
         self._library: ctypes.CDLL | None = None
         self._instance, self._session, self._space = Handle(), Handle(), Handle()
         self._trackers: dict[Side, Handle] = {}
@@ -177,7 +166,7 @@ class OpenXrHands(Source):
             DeviceError: no runtime, one without these extensions, or without a headset.
             UnavailableError: the loader is not installed.
         """
-        self._library = load_library(self._path, FUNCTIONS, install=INSTALL)
+        self._library = source.load_library(self._path, FUNCTIONS, install=INSTALL)
         names = (c_char_p * len(EXTENSIONS))(*EXTENSIONS)
         about = InstanceCreateInfo(TYPE_INSTANCE)
         about.applicationInfo = ApplicationInfo(b"dextouch", 1, b"", 0, API_VERSION_1_0)
@@ -205,15 +194,15 @@ class OpenXrHands(Source):
             self._call(
                 "xrCreateHandTrackerEXT", self._session, byref(hand), byref(self._trackers[side])
             )
-        return hello(
+        return source.hello(
             kind="finger_tracker",
             software="OpenXR, XR_EXT_hand_tracking",
             devices=tuple(self._devices.values()),
-            frame=OUR_AXES,
+            frame=source.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[Reading]:
+    def read(self) -> Sequence[source.Reading]:
         """The hands of now, 120 times a second.
 
         Raises:
@@ -230,7 +219,7 @@ class OpenXrHands(Source):
             byref(Timespec(seconds, nanoseconds)),
             byref(xr_time),
         )
-        t_ns = t_monotonic_ns + station_offset_ns(self._clock)
+        t_ns = t_monotonic_ns + source.station_offset_ns(self._clock)
         readings = (self._reading(side, xr_time, t_ns) for side in self._devices)
         return [reading for reading in readings if reading is not None]
 
@@ -274,7 +263,7 @@ class OpenXrHands(Source):
                     raise DeviceError(f"OpenXR: the runtime ends the session (state {state})")
             event = EventDataBuffer(TYPE_EVENT)
 
-    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> Reading | None:
+    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> source.Reading | None:
         joints = (HandJointLocation * NUM_JOINTS)()
         request = HandJointsLocateInfo(TYPE_LOCATE, None, self._space, xr_time)
         found = HandJointLocations(TYPE_LOCATIONS, None, 0, NUM_JOINTS, joints)
@@ -292,9 +281,11 @@ class OpenXrHands(Source):
         has_wrist = is_seen[WRIST_JOINT] and wrist.locationFlags & turned == turned
         if not (found.isActive and has_wrist):
             nowhere = np.full((len(NODES), 3), np.nan)
-            return hand_reading(self._devices[side], t_ns, nowhere, np.zeros(len(NODES), bool))
+            return source.hand_reading(
+                self._devices[side], t_ns, nowhere, np.zeros(len(NODES), bool)
+            )
         points = np.array([list(joint.pose.position) for joint in joints])
         x, y, z, w = wrist.pose.orientation
-        relative = wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
+        relative = source.wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
         ours = relative[KEYPOINT_JOINTS] * OUR_SIGNS[side]
-        return hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])
+        return source.hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])
