@@ -16,27 +16,15 @@ from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import PracticeStatus
 from dextouch.serving import RequireScope, create_service_app, serve
 from dextouch.tactile import TactileLayout, read_layout
+from services.acquisition import retention, routes
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
-from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.health.metrics import HealthCollector, RecorderCollector
 from services.acquisition.recorder import Recorder, keep_for_life
-from services.acquisition.retention import (
-    DeletedTakes,
-    OperatorNames,
-    remove_take,
-    spooled_takes,
-)
-from services.acquisition.routes import (
-    faults_router,
-    live_router,
-    recorder_router,
-    station_router,
-    uploads_router,
-)
 from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
+from services.acquisition.watches import MakeFollowCheck
 
 if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
@@ -152,8 +140,8 @@ def practice_app(settings: AcquisitionSettings) -> FastAPI:
     practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
     with disk_errors(f"make the spool {spool}"):
         spool.mkdir(parents=True, exist_ok=True)
-    for take in spooled_takes(spool):
-        remove_take(take)
+    for take in retention.spooled_takes(spool):
+        retention.remove_take(take)
     mock = MockStation(
         pattern.practice_streams(settings.seed, layout=_mock_layout(settings)),
         FaultScript(devices=pattern.PRACTICE_FAULTS),
@@ -185,7 +173,7 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
     streams, known = pattern_streams(layout=layout), pattern_calibration()
     if settings.mock_store is not None and settings.mock_episode_id is not None:
         from dextouch.episodes import EpisodeStore
-        from services.acquisition.mocks.replay import replay_calibration, replay_streams
+        from services.acquisition.mocks.replay import replay_streams
 
         if layout is not None:
             raise InvalidInputError(
@@ -193,7 +181,7 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
                 "them: an episode says the layout of its gloves"
             )
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
-        streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
+        streams, known = replay_streams(episode), {**known, **episode.attributes.matrices()}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
@@ -223,11 +211,11 @@ def _make_uploader(settings: AcquisitionSettings, recorder: Recorder) -> Uploade
         store,
         period_s=settings.upload_period_s,
         retention=settings,
-        deleted=DeletedTakes(
+        deleted=retention.DeletedTakes(
             settings.spool,
             settings.station,
             stored_as=ids_in_store,
-            operators=OperatorNames(recorder.session_operators, recorder.forget_operator),
+            operators=retention.OperatorNames(recorder.session_operators, recorder.forget_operator),
         ),
     )
 
@@ -300,11 +288,11 @@ def _station_app(
         name="acquisition",
         settings=settings,
         routers=[
-            recorder_router(station),
-            station_router(station, uploads),
-            uploads_router(uploads),
-            live_router(station),
-            faults_router(mock),
+            routes.recorder_router(station),
+            routes.station_router(station, uploads),
+            routes.uploads_router(uploads),
+            routes.live_router(station),
+            routes.faults_router(mock),
             *([practice.router()] if practice is not None else []),
         ],
         lifespan=lifespan,

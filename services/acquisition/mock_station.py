@@ -19,7 +19,6 @@ from services.acquisition.devices import kinds
 from services.acquisition.devices.camera import CameraDecoder
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
-from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
@@ -32,6 +31,7 @@ from services.acquisition.mocks.trackers_and_cameras import (
 )
 from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
+from services.acquisition.watches import MakeFollowCheck
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")

@@ -29,9 +29,7 @@ from dextouch.serving import ServedFolder
 from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
-from services.acquisition.follow_watch import FollowWatch
 from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.path_latency import add_latencies
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import (
     DeviceEvents,
@@ -40,6 +38,7 @@ from services.acquisition.take import (
     check_free_space,
     incomplete_cause,
 )
+from services.acquisition.watches import FollowWatch, add_latencies
 
 logger = structlog.get_logger(__name__)
 

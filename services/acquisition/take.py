@@ -30,13 +30,13 @@ from dextouch.schemas import (
 from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch, StreamDescriptor
 from services.acquisition.clock import HostWatch, PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.follow_watch import FollowCounts, FollowWatch
 from services.acquisition.health.causes import SIMULATED_ADVICE
 from services.acquisition.health.cells import count_taxels, is_ours
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import StreamCounters
+from services.acquisition.watches import FollowCounts, FollowWatch
 
 logger = structlog.get_logger(__name__)
 

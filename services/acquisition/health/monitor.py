@@ -8,7 +8,6 @@ from dextouch import schemas
 from dextouch.streams import BODIES, StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
-from services.acquisition.follow_watch import FollowWatch
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.cells import (
     TaxelCheck,
@@ -46,8 +45,8 @@ from services.acquisition.health.streams import (
     SampleQueue,
     TrackingCheck,
 )
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import FollowWatch, PathWatch
 
 TICK_NS = 100_000_000
 PERIOD_NS = 1_000_000_000

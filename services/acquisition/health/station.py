@@ -21,8 +21,8 @@ from services.acquisition.health.evaluation import (
     Finding,
     Rolling,
 )
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import PathWatch
 
 MIN_RATE_SPAN_NS = 900_000_000
 CALIBRATED_AT = "calibrated_at_unix_s"

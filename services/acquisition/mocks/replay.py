@@ -361,8 +361,3 @@ def replay_streams(reader: EpisodeReader) -> list[ReplayStream]:
         wanted = plain if descriptor.kind == "image" else descriptor
         streams.append(ReplayStream(wanted, data.t_ref_ns, data.values))
     return streams
-
-
-def replay_calibration(reader: EpisodeReader) -> dict[str, Matrix]:
-    """What a stored episode knows of its cameras and mounts."""
-    return reader.attributes.matrices()
