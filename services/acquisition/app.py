@@ -35,8 +35,7 @@ PRACTICE_PATH: Final = "/practice"
 class Practice:
     """An ASGI application that serves the practice station while there is one.
 
-    Args:
-        make: makes the application of the practice station; None where devices are real.
+    `make` makes it; None where devices are real.
     """
 
     def __init__(self, make: Callable[[], FastAPI] | None) -> None:

@@ -128,15 +128,9 @@ class JustFloatFrames(PortionedSearch[bytes]):
 class JustFloatGloveDecoder(base.StreamDecoder[bytes]):
     """Decodes one glove's byte stream to float32 [num_values], without stamp and number.
 
-    Without a sequence, losses cannot be counted.
-
-    Args:
-        side: of the glove; the packets do not contain it.
-        num_values: float32s of a packet (known versions send 401, 415 or 615).
-        full_scale: the largest reading; packets with larger ones are held back.
-        rate_hz: nominal rate; the stream has no device clock.
-        label: of a further glove of this hand.
-        layout: of its taxels; None where only the calibration maps them to those of `dextouch_v1`.
+    Without a sequence, losses cannot be counted. Known versions send 401, 415 or 615 values;
+    packets with larger ones than `full_scale` are held back. `label` is that of a further glove of
+    this hand, `layout` None where only the calibration maps its taxels to those of `dextouch_v1`.
     """
 
     def __init__(
@@ -193,12 +187,7 @@ def are_readings(values: Float32[np.ndarray, " n"], largest_bits: int) -> bool:
 class JustFloatGloveSettings(GloveSettings):
     """Settings of a glove on a serial port whose packets do not describe themselves.
 
-    Each must be set where no `layout` says it.
-
-    Attributes:
-        num_values: float32s of a packet.
-        full_scale: the largest reading.
-        rate_hz: nominal rate.
+    Number of float32s, largest reading and nominal rate must be set where no `layout` says them.
     """
 
     kind: Literal["justfloat_glove"] = "justfloat_glove"

@@ -175,12 +175,8 @@ def glove_descriptor(
 class TactileGloveDecoder(base.StreamDecoder[Packet]):
     """Decodes one glove's byte stream to uint16 counts [cells] in raw scan order.
 
-    Args:
-        side: which glove it must be; None takes any.
-        on_reply: takes each reply to a command with its arrival; without it replies are passed
-            over.
-        label: of a further glove of this hand.
-        layout: of its taxels; None of `dextouch_v1`.
+    Without a side it takes any glove. `on_reply` takes each reply to a command with its arrival.
+    `label` is that of a further glove of this hand, `layout` None of a `dextouch_v1`.
     """
 
     def __init__(
@@ -231,15 +227,8 @@ class TactileGlove(base.Driver):
     """Reads one glove and asks it things.
 
     Every opening asks who it is: a glove of another serial number or of the other hand is
-    refused by name before any sample is taken from it.
-
-    Args:
-        side: which hand's glove it must be.
-        transport: where it is.
-        clock: of the station.
-        serial_number: that it must have; None takes any.
-        label: of a further glove of this hand.
-        layout: of its taxels; None of `dextouch_v1`.
+    refused by name before any sample is taken from it. Without a serial number any is taken.
+    `label` is that of a further glove of this hand, `layout` None of a `dextouch_v1`.
     """
 
     def __init__(

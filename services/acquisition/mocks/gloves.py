@@ -137,12 +137,10 @@ def mock_glove(
     calibration: GloveCalibration | None = None,
     worn_side: Side | None = None,
 ) -> replay.MockPair:
-    """Our own glove, which answers commands.
+    """Our own glove, which answers commands; its serial number is the name of its place.
 
-    Args:
-        place: where it stands; its serial number is its name.
-        calibration: of this glove; made from the seed if None.
-        worn_side: which hand it says it is, if it is the wrong one.
+    Without a calibration one is made from the seed; `worn_side` is the hand that it says it is, if
+    that is the wrong one.
     """
     name, side = place.name, place.side
     unit_seed = place.seed if place.unit_seed is None else place.unit_seed
@@ -163,13 +161,9 @@ def mock_glove(
 
 
 class TactileGloveSource(replay.PacketSource):
-    """Packets of one glove.
+    """Packets of one glove, of a stream float32 [n, taxels] in kPa.
 
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand.
-        calibration: of this glove.
-        faults: whose dead and drifted raw cells are planted.
+    Dead and drifted raw cells of the faults are planted.
     """
 
     edits = OurPacketEdits({"stuck": 1_000.0, "saturated": float(tactile_glove.FULL_SCALE_COUNTS)})
@@ -262,12 +256,8 @@ class JustFloatPacketEdits(PacketEdits):
 class JustFloatGloveSource(replay.PacketSource):
     """Packets of one glove: the taxels' counts, then zeros in the slots that mean nothing.
 
-    With a layout they are readings in its unit and in the order of its raw cells.
-
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand; only needed with a layout.
-        dead_taxels: places in the packet that read zero.
+    With a layout, for which the side is needed, they are readings in its unit and in the order of
+    its raw cells. `stream` is float32 [n, taxels] in kPa; `dead_taxels` of the packet read zero.
     """
 
     edits = JustFloatPacketEdits({"stuck": 1_000.0, "saturated": FULL_SCALE})
@@ -331,12 +321,9 @@ class WujiPacketEdits(PacketEdits):
 
 
 class WujiGloveSource(replay.PacketSource):
-    """Packets of one glove.
+    """Packets of one glove, of a stream float32 [n, taxels] in kPa.
 
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand.
-        dead_taxels: cells of the grid, row by row, that read zero.
+    `dead_taxels` are cells of the grid, row by row, that read zero.
     """
 
     edits = WujiPacketEdits({"stuck": 0.25, "saturated": 1.0})

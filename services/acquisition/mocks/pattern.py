@@ -76,9 +76,7 @@ def pattern_streams(
 ) -> list[ReplayStream]:
     """All human streams of one round; the end meets the beginning.
 
-    Args:
-        round_s: how long it takes.
-        layout: of the gloves; None for `dextouch_v1`.
+    `layout` is that of the gloves; None for `dextouch_v1`.
     """
     glove = layout or DEXTOUCH_V1
 

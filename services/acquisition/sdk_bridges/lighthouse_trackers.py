@@ -77,7 +77,6 @@ class OpenVrTrackers(source.Source):
     Args:
         devices: by the serial number where the device sits.
         origin: `standing`, the play area of the room setup, or `raw`, the driver's own.
-        clock: of this host.
     """
 
     clock = (

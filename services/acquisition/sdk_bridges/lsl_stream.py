@@ -31,10 +31,7 @@ CORRECTION_PERIOD_S = 1.0
 class LslStream(source.Source):
     """One outlet of the Lab Streaming Layer with numeric channels.
 
-    Args:
-        value: what the outlet must have.
-        by: which property has it: `name`, `type` or `source_id`.
-        clock: of this host.
+    Its property `by` (`name`, `type` or `source_id`) has the value.
     """
 
     clock = (

@@ -111,12 +111,8 @@ class ManusGloves(source.Source):
 
     The SDK's callback copies the nodes and returns; all else happens in the thread of the bridge.
     Keypoints are relative to the wrist node and in its axes, which are not ours: calibrate them
-    with `dextouch station calibrate wrist`.
-
-    Args:
-        sides: the hands to serve; of several gloves of one side, the first one that streams.
-        library: name or path of the shared library.
-        clock: of this host.
+    with `dextouch station calibrate wrist`. Of several gloves of one side, the first one that
+    streams is served.
     """
 
     clock = (

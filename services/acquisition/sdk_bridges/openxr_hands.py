@@ -125,12 +125,7 @@ class OpenXrHands(source.Source):
 
     Every joint whose position is not both valid and tracked is sent as not seen, and all of them
     where the hand is not active or its wrist is not tracked: a runtime may extrapolate or infer
-    joints that nobody sees.
-
-    Args:
-        sides: the hands to serve.
-        library: name or path of the OpenXR loader.
-        clock: of this host.
+    joints that nobody sees. `library` is name or path of the OpenXR loader.
     """
 
     clock = (

@@ -149,10 +149,7 @@ def _clear_path(path: Path) -> None:
 class BridgeServer:
     """Listens for stations and sends them packets and signs of life.
 
-    Args:
-        hello: of the source.
-        address: a host and port (0: any free one), or the path of a local socket.
-        clock: of this host.
+    The address is a host and port (0: any free one), or the path of a local socket.
 
     Raises:
         InvalidInputError: the address is in use or not one of this host.
@@ -306,14 +303,7 @@ def run_bridge(
     """Serve a source until `stop` is set, opening it again whenever it is lost.
 
     It listens as soon as the source was opened once. While the source is away, stations get signs
-    of life and no samples.
-
-    Args:
-        source: the SDK.
-        address: where stations connect: host and port, or the path of a local socket.
-        stop: ends it.
-        say: shows a line to people.
-        clock: of this host.
+    of life and no samples. The address is as of `BridgeServer`; `say` shows a line to people.
 
     Raises:
         InvalidInputError: nothing can listen at the address.

@@ -106,11 +106,7 @@ class Source(ABC):
 
 
 def import_sdk(module: str, *, install: str) -> ModuleType:
-    """The Python module of an SDK.
-
-    Args:
-        module: its name.
-        install: what to do where it is missing.
+    """The Python module of an SDK; `install` says what to do where it is missing.
 
     Raises:
         UnavailableError: it, or the shared library that it needs, is not installed.
@@ -129,12 +125,7 @@ def structure(name: str, **fields: object) -> type[ctypes.Structure]:
 
 
 def load_library(path: str, functions: Functions, *, install: str) -> ctypes.CDLL:
-    """A shared library with the types of its functions set.
-
-    Args:
-        path: its name or path, as for the dynamic loader.
-        functions: those that are used.
-        install: what to do where it is missing.
+    """A shared library, by name or path, with the types of the used functions set.
 
     Raises:
         UnavailableError: it is not there, or lacks a function.
@@ -238,12 +229,7 @@ def hand_device(index: int, side: Side, sdk: str) -> BridgedDevice:
 
 
 class Pace:
-    """Waits for the next of evenly spaced moments, and leaves out those that have passed.
-
-    Args:
-        rate_hz: of the moments.
-        clock: on which it waits.
-    """
+    """Waits for the next of evenly spaced moments, and leaves out those that have passed."""
 
     def __init__(self, rate_hz: float, clock: StationClock) -> None:
         self._period_ns = round(1e9 / rate_hz)
