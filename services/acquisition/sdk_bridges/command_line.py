@@ -13,7 +13,7 @@ from dextouch.free_text import printable
 
 # The help is shown without SDKs and drivers.
 if TYPE_CHECKING:
-    from services.acquisition.sdk_bridges.source import Source
+    from services.acquisition.sdk_bridges.bridge import Source
 
 # Chosen: five ports in a row that no other service of ours uses.
 PORTS: Final = {"openvr": 9110, "libsurvive": 9111, "manus": 9112, "openxr": 9113, "lsl": 9114}
@@ -237,7 +237,7 @@ def _placed(devices: Sequence[tuple[str, str]]) -> dict[str, str]:
 
 def main(arguments: Sequence[str]) -> int:
     """Run `dextouch station bridge`."""
-    from services.acquisition.sdk_bridges.server import run_bridge
+    from services.acquisition.sdk_bridges.bridge import run_bridge
 
     options = bridge_parser().parse_args(arguments)
     source = build_source(options)

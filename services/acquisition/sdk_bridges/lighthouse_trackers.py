@@ -26,7 +26,7 @@ from services.acquisition.devices.pose_tracker import (
     TrackingResult,
 )
 from services.acquisition.drivers.sdk_link import BridgedDevice, BridgeHello
-from services.acquisition.sdk_bridges import source
+from services.acquisition.sdk_bridges import bridge
 
 Origin = Literal["standing", "raw"]
 OPENVR_INSTALL = "install SteamVR, and `pip install openvr`"
@@ -46,8 +46,8 @@ READ_S = 0.02
 LIST_S = 3.0
 _NO_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 # `SurvivePose` (LinmathPose) of a build in double precision, which is the default.
-SurvivePose = source.structure("SurvivePose", Pos=ctypes.c_double * 3, Rot=ctypes.c_double * 4)
-FUNCTIONS: source.Functions = {
+SurvivePose = bridge.structure("SurvivePose", Pos=ctypes.c_double * 3, Rot=ctypes.c_double * 4)
+FUNCTIONS: bridge.Functions = {
     "survive_simple_init": (
         ctypes.c_void_p,
         (ctypes.c_int, ctypes.POINTER(ctypes.c_char_p)),
@@ -67,7 +67,7 @@ FUNCTIONS: source.Functions = {
 }
 
 
-class OpenVrTrackers(source.Source):
+class OpenVrTrackers(bridge.Source):
     """Trackers of a running SteamVR.
 
     OpenVR has no stamps of measurements: it extrapolates every pose to the moment of the request
@@ -92,10 +92,10 @@ class OpenVrTrackers(source.Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = source.placed_devices(devices)
+        self._devices = bridge.placed_devices(devices)
         self._origin = origin
         self._clock = clock or StationClock()
-        self._pace = source.Pace(NOMINAL_RATE_HZ, self._clock)
+        self._pace = bridge.Pace(NOMINAL_RATE_HZ, self._clock)
         self._longest_call_ns = 0
         self._sdk: ModuleType | None = None
         self._system: Any = None
@@ -114,14 +114,14 @@ class OpenVrTrackers(source.Source):
         """
         sdk = self._connect()
         self._scan()
-        return source.hello(
+        return bridge.hello(
             kind="pose_tracker",
             software=f"OpenVR, Python module {getattr(sdk, '__version__', 'openvr')}",
             devices=tuple(self._devices.values()),
-            frame=source.Y_UP_AXES,
+            frame=bridge.Y_UP_AXES,
         )
 
-    def read(self) -> Sequence[source.Reading]:
+    def read(self) -> Sequence[bridge.Reading]:
         """The poses of now, 100 times a second.
 
         Raises:
@@ -175,7 +175,7 @@ class OpenVrTrackers(source.Source):
         return [f"longest call of OpenVR: {self._longest_call_ns / 1e6:.2f} ms"]
 
     def _connect(self) -> ModuleType:
-        self._sdk = sdk = source.import_sdk("openvr", install=OPENVR_INSTALL)
+        self._sdk = sdk = bridge.import_sdk("openvr", install=OPENVR_INSTALL)
         try:
             # As a background application, which does not start SteamVR.
             self._system = sdk.init(sdk.VRApplication_Background)
@@ -216,7 +216,7 @@ class OpenVrTrackers(source.Source):
             if serial in self._devices
         }
 
-    def _reading(self, index: int, device: BridgedDevice, t_ns: int) -> source.Reading | None:
+    def _reading(self, index: int, device: BridgedDevice, t_ns: int) -> bridge.Reading | None:
         pose = self._poses[index]
         if not pose.bDeviceIsConnected:
             self.not_sent["disconnected"] += 1
@@ -228,10 +228,10 @@ class OpenVrTrackers(source.Source):
             self.not_sent["unchanged"] += 1
             return None
         self._last[device.serial_number] = measured
-        return source.pose_reading(device, t_ns, numbers, result=result, is_valid=is_valid)
+        return bridge.pose_reading(device, t_ns, numbers, result=result, is_valid=is_valid)
 
 
-class LibsurviveTrackers(source.Source):
+class LibsurviveTrackers(bridge.Source):
     """Trackers of libsurvive, which this process runs.
 
     libsurvive gives a pose only after an update, and none while a tracker is not seen. A pose whose
@@ -258,7 +258,7 @@ class LibsurviveTrackers(source.Source):
         arguments: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._devices = source.placed_devices(devices)
+        self._devices = bridge.placed_devices(devices)
         self._path, self._arguments = library, ("dextouch", *arguments)
         self._library: ctypes.CDLL | None = None
         self._context: int | None = None
@@ -273,14 +273,14 @@ class LibsurviveTrackers(source.Source):
             UnavailableError: the library is not there.
         """
         self._start()
-        return source.hello(
+        return bridge.hello(
             kind="pose_tracker",
             software=f"libsurvive, {self._path}",
             devices=tuple(self._devices.values()),
-            frame=source.OUR_AXES,
+            frame=bridge.OUR_AXES,
         )
 
-    def read(self) -> Sequence[source.Reading]:
+    def read(self) -> Sequence[bridge.Reading]:
         """Poses of updated trackers.
 
         Raises:
@@ -327,7 +327,7 @@ class LibsurviveTrackers(source.Source):
             self.close()
 
     def _start(self) -> None:
-        self._library = library = source.load_library(
+        self._library = library = bridge.load_library(
             self._path, FUNCTIONS, install=LIBSURVIVE_INSTALL
         )
         words = [word.encode() for word in self._arguments]
@@ -357,7 +357,7 @@ class LibsurviveTrackers(source.Source):
             self._found[updated] = self._devices.get(serial) or self._devices.get(name)
         return self._found[updated]
 
-    def _reading(self, updated: int, device: BridgedDevice) -> source.Reading:
+    def _reading(self, updated: int, device: BridgedDevice) -> bridge.Reading:
         library, _ = self._opened()
         pose = SurvivePose()
         seconds = library.survive_simple_object_get_latest_pose(updated, ctypes.byref(pose))
@@ -367,8 +367,8 @@ class LibsurviveTrackers(source.Source):
             abs(float(np.linalg.norm(q_wxyz)) - 1.0) <= NORM_TOLERANCE
         )
         if not is_pose:
-            return source.pose_reading(
+            return bridge.pose_reading(
                 device, t_ns, _NO_POSE, result=TrackingResult.UNINITIALIZED, is_valid=False
             )
         T = np.column_stack([rotation_from_quaternion(q_wxyz), position])
-        return source.pose_reading(device, t_ns, T.ravel().tolist())
+        return bridge.pose_reading(device, t_ns, T.ravel().tolist())

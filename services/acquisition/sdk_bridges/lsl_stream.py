@@ -15,7 +15,7 @@ from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgeHello
-from services.acquisition.sdk_bridges import source
+from services.acquisition.sdk_bridges import bridge
 
 INSTALL = "`pip install pylsl`"
 # Chosen: outlets of the same network answer within half a second, and the bridge tries again.
@@ -28,7 +28,7 @@ MAX_SAMPLES = 256
 CORRECTION_PERIOD_S = 1.0
 
 
-class LslStream(source.Source):
+class LslStream(bridge.Source):
     """One outlet of the Lab Streaming Layer with numeric channels.
 
     Its property `by` (`name`, `type` or `source_id`) has the value.
@@ -54,7 +54,7 @@ class LslStream(source.Source):
             InvalidInputError: several, or one without numbers.
             UnavailableError: pylsl is not installed.
         """
-        lsl = source.import_sdk("pylsl", install=INSTALL)
+        lsl = bridge.import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)
         if not found:
             raise DeviceError(
@@ -79,15 +79,15 @@ class LslStream(source.Source):
         self._inlet = lsl.StreamInlet(info, recover=False, max_buflen=1)
         self._guarded(lambda: self._inlet.open_stream(CORRECTION_S))
         self._correct(CORRECTION_S)
-        return source.hello(
+        return bridge.hello(
             kind="numbers",
             software=f"liblsl {lsl.library_version()}, outlet {info.name()} at {info.hostname()}",
             devices=({"index": 0, "serial_number": self._value, "source": "none"},),
-            frame=source.OUR_AXES,
+            frame=bridge.OUR_AXES,
             channels=num_channels,
         )
 
-    def read(self) -> Sequence[source.Reading]:
+    def read(self) -> Sequence[bridge.Reading]:
         """New samples.
 
         Raises:
@@ -98,12 +98,12 @@ class LslStream(source.Source):
         samples, stamps = self._guarded(
             lambda: self._inlet.pull_chunk(timeout=READ_S, max_samples=MAX_SAMPLES, min_samples=1)
         )
-        offset_ns = source.station_offset_ns(self._clock)
+        offset_ns = bridge.station_offset_ns(self._clock)
         readings = []
         for values, stamp_s in zip(samples, stamps, strict=True):
             t_ns = round((stamp_s + self._correction_s) * 1e9) + offset_ns
             payload = struct.pack(f"<{len(values)}d", *values)
-            readings.append(source.Reading(self._value, SOURCES["none"], t_ns, payload))
+            readings.append(bridge.Reading(self._value, SOURCES["none"], t_ns, payload))
         return readings
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class LslStream(source.Source):
 
     def present(self) -> list[str]:
         """Name, type, source_id and shape of every outlet of the network."""
-        lsl = source.import_sdk("pylsl", install=INSTALL)
+        lsl = bridge.import_sdk("pylsl", install=INSTALL)
         return [
             f"{info.name()} (type {info.type()}, source_id {info.source_id()}, "
             f"{info.channel_count()} channels, {info.nominal_srate():g} Hz, {info.hostname()})"
@@ -144,7 +144,7 @@ class LslStream(source.Source):
     def _correct(self, timeout_s: float) -> None:
         """Ask liblsl for the present offset; the last one stays where it has no newer one."""
         self._corrected_s = time.monotonic()
-        lib = source.import_sdk("pylsl.lib", install=INSTALL).lib
+        lib = bridge.import_sdk("pylsl.lib", install=INSTALL).lib
         function = lib.lsl_time_correction_ex
         function.restype = ctypes.c_double
         remote_s, uncertainty_s, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int32()

@@ -20,7 +20,7 @@ from dextouch.hands import NODES, NUM_KEYPOINTS, node_order
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges import source
+from services.acquisition.sdk_bridges import bridge
 
 LIBRARY = "libManusSDK_Integrated.so"
 INSTALL = (
@@ -46,13 +46,13 @@ READ_S = 0.02
 REPLACED_NS = 1_000_000_000
 
 
-Vec3 = source.structure("ManusVec3", x=c_float, y=c_float, z=c_float)
-Quaternion = source.structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
+Vec3 = bridge.structure("ManusVec3", x=c_float, y=c_float, z=c_float)
+Quaternion = bridge.structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
 # With its `ManusTransform`.
-SkeletonNode = source.structure(
+SkeletonNode = bridge.structure(
     "SkeletonNode", id=c_uint32, position=Vec3, rotation=Quaternion, scale=Vec3
 )
-NodeInfo = source.structure(
+NodeInfo = bridge.structure(
     "NodeInfo",
     nodeId=c_uint32,
     parentId=c_uint32,
@@ -60,22 +60,22 @@ NodeInfo = source.structure(
     side=c_int,
     fingerJointType=c_int,
 )
-RawSkeletonInfo = source.structure(
+RawSkeletonInfo = bridge.structure(
     "RawSkeletonInfo", gloveId=c_uint32, nodesCount=c_uint32, publishTime=c_uint64
 )
-SkeletonStreamInfo = source.structure(
+SkeletonStreamInfo = bridge.structure(
     "SkeletonStreamInfo", publishTime=c_uint64, skeletonsCount=c_uint32
 )
-CoordinateSystemVUH = source.structure(
+CoordinateSystemVUH = bridge.structure(
     "CoordinateSystemVUH", view=c_int, up=c_int, handedness=c_int, unitScale=c_float
 )
 # The size of the version differs between releases. It is filled by the SDK and passed back to it,
 # by value on the stack, so that the largest form serves for all.
-ManusHost = source.structure(
+ManusHost = bridge.structure(
     "ManusHost", hostName=c_char * 256, ipAddress=c_char * 40, version=c_uint32 * 15
 )
 RawSkeletonCallback = ctypes.CFUNCTYPE(None, POINTER(SkeletonStreamInfo))
-FUNCTIONS: source.Functions = {
+FUNCTIONS: bridge.Functions = {
     "CoreSdk_InitializeIntegrated": (c_int, ()),
     "CoreSdk_ShutDown": (c_int, ()),
     "CoreSdk_InitializeCoordinateSystemWithVUH": (c_int, (CoordinateSystemVUH, c_bool)),
@@ -106,7 +106,7 @@ def _node_name(node: ctypes.Structure) -> tuple[str, str]:
     return chain, "distal" if (chain, joint) == ("thumb", "intermediate") else joint
 
 
-class ManusGloves(source.Source):
+class ManusGloves(bridge.Source):
     """Hands of MANUS gloves on this host.
 
     The SDK's callback copies the nodes and returns; all else happens in the thread of the bridge.
@@ -128,7 +128,7 @@ class ManusGloves(source.Source):
         clock: StationClock | None = None,
     ) -> None:
         super().__init__()
-        self._devices = {side: source.hand_device(i, side, "manus") for i, side in enumerate(sides)}
+        self._devices = {side: bridge.hand_device(i, side, "manus") for i, side in enumerate(sides)}
         self._path = library
         self._clock = clock or StationClock()
         self._library: ctypes.CDLL | None = None
@@ -148,7 +148,7 @@ class ManusGloves(source.Source):
             DeviceError: it does not start.
             UnavailableError: the library is not there.
         """
-        self._library = library = source.load_library(self._path, FUNCTIONS, install=INSTALL)
+        self._library = library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         self._call("CoreSdk_InitializeIntegrated")
         self._call("CoreSdk_RegisterCallbackForRawSkeletonStream", self._callback)
         axes = CoordinateSystemVUH(X_FROM_VIEWER, POSITIVE_Z, RIGHT_HANDED, METRES)
@@ -158,15 +158,15 @@ class ManusGloves(source.Source):
         library.ManusHost_Init(ctypes.byref(host))
         self._call("CoreSdk_ConnectToHost", host)
         self._call("CoreSdk_SetRawSkeletonHandMotion", NO_HAND_MOTION)
-        return source.hello(
+        return bridge.hello(
             kind="finger_tracker",
             software=f"MANUS Core SDK, {self._path}",
             devices=tuple(self._devices.values()),
-            frame=source.OUR_AXES,
+            frame=bridge.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[source.Reading]:
+    def read(self) -> Sequence[bridge.Reading]:
         """Hands that the SDK has published since the last call.
 
         Raises:
@@ -222,7 +222,7 @@ class ManusGloves(source.Source):
                 self._skeletons.append(_Skeleton(t_ns, info.gloveId, info.publishTime, nodes))
         self._has_some.set()
 
-    def _reading(self, skeleton: _Skeleton) -> source.Reading | None:
+    def _reading(self, skeleton: _Skeleton) -> bridge.Reading | None:
         side, places = self._glove(skeleton)
         owner, owner_ns = self._owners.get(side, (skeleton.glove_id, 0))
         is_other = owner != skeleton.glove_id and skeleton.t_ns - owner_ns < REPLACED_NS
@@ -244,8 +244,8 @@ class ManusGloves(source.Source):
         if not np.isfinite(q_wxyz).all() or abs(float(np.linalg.norm(q_wxyz)) - 1.0) > 1e-3:
             self.not_sent["no wrist"] += 1
             return None
-        relative = source.wrist_axes(points, wrist, q_wxyz)
-        return source.hand_reading(
+        relative = bridge.wrist_axes(points, wrist, q_wxyz)
+        return bridge.hand_reading(
             self._devices[side], skeleton.t_ns, relative, np.isfinite(relative).all(axis=1)
         )
 

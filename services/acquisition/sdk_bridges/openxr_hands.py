@@ -22,7 +22,7 @@ from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import NOMINAL_RATE_HZ
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges import source
+from services.acquisition.sdk_bridges import bridge
 
 LIBRARY = "libopenxr_loader.so.1"
 INSTALL = "install it (Debian: apt install libopenxr-loader1), or name it with --library"
@@ -51,10 +51,10 @@ Handle = c_uint64
 
 def _typed(name: str, **fields: object) -> type[ctypes.Structure]:
     """A structure that begins with its type, as all that the functions take."""
-    return source.structure(name, type=c_int, next=ctypes.c_void_p, **fields)
+    return bridge.structure(name, type=c_int, next=ctypes.c_void_p, **fields)
 
 
-ApplicationInfo = source.structure(
+ApplicationInfo = bridge.structure(
     "XrApplicationInfo",
     applicationName=c_char * 128,
     applicationVersion=c_uint32,
@@ -76,7 +76,7 @@ SystemGetInfo = _typed("XrSystemGetInfo", formFactor=c_int)
 SessionCreateInfo = _typed("XrSessionCreateInfo", createFlags=c_uint64, systemId=c_uint64)
 SessionBeginInfo = _typed("XrSessionBeginInfo", primaryViewConfigurationType=c_int)
 # Quaternion x y z w, then position.
-Posef = source.structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
+Posef = bridge.structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
 ReferenceSpaceCreateInfo = _typed(
     "XrReferenceSpaceCreateInfo", referenceSpaceType=c_int, poseInReferenceSpace=Posef
 )
@@ -87,7 +87,7 @@ SessionStateChanged = _typed(
 )
 HandTrackerCreateInfo = _typed("XrHandTrackerCreateInfoEXT", hand=c_int, handJointSet=c_int)
 HandJointsLocateInfo = _typed("XrHandJointsLocateInfoEXT", baseSpace=Handle, time=c_int64)
-HandJointLocation = source.structure(
+HandJointLocation = bridge.structure(
     "XrHandJointLocationEXT", locationFlags=c_uint64, pose=Posef, radius=c_float
 )
 HandJointLocations = _typed(
@@ -96,8 +96,8 @@ HandJointLocations = _typed(
     jointCount=c_uint32,
     jointLocations=POINTER(HandJointLocation),
 )
-Timespec = source.structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
-FUNCTIONS: source.Functions = {
+Timespec = bridge.structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
+FUNCTIONS: bridge.Functions = {
     "xrCreateInstance": (c_int, (POINTER(InstanceCreateInfo), POINTER(Handle))),
     "xrDestroyInstance": (c_int, (Handle,)),
     "xrGetSystem": (c_int, (Handle, POINTER(SystemGetInfo), POINTER(c_uint64))),
@@ -120,7 +120,7 @@ EXTENSION_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 }
 
 
-class OpenXrHands(source.Source):
+class OpenXrHands(bridge.Source):
     """Tracked hands of an OpenXR runtime with headless sessions, such as Monado.
 
     Every joint whose position is not both valid and tracked is sent as not seen, and all of them
@@ -143,11 +143,11 @@ class OpenXrHands(source.Source):
     ) -> None:
         super().__init__()
         self._devices = {
-            side: source.hand_device(i, side, "openxr") for i, side in enumerate(sides)
+            side: bridge.hand_device(i, side, "openxr") for i, side in enumerate(sides)
         }
         self._path = library
         self._clock = clock or StationClock()
-        self._pace = source.Pace(NOMINAL_RATE_HZ, self._clock)
+        self._pace = bridge.Pace(NOMINAL_RATE_HZ, self._clock)
         self._library: ctypes.CDLL | None = None
         self._instance, self._session, self._space = Handle(), Handle(), Handle()
         self._trackers: dict[Side, Handle] = {}
@@ -161,7 +161,7 @@ class OpenXrHands(source.Source):
             DeviceError: no runtime, one without these extensions, or without a headset.
             UnavailableError: the loader is not installed.
         """
-        self._library = source.load_library(self._path, FUNCTIONS, install=INSTALL)
+        self._library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         names = (c_char_p * len(EXTENSIONS))(*EXTENSIONS)
         about = InstanceCreateInfo(TYPE_INSTANCE)
         about.applicationInfo = ApplicationInfo(b"dextouch", 1, b"", 0, API_VERSION_1_0)
@@ -189,15 +189,15 @@ class OpenXrHands(source.Source):
             self._call(
                 "xrCreateHandTrackerEXT", self._session, byref(hand), byref(self._trackers[side])
             )
-        return source.hello(
+        return bridge.hello(
             kind="finger_tracker",
             software="OpenXR, XR_EXT_hand_tracking",
             devices=tuple(self._devices.values()),
-            frame=source.OUR_AXES,
+            frame=bridge.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[source.Reading]:
+    def read(self) -> Sequence[bridge.Reading]:
         """The hands of now, 120 times a second.
 
         Raises:
@@ -214,7 +214,7 @@ class OpenXrHands(source.Source):
             byref(Timespec(seconds, nanoseconds)),
             byref(xr_time),
         )
-        t_ns = t_monotonic_ns + source.station_offset_ns(self._clock)
+        t_ns = t_monotonic_ns + bridge.station_offset_ns(self._clock)
         readings = (self._reading(side, xr_time, t_ns) for side in self._devices)
         return [reading for reading in readings if reading is not None]
 
@@ -258,7 +258,7 @@ class OpenXrHands(source.Source):
                     raise DeviceError(f"OpenXR: the runtime ends the session (state {state})")
             event = EventDataBuffer(TYPE_EVENT)
 
-    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> source.Reading | None:
+    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> bridge.Reading | None:
         joints = (HandJointLocation * NUM_JOINTS)()
         request = HandJointsLocateInfo(TYPE_LOCATE, None, self._space, xr_time)
         found = HandJointLocations(TYPE_LOCATIONS, None, 0, NUM_JOINTS, joints)
@@ -276,11 +276,11 @@ class OpenXrHands(source.Source):
         has_wrist = is_seen[WRIST_JOINT] and wrist.locationFlags & turned == turned
         if not (found.isActive and has_wrist):
             nowhere = np.full((len(NODES), 3), np.nan)
-            return source.hand_reading(
+            return bridge.hand_reading(
                 self._devices[side], t_ns, nowhere, np.zeros(len(NODES), bool)
             )
         points = np.array([list(joint.pose.position) for joint in joints])
         x, y, z, w = wrist.pose.orientation
-        relative = source.wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
+        relative = bridge.wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
         ours = relative[KEYPOINT_JOINTS] * OUR_SIGNS[side]
-        return source.hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])
+        return bridge.hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])
