@@ -240,8 +240,8 @@ def create_app(
     mock = _mock_station(settings, follow) if settings.mock else None
     station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
-    wanted = settings.require_consent
-    station.recorder.needs_consent = not settings.mock if wanted is None else wanted
+    is_required = settings.require_consent
+    station.recorder.needs_consent = not settings.mock if is_required is None else is_required
     practice = Practice(partial(practice_app, settings) if settings.mock else None)
     return _station_app(settings, station, mock, uploads, practice)
 

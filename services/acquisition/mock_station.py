@@ -45,7 +45,7 @@ SLOW_S = 0.1
 DEAD_CELL = 9
 
 
-def mock_glove_of(kind_name: str, place: replay.MockSlot) -> replay.MockPair:
+def mock_glove_of(kind_name: str, slot: replay.MockSlot) -> replay.MockPair:
     """A simulated glove of a kind of this package or another one.
 
     Raises:
@@ -66,7 +66,7 @@ def mock_glove_of(kind_name: str, place: replay.MockSlot) -> replay.MockPair:
             f"{where}: got {type(error).__name__}: {error}, expected a function 'module:function' "
             "of a MockSlot; fix the package that provides the kind"
         ) from error
-    pair: object = make(place)
+    pair: object = make(slot)
     if not isinstance(pair, replay.MockPair):
         raise InvalidInputError(
             f"{where}: gave {type(pair).__name__}, expected a services.acquisition.mocks.MockPair; "
@@ -96,7 +96,7 @@ def build_mocks(
     if len(named) != len(streams):
         raise InvalidInputError("mock station: two streams of the same name")
 
-    def place(name: str, stream: str) -> replay.MockSlot:
+    def slot(name: str, stream: str) -> replay.MockSlot:
         return replay.MockSlot(
             name, named[stream], faults.of(name), seed, clock, links.trackers, unit_seed
         )
@@ -104,18 +104,18 @@ def build_mocks(
     pairs = []
     for side in SIDES:
         if (tactile := f"tactile_{side}") in named:
-            pairs.append(mock_glove_of(links.gloves, place(f"glove_{side}", tactile)))
+            pairs.append(mock_glove_of(links.gloves, slot(f"glove_{side}", tactile)))
         if (keypoints := f"keypoints_{side}") in named:
-            pairs.append(mock_finger_tracker(place(f"finger_tracker_{side}", keypoints)))
+            pairs.append(mock_finger_tracker(slot(f"finger_tracker_{side}", keypoints)))
     trackers = [*WRISTS, "head"]
     if "joints_measured" in named:
         by_trackers = WRISTS if links.wrists == "trackers" else ()
         source = RobotStateSource({n: s for n, s in named.items() if n in STREAM_SIZES})
         decoder = RobotStateDecoder([name for name in STREAM_SIZES if name not in by_trackers])
-        pairs.append(_on_socket(place("robot_state", "joints_measured"), source, decoder))
+        pairs.append(_on_socket(slot("robot_state", "joints_measured"), source, decoder))
         trackers = ["head", *by_trackers]
-    pairs += [mock_pose_tracker(place(f"pose_tracker_{n}", n)) for n in trackers if n in named]
-    pairs += [_camera(place(n, n), links) for n in named if n.startswith("camera_")]
+    pairs += [mock_pose_tracker(slot(f"pose_tracker_{n}", n)) for n in trackers if n in named]
+    pairs += [_camera(slot(n, n), links) for n in named if n.startswith("camera_")]
     if not pairs:
         raise InvalidInputError(
             f"mock station: got streams {sorted(named)}, expected tactile_…, keypoints_…, "
@@ -124,22 +124,22 @@ def build_mocks(
     return pairs
 
 
-def _camera(place: replay.MockSlot, links: MockLinks) -> replay.MockPair:
+def _camera(slot: replay.MockSlot, links: MockLinks) -> replay.MockPair:
     if links.cameras == "station":
-        return video_camera(place, encoding=links.images)
-    height_px, width_px = place.stream.descriptor.shape[:2]
+        return video_camera(slot, encoding=links.images)
+    height_px, width_px = slot.stream.descriptor.shape[:2]
     decoder = CameraDecoder(
-        place.name, height_px=height_px, width_px=width_px, encoding=links.images
+        slot.name, height_px=height_px, width_px=width_px, encoding=links.images
     )
-    return _on_socket(place, CameraSource(place.stream, encoding=links.images), decoder)
+    return _on_socket(slot, CameraSource(slot.stream, encoding=links.images), decoder)
 
 
 def _on_socket(
-    place: replay.MockSlot, source: replay.PacketSource, decoder: Decoder
+    slot: replay.MockSlot, source: replay.PacketSource, decoder: Decoder
 ) -> replay.MockPair:
-    port = SocketPort(place.name)
-    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return replay.MockPair(replay.MockDevice(place, source, port), driver)
+    port = SocketPort(slot.name)
+    driver = Driver(slot.name, transport=port.transport, decoder=decoder, clock=slot.clock)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
 
 
 def _known_of(

@@ -202,13 +202,13 @@ class TakeFindings:
         self._health = health
         self._started_ns = t_host_ns
         self._before = Counter(health.raised() if health else {})
-        standing = [
+        raised = [
             (stream.stream, finding.code)
             for stream in (health.report().streams if health else ())
             for finding in stream.findings
         ]
         # What was never raised is no finding yet: a stream that is about to begin.
-        self._first_ns = {key: t_host_ns for key in standing if key in self._before}
+        self._first_ns = {key: t_host_ns for key in raised if key in self._before}
         self._counts = Counter(self._first_ns.keys())
         self._worst: dict[str, float] = {}
         self._causes: dict[tuple[str, str], HealthCause] = {}

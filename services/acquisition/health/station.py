@@ -133,12 +133,12 @@ class PathCheck:
         evaluation.figures["path_latency_sigma_seconds"] = measured.sigma_ns * 1e-9
         if self._calibrated_ns is not None:
             sigma_ns = math.hypot(measured.sigma_ns, self._calibrated_sigma_ns)
-            apart = abs(measured.latency_ns - self._calibrated_ns) / sigma_ns
+            sigmas = abs(measured.latency_ns - self._calibrated_ns) / sigma_ns
             text = (
                 f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
-                f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {apart:.1f} sigma apart"
+                f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {sigmas:.1f} sigma apart"
             )
-            evaluation.judge("latency_calibration", apart, text)
+            evaluation.judge("latency_calibration", sigmas, text)
 
 
 def judge_uploads(evaluation: Evaluation, refused: Mapping[str, str]) -> None:
@@ -247,11 +247,11 @@ class HostClockCheck:
     def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
         self._watch.look()
-        shown = (
+        rules = (
             ("host_suspended", SUSPENDED_SHOWN_NS, "it was suspended for {:.1f} s"),
             ("wall_clock_set", CLOCK_SET_SHOWN_NS, "its wall clock was set by {:.1f} s"),
         )
-        for code, shown_ns, text in shown:
+        for code, shown_ns, text in rules:
             recent_ns = [
                 step_ns
                 for t_ns, step_ns in self._watch.events[code]

@@ -132,30 +132,30 @@ class GloveCalibration:
 
 
 def mock_glove(
-    place: replay.MockSlot,
+    slot: replay.MockSlot,
     *,
     calibration: GloveCalibration | None = None,
     worn_side: Side | None = None,
 ) -> replay.MockPair:
-    """Our own glove, which answers commands; its serial number is the name of its place.
+    """Our own glove, which answers commands; its serial number is the name of its slot.
 
     Without a calibration one is made from the seed; `worn_side` is the hand that it says it is, if
     that is the wrong one.
     """
-    name, side = place.name, place.side
-    unit_seed = place.seed if place.unit_seed is None else place.unit_seed
-    layout = place.stream.descriptor.layout
+    name, side = slot.name, slot.side
+    unit_seed = slot.seed if slot.unit_seed is None else slot.unit_seed
+    layout = slot.stream.descriptor.layout
     glove = calibration or GloveCalibration.seeded(side, unit_seed, layout or DEXTOUCH_V1)
     worn: Side = worn_side or side
-    source = TactileGloveSource(place.stream, side=worn, calibration=glove, faults=place.faults)
+    source = TactileGloveSource(slot.stream, side=worn, calibration=glove, faults=slot.faults)
     # The device is made of its port, and tells its time to what answers there.
     answers = GloveAnswers(
-        worn, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
+        worn, serial_number=name, device_time_ns=lambda: _device_time_ns(device, slot.clock)
     )
     port = PtyPort(name, answer=answers.answer)
-    device = replay.MockDevice(place, source, port)
+    device = replay.MockDevice(slot, source, port)
     driver = tactile_glove.TactileGlove(
-        side, transport=port.transport, clock=place.clock, serial_number=name, layout=layout
+        side, transport=port.transport, clock=slot.clock, serial_number=name, layout=layout
     )
     return replay.MockPair(device, driver, glove.matrices(side))
 
@@ -209,21 +209,19 @@ def _device_time_ns(device: replay.MockDevice, clock: StationClock) -> int:
     return ledger.t_device_ns[last] + since_ns + skew_ns
 
 
-def mock_justfloat_glove(place: replay.MockSlot) -> replay.MockPair:
+def mock_justfloat_glove(slot: replay.MockSlot) -> replay.MockPair:
     """A glove that sends bare float32s at the rate of the stream, in the unit of its layout."""
-    source = JustFloatGloveSource(
-        place.stream, side=place.side, dead_taxels=place.faults.dead_taxels
-    )
-    layout = place.stream.descriptor.layout
+    source = JustFloatGloveSource(slot.stream, side=slot.side, dead_taxels=slot.faults.dead_taxels)
+    layout = slot.stream.descriptor.layout
     decoder = JustFloatGloveDecoder(
-        place.side,
+        slot.side,
         num_values=NUM_VALUES if layout is None else layout.num_raw_cells,
         full_scale=FULL_SCALE if layout is None else layout.full_scale,
-        rate_hz=place.stream.descriptor.nominal_rate_hz,
+        rate_hz=slot.stream.descriptor.nominal_rate_hz,
         layout=layout,
     )
     return replay.serial_mock(
-        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+        slot, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
     )
 
 
@@ -287,16 +285,16 @@ def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
     return values.astype("<f4").tobytes() + TAIL
 
 
-def mock_wuji_glove(place: replay.MockSlot) -> replay.MockPair:
+def mock_wuji_glove(slot: replay.MockSlot) -> replay.MockPair:
     """A Wuji glove: wuji_glove.CRC-16, a number of 16 bits, milliseconds."""
     source = WujiGloveSource(
-        replay.at_rate(place.stream, wuji_glove.NOMINAL_RATE_HZ),
-        side=place.side,
-        dead_taxels=place.faults.dead_taxels,
+        replay.at_rate(slot.stream, wuji_glove.NOMINAL_RATE_HZ),
+        side=slot.side,
+        dead_taxels=slot.faults.dead_taxels,
     )
-    decoder = wuji_glove.WujiGloveDecoder(place.side, layout=place.stream.descriptor.layout)
+    decoder = wuji_glove.WujiGloveDecoder(slot.side, layout=slot.stream.descriptor.layout)
     return replay.serial_mock(
-        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+        slot, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
     )
 
 

@@ -121,11 +121,11 @@ class BridgePort(SocketPort):
 
 
 def bridged_pair(
-    place: replay.MockSlot, source: BridgeSource, decoder: BridgeDecoder
+    slot: replay.MockSlot, source: BridgeSource, decoder: BridgeDecoder
 ) -> replay.MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
-    port, clock = BridgePort(place.name, source.hello), place.clock
-    device = replay.MockDevice(place, source, port)
+    port, clock = BridgePort(slot.name, source.hello), slot.clock
+    device = replay.MockDevice(slot, source, port)
 
     def sign_of_life(sequence: int) -> bytes:
         return encode_packet(source.magic, Packet(VERSION, SOURCES["none"], sequence, 0, b""))
@@ -138,7 +138,7 @@ def bridged_pair(
             clock=clock,
             name="bridge-life",
         )
-    driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
+    driver = BridgeDriver(slot.name, transport=port.transport, decoder=decoder, clock=clock)
     return replay.MockPair(device, driver)
 
 
@@ -158,7 +158,7 @@ class TrackedFingers(replay.PacketSource):
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
         # For each sample one bit a node, in the device's order: whether the device sees it.
-        hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(self._order, _HIDDEN)))
+        hidden = sum(1 << int(node) for node in np.flatnonzero(np.isin(self._order, _HIDDEN)))
         self._seen = np.full(len(stream.t_ns), finger_tracker.ALL_SEEN, dtype=np.int64)
         for start_s, stop_s in faults.occluded_s:
             during = (stream.t_ns >= start_s * 1e9) & (stream.t_ns < stop_s * 1e9)
@@ -233,20 +233,18 @@ class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
         return 100.0 * points_m @ self.frame.ours_from_theirs()
 
 
-def mock_finger_tracker(place: replay.MockSlot) -> replay.MockPair:
-    """A finger tracker of one hand; the stream of its place is [n, 25, 3] in m, wrist frame."""
-    rng = replay.device_rng(place.seed, f"noise_{place.name}")
-    if place.link == "bridge":
-        bridge = BridgeFingerTrackerSource(
-            place.stream, side=place.side, rng=rng, faults=place.faults
-        )
-        return bridged_pair(place, bridge, finger_tracker.BridgeFingerTrackerDecoder(place.side))
-    source = FingerTrackerSource(place.stream, side=place.side, rng=rng, faults=place.faults)
-    port = HidPort(place.name, answer=source.answer)
+def mock_finger_tracker(slot: replay.MockSlot) -> replay.MockPair:
+    """A finger tracker of one hand; the stream of its slot is [n, 25, 3] in m, wrist frame."""
+    rng = replay.device_rng(slot.seed, f"noise_{slot.name}")
+    if slot.link == "bridge":
+        bridge = BridgeFingerTrackerSource(slot.stream, side=slot.side, rng=rng, faults=slot.faults)
+        return bridged_pair(slot, bridge, finger_tracker.BridgeFingerTrackerDecoder(slot.side))
+    source = FingerTrackerSource(slot.stream, side=slot.side, rng=rng, faults=slot.faults)
+    port = HidPort(slot.name, answer=source.answer)
     driver = finger_tracker.FingerTracker(
-        place.name, place.side, transport=port.transport, clock=place.clock
+        slot.name, slot.side, transport=port.transport, clock=slot.clock
     )
-    return replay.MockPair(replay.MockDevice(place, source, port), driver)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
 
 
 class TrackedPoses(replay.PacketSource):
@@ -337,18 +335,18 @@ class BridgePoseSource(TrackedPoses, BridgeSource):
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
-def mock_pose_tracker(place: replay.MockSlot) -> replay.MockPair:
-    """A pose tracker; the stream of its place is [n, 7], x y z (m) qw qx qy qz in the world."""
-    stream, faults = place.stream, place.faults
+def mock_pose_tracker(slot: replay.MockSlot) -> replay.MockPair:
+    """A pose tracker; the stream of its slot is [n, 7], x y z (m) qw qx qy qz in the world."""
+    stream, faults = slot.stream, slot.faults
     where = stream.descriptor.name
-    rng = replay.device_rng(place.seed, f"noise_{place.name}")
-    if place.link == "bridge":
+    rng = replay.device_rng(slot.seed, f"noise_{slot.name}")
+    if slot.link == "bridge":
         bridge = BridgePoseSource(stream, faults=faults, rng=rng)
-        return bridged_pair(place, bridge, pose_tracker.BridgePoseTrackerDecoder(where))
-    source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(place.name)
+        return bridged_pair(slot, bridge, pose_tracker.BridgePoseTrackerDecoder(where))
+    source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(slot.name)
     decoder = pose_tracker.PoseTrackerDecoder(where)
-    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return replay.MockPair(replay.MockDevice(place, source, port), driver)
+    driver = Driver(slot.name, transport=port.transport, decoder=decoder, clock=slot.clock)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
 
 
 class CameraSource(replay.PacketSource):
@@ -459,11 +457,11 @@ class VideoDevice(replay.MockDevice):
         return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
 
 
-def video_camera(place: replay.MockSlot, **settings: float | str) -> replay.MockPair:
+def video_camera(slot: replay.MockSlot, **settings: float | str) -> replay.MockPair:
     """A mock camera that plays a stream of images, and its driver with other settings."""
-    port, descriptor = VideoPort(place.name), place.stream.descriptor
+    port, descriptor = VideoPort(slot.name), slot.stream.descriptor
     known = {
-        "stream": place.name,
+        "stream": slot.name,
         "rate_hz": descriptor.nominal_rate_hz,
         "height_px": descriptor.shape[0],
         "width_px": descriptor.shape[1],
@@ -471,10 +469,10 @@ def video_camera(place: replay.MockSlot, **settings: float | str) -> replay.Mock
     driver = station_camera.StationCamera(
         station_camera.StationCameraSettings.model_validate({**known, **settings}),
         link=port.transport,
-        clock=place.clock,
+        clock=slot.clock,
         max_encode_wait_s=LOCKSTEP_WAIT_S,
     )
-    return replay.MockPair(VideoDevice(place, VideoSource(place.stream), port), driver)
+    return replay.MockPair(VideoDevice(slot, VideoSource(slot.stream), port), driver)
 
 
 class RobotStateSource(replay.PacketSource):

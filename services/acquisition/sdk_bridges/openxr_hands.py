@@ -269,8 +269,8 @@ class OpenXrHands(bridge.Source):
             return None
         self._last[side] = measured
         flags = np.array([joint.locationFlags for joint in joints], dtype=np.uint64)
-        wanted = np.uint64(POSITION_VALID | POSITION_TRACKED)
-        is_seen = (flags & wanted) == wanted
+        required = np.uint64(POSITION_VALID | POSITION_TRACKED)
+        is_seen = (flags & required) == required
         turned = ORIENTATION_VALID | ORIENTATION_TRACKED
         wrist = joints[WRIST_JOINT]
         has_wrist = is_seen[WRIST_JOINT] and wrist.locationFlags & turned == turned
