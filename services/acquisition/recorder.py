@@ -1,9 +1,4 @@
-"""Recorder of a station: one take at a time in a spool, and the count of saved ones.
-
-A take allocates and frees memory in many sizes and threads. glibc keeps free memory in the process,
-a little more after each take, until `malloc_trim` is called. Objects in reference cycles, such as
-the requests and responses of an upload, are only freed by the garbage collector.
-"""
+"""Recorder of a station: one take at a time in a spool, and the count of saved ones."""
 
 import ctypes
 import gc
@@ -430,6 +425,7 @@ def keep_for_life() -> None:
 def give_back_free_memory() -> bool:
     """Between takes: milliseconds. False where the C library has no `malloc_trim` (not glibc).
 
+    glibc keeps free memory in the process, a little more after each take, until this is called.
     Circles are looked for after `keep_for_life` only: without it that would hold up readers in the
     middle of a take, if it is an upload that calls this.
     """

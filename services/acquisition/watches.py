@@ -3,9 +3,8 @@
 Exchanges with a device that answers time requests measure the offset of its clock, which one-way
 timestamps cannot. The difference to the estimated sample times is the path delay.
 
-What the robot's hand can do is not known here: the check of a hand is given to the station
-(`services.pipelines.station`). It runs in a thread of its own on the newest sample of each hand;
-readers only leave that sample there, and a slow check skips samples.
+The check of what the robot's hand can do is given to the station (`services.pipelines.station`).
+It runs in a thread of its own on the newest sample of each hand; a slow check skips samples.
 """
 
 import math

@@ -1,10 +1,8 @@
 """Pressure cells of gloves: their calibration record, and the health checks of each cell.
 
-A cell that does not change is not necessarily faulty, because a hand at rest looks the same. It is
-reported if its neighbours change while it does not, or if no load explains its reading.
-`TaxelCheck` checks gloves that send counts, whose layout wires their taxels, by their tare.
-`CellCheck` checks gloves of other manufacturers: a position that never had a reading is not a cell,
-and if the layout is unknown, a cell that never changed may be an unused position.
+A cell that does not change is reported if its neighbours change while it does not, or if no load
+explains its reading (docs/health.md). `TaxelCheck` checks gloves that send counts, whose layout
+wires their taxels, by their tare, `CellCheck` those of other manufacturers.
 """
 
 import math

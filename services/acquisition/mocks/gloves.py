@@ -286,7 +286,7 @@ def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
 
 
 def mock_wuji_glove(slot: replay.MockSlot) -> replay.MockPair:
-    """A Wuji glove: wuji_glove.CRC-16, a number of 16 bits, milliseconds."""
+    """A Wuji glove: CRC-16, a number of 16 bits, milliseconds."""
     source = WujiGloveSource(
         replay.at_rate(slot.stream, wuji_glove.NOMINAL_RATE_HZ),
         side=slot.side,
