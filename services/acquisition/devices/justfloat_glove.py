@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field, model_validator
 
-from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
@@ -48,11 +48,7 @@ class JustFloatFrames(PortionedSearch[bytes]):
         self._foreign = (0, 0)
 
     def _search(self, data: bytes) -> tuple[list[bytes], int]:
-        """Payloads, and how many bytes are done with.
-
-        Raises:
-            DeviceError: packets of another length, three in a row.
-        """
+        """Payloads, and how many bytes are done with; DeviceError after three of another length."""
         found: list[bytes] = []
         position = 0
         while True:
@@ -214,11 +210,8 @@ def build(settings: JustFloatGloveSettings, clock: StationClock) -> base.Driver:
 
     def setting(name: str, of_layout: str) -> float:
         value = getattr(settings, name)
-        if value is None and layout is not None:
-            value = getattr(layout, of_layout)
-        if value is None:
-            raise InvalidInputError(f"{settings.device}: got no {name}, expected one or a layout")
-        return float(value)
+        # Validated: without a layout there is a value.
+        return float(getattr(layout, of_layout) if value is None else value)
 
     decoder = JustFloatGloveDecoder(
         settings.side,

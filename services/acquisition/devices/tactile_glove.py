@@ -20,6 +20,7 @@ from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial
 from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import (
     SEQUENCE_MODULUS,
+    SOURCE_NAMES,
     SOURCES,
     VERSION,
     Packet,
@@ -111,10 +112,8 @@ def parse_identity(body: bytes, source: int) -> GloveIdentity:
         serial_number = serial_bytes.rstrip(b"\0").decode("ascii")
     except UnicodeDecodeError as error:
         raise PacketError(f"glove identity: got {serial_bytes!r}, expected ASCII") from error
-    sides = {number: name for name, number in SOURCES.items()}
-    return GloveIdentity(
-        serial_number, ".".join(map(str, firmware)), sides.get(source, str(source))
-    )
+    side = SOURCE_NAMES.get(source, str(source))
+    return GloveIdentity(serial_number, ".".join(map(str, firmware)), side)
 
 
 def encode_identity(serial_number: str, firmware: tuple[int, int, int]) -> bytes:

@@ -136,11 +136,7 @@ class WujiGloveDecoder(base.StreamDecoder[WujiPacket]):
 
 
 def _check_layout(layout: TactileLayout, *, device: str) -> None:
-    """Check that a layout has the cells, unit and full scale of what the glove sends.
-
-    Raises:
-        InvalidInputError: it has others, by which conversion would make wrong pressures.
-    """
+    """Refuse a layout by whose cells, unit or full scale conversion would make wrong pressures."""
     base.check_raw_cells(layout, NUM_CELLS, device=device)
     if (layout.unit, layout.full_scale) != (UNIT, FULL_SCALE):
         raise InvalidInputError(

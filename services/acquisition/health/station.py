@@ -184,7 +184,7 @@ class HostCheck:
         load: Callable[[], tuple[float, int]] | None = None,
         cpu_times: Callable[[], tuple[int, int] | None] | None = None,
     ) -> None:
-        self._load = load or _load
+        self._load = load or (lambda: (os.getloadavg()[0], os.cpu_count() or 1))
         self._late = Rolling()
         self._cpu_times = cpu_times or _cpu_times
         # The times of the last 10 s, whose ends give the share that was used.
@@ -221,10 +221,6 @@ class HostCheck:
             _, used, ticks = self._times[max(earlier, -len(self._times))]
             if times[1] > ticks:
                 evaluation.figures[figure] = (times[0] - used) / (times[1] - ticks)
-
-
-def _load() -> tuple[float, int]:
-    return os.getloadavg()[0], os.cpu_count() or 1
 
 
 def _cpu_times(stat: Path = Path("/proc/stat")) -> tuple[int, int] | None:

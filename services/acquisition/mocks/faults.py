@@ -33,6 +33,7 @@ from services.acquisition.drivers.packets import (
     CRC,
     HEADER,
     MAGIC_SIZE,
+    SOURCE_NAMES,
     SOURCES,
     VERSION,
     Packet,
@@ -51,7 +52,6 @@ NUMBERS = {
     b"DXPM": (16, "<f4"),
     b"DXRS": (0, "<f8"),
 }
-SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 
 Edit = Callable[[bytes], bytes]
 Pinned = Literal["dead", "stuck", "saturated"]

@@ -206,8 +206,10 @@ def practice_streams(seed: int = 0, *, layout: TactileLayout | None = None) -> l
         _stream(name, "pose", (POSE_RATE_HZ, "pose_m_wxyz"), pose_from_transform(Ts))
         for name, Ts in moved.items()
     ]
-    rest = [_at_rest(s) for s in others if s.descriptor.kind not in {"image", "pose"}]
-    return [*rest, *poses, board]
+    hands = [s for s in others if s.descriptor.kind == "keypoints"]
+    gloves = [s for s in others if s.descriptor.kind == "tactile"]
+    rest = [replace(glove, values=np.zeros_like(glove.values)) for glove in gloves]
+    return [*hands, *rest, *poses, board]
 
 
 def _practice_heads(seed: int) -> Float64[np.ndarray, "n 4 4"]:
@@ -229,12 +231,6 @@ def _practice_heads(seed: int) -> Float64[np.ndarray, "n 4 4"]:
     Ts_camera_board = np.array([board_pose(pose) for pose in boards])
     heads = T_WORLD_BOARD @ invert(T_TRACKER_CAMERA @ Ts_camera_board)
     return heads @ transform(rotation_from_vector(error[:, :3]), error[:, 3:])
-
-
-def _at_rest(stream: ReplayStream) -> ReplayStream:
-    if stream.descriptor.kind != "tactile":
-        return stream
-    return replace(stream, values=np.zeros_like(stream.values))
 
 
 def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:

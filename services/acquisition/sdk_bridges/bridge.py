@@ -383,11 +383,7 @@ class StationLink:
 
 
 def _clear_path(path: Path) -> None:
-    """Remove the socket that a killed bridge has left behind.
-
-    Raises:
-        InvalidInputError: a running bridge has it.
-    """
+    """Remove the socket that a killed bridge has left behind, and refuse that of a running one."""
     if not path.is_socket():
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:

@@ -106,12 +106,7 @@ class OpenVrTrackers(bridge.Source):
         self._scanned_s = 0.0
 
     def open(self) -> BridgeHello:
-        """Connect to SteamVR, which must run already.
-
-        Raises:
-            DeviceError: SteamVR does not run.
-            UnavailableError: the Python module is not installed.
-        """
+        """Connect to SteamVR, which must run already."""
         sdk = self._connect()
         self._scan()
         return bridge.hello(
@@ -122,11 +117,7 @@ class OpenVrTrackers(bridge.Source):
         )
 
     def read(self) -> Sequence[bridge.Reading]:
-        """The poses of now, 100 times a second.
-
-        Raises:
-            DeviceError: SteamVR ends.
-        """
+        """The poses of now, 100 times a second."""
         sdk, system = self._opened()
         self._pace.wait()
         event = sdk.VREvent_t()
@@ -266,12 +257,7 @@ class LibsurviveTrackers(bridge.Source):
         self._found: dict[int, BridgedDevice | None] = {}
 
     def open(self) -> BridgeHello:
-        """Start libsurvive.
-
-        Raises:
-            DeviceError: it does not start.
-            UnavailableError: the library is not there.
-        """
+        """Start libsurvive."""
         self._start()
         return bridge.hello(
             kind="pose_tracker",
@@ -281,11 +267,7 @@ class LibsurviveTrackers(bridge.Source):
         )
 
     def read(self) -> Sequence[bridge.Reading]:
-        """Poses of updated trackers.
-
-        Raises:
-            DeviceError: libsurvive has ended.
-        """
+        """Poses of updated trackers."""
         library, context = self._opened()
         readings = []
         end_s = time.monotonic() + READ_S

@@ -50,9 +50,7 @@ class LslStream(bridge.Source):
         """Find the outlet, connect to it, and measure the offset of its clock.
 
         Raises:
-            DeviceError: no such outlet.
-            InvalidInputError: several, or one without numbers.
-            UnavailableError: pylsl is not installed.
+            InvalidInputError: several outlets, or one without numbers.
         """
         lsl = bridge.import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)
@@ -88,11 +86,7 @@ class LslStream(bridge.Source):
         )
 
     def read(self) -> Sequence[bridge.Reading]:
-        """New samples.
-
-        Raises:
-            DeviceError: the outlet is gone.
-        """
+        """New samples."""
         if time.monotonic() - self._corrected_s > CORRECTION_PERIOD_S:
             self._correct(0.0)
         samples, stamps = self._guarded(
@@ -129,11 +123,7 @@ class LslStream(bridge.Source):
         ]
 
     def _guarded(self, call: Any) -> Any:  # noqa: ANN401 - as pylsl's
-        """What a call of pylsl gives.
-
-        Raises:
-            DeviceError: the outlet is lost or does not answer.
-        """
+        """What a call of pylsl gives; DeviceError of an outlet that is lost or does not answer."""
         try:
             return call()
         except RuntimeError as error:  # LostError, TimeoutError and others of pylsl

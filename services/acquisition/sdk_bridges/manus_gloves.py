@@ -142,12 +142,7 @@ class ManusGloves(bridge.Source):
         self._published: dict[int, int] = {}
 
     def open(self) -> BridgeHello:
-        """Start the SDK and connect to its integrated core.
-
-        Raises:
-            DeviceError: it does not start.
-            UnavailableError: the library is not there.
-        """
+        """Start the SDK and connect to its integrated core."""
         self._library = library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         self._call("CoreSdk_InitializeIntegrated")
         self._call("CoreSdk_RegisterCallbackForRawSkeletonStream", self._callback)
@@ -167,11 +162,7 @@ class ManusGloves(bridge.Source):
         )
 
     def read(self) -> Sequence[bridge.Reading]:
-        """Hands that the SDK has published since the last call.
-
-        Raises:
-            DeviceError: the SDK has lost its core, or describes no hand.
-        """
+        """Hands that the SDK has published since the last call."""
         if not self._has_some.wait(READ_S):
             connected = c_bool()
             self._call("CoreSdk_GetIsConnectedToCore", ctypes.byref(connected))

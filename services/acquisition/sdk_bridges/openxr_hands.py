@@ -155,12 +155,7 @@ class OpenXrHands(bridge.Source):
         self._last: dict[Side, bytes] = {}
 
     def open(self) -> BridgeHello:
-        """Create a headless session with a hand tracker for each side.
-
-        Raises:
-            DeviceError: no runtime, one without these extensions, or without a headset.
-            UnavailableError: the loader is not installed.
-        """
+        """Create a headless session with a hand tracker for each side."""
         self._library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         names = (c_char_p * len(EXTENSIONS))(*EXTENSIONS)
         about = InstanceCreateInfo(TYPE_INSTANCE)
@@ -198,11 +193,7 @@ class OpenXrHands(bridge.Source):
         )
 
     def read(self) -> Sequence[bridge.Reading]:
-        """The hands of now, 120 times a second.
-
-        Raises:
-            DeviceError: the session is lost.
-        """
+        """The hands of now, 120 times a second."""
         self._pace.wait()
         self._follow_session()
         t_monotonic_ns = self._clock.read_ns(time.CLOCK_MONOTONIC)
@@ -240,11 +231,7 @@ class OpenXrHands(bridge.Source):
         return result
 
     def _follow_session(self) -> None:
-        """Take in the runtime's events: begin a session that is ready.
-
-        Raises:
-            DeviceError: the runtime ends it.
-        """
+        """Begin a session that is ready; DeviceError of one that the runtime ends."""
         event = EventDataBuffer(TYPE_EVENT)
         while self._call("xrPollEvent", self._instance, byref(event)) != EVENT_UNAVAILABLE:
             if event.type == TYPE_INSTANCE_LOSS:
