@@ -214,7 +214,7 @@ def _make_uploader(settings: AcquisitionSettings, recorder: Recorder) -> Uploade
             settings.spool,
             settings.station,
             stored_as=ids_in_store,
-            operators=retention.OperatorNames(recorder.session_operators, recorder.forget_operator),
+            operators=retention.OperatorNames(recorder.session.operators, recorder.session.forget),
         ),
     )
 

@@ -107,7 +107,7 @@ class Recorder:
         self._lock = threading.RLock()
         self._state: schemas.RecorderState = "idle"
         self._discarded_id: str | None = None
-        self._session = SessionCount(spool_root)
+        self.session = SessionCount(spool_root)
         self.needs_consent = False
         self._arm(None)
 
@@ -128,7 +128,7 @@ class Recorder:
                 else {},
                 problems=(*(take.problems() if take else ()), *problems),
                 check=check,
-                session=self._session.now,
+                session=self.session.now,
                 needs_consent=self.needs_consent,
             )
 
@@ -190,19 +190,8 @@ class Recorder:
 
     def begin_session(self) -> schemas.RecorderStatus:
         """Count saved takes from zero again; what was saved stays."""
-        with self._lock:
-            self._session.begin()
-            return self.status()
-
-    def session_operators(self) -> tuple[str, ...]:
-        """Pseudonyms that the session's counts name."""
-        with self._lock:
-            return self._session.operators()
-
-    def forget_operator(self, operator: str) -> None:
-        """Remove a pseudonym from the session's counts."""
-        with self._lock:
-            self._session.forget(operator)
+        self.session.begin()
+        return self.status()
 
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
@@ -309,7 +298,7 @@ class Recorder:
         if self._prompt is not None:
             saved = spool.attributes
             cause = saved.incomplete_cause
-            self._session.add(self._prompt, saved.recording_id, incomplete=cause)
+            self.session.add(self._prompt, saved.recording_id, incomplete=cause)
         give_back_free_memory()
 
     def _discard(self) -> None:
@@ -352,31 +341,32 @@ class Recorder:
 
 
 class SessionCount:
-    """The present session; counts survive a restart and the deletion of uploaded takes.
+    """The present session, for any thread; counts survive a restart and removals of takes.
 
     A session that cannot be written is counted in memory: a take that is saved must stay saved.
     """
 
     def __init__(self, spool_root: Path) -> None:
         self._path = spool_root / SESSION_FILE
+        self._lock = threading.Lock()
         self.now = self._read() or schemas.RecorderSession(started_at=datetime.now(UTC))
 
     def begin(self) -> None:
         """Begin a new session, in which nothing was saved yet."""
-        fresh = {"started_at": datetime.now(UTC), "saved": ()}
-        self._write(self.now.model_copy(update=fresh))
+        with self._lock:
+            self._write(started_at=datetime.now(UTC), saved=())
 
     def add(self, prompt: schemas.TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
         """Count a saved take; `incomplete` says why it is, if it is."""
-        key = (prompt.task, prompt.operator)
-        counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
-        counts[key] = counts.get(key, 0) + 1
-        saved = tuple(
-            schemas.SavedTakes(task=task, operator=operator, num_saved=count)
-            for (task, operator), count in counts.items()
-        )
-        last = {"last_saved": recording_id, "last_incomplete": incomplete}
-        self._write(self.now.model_copy(update={"saved": saved, **last}))
+        with self._lock:
+            key = (prompt.task, prompt.operator)
+            counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
+            counts[key] = counts.get(key, 0) + 1
+            saved = tuple(
+                schemas.SavedTakes(task=task, operator=operator, num_saved=count)
+                for (task, operator), count in counts.items()
+            )
+            self._write(saved=saved, last_saved=recording_id, last_incomplete=incomplete)
 
     def operators(self) -> tuple[str, ...]:
         """All operators that the counts name."""
@@ -385,11 +375,11 @@ class SessionCount:
 
     def forget(self, operator: str) -> None:
         """Remove an operator's counts."""
-        saved = tuple(item for item in self.now.saved if item.operator != operator)
-        self._write(self.now.model_copy(update={"saved": saved}))
+        with self._lock:
+            self._write(saved=tuple(item for item in self.now.saved if item.operator != operator))
 
-    def _write(self, session: schemas.RecorderSession) -> None:
-        self.now = session
+    def _write(self, **changed: object) -> None:
+        self.now = session = self.now.model_copy(update=changed)
         try:
             with disk_errors(f"write {self._path.name}"):
                 # In a spool that is gone this fails: only a take may create it.
