@@ -179,14 +179,10 @@ class HostCheck:
     The 90th percentile of 10 s: a single stop of the process, such as a laptop's sleep, is none.
     """
 
-    def __init__(
-        self,
-        load: Callable[[], tuple[float, int]] | None = None,
-        cpu_times: Callable[[], tuple[int, int] | None] | None = None,
-    ) -> None:
+    def __init__(self, load: Callable[[], tuple[float, int]] | None = None) -> None:
         self._load = load or (lambda: (os.getloadavg()[0], os.cpu_count() or 1))
         self._late = Rolling()
-        self._cpu_times = cpu_times or _cpu_times
+        self._cpu_times = _cpu_times
         # The times of the last 10 s, whose ends give the share that was used.
         self._times: deque[tuple[int, int, int]] = deque()
 

@@ -104,6 +104,7 @@ class Source(ABC):
 
     def __init__(self) -> None:
         self.not_sent: Counter[str] = Counter()
+        self._clock = StationClock()
 
     @abstractmethod
     def open(self) -> BridgeHello:
@@ -547,7 +548,6 @@ def run_bridge(
     *,
     stop: threading.Event,
     say: Say,
-    clock: StationClock | None = None,
 ) -> Summary:
     """Serve a source until `stop` is set, opening it again whenever it is lost.
 
@@ -558,7 +558,7 @@ def run_bridge(
         InvalidInputError: nothing can listen at the address.
         UnavailableError: the SDK's library is not installed.
     """
-    clock = clock or StationClock()
+    clock = StationClock()
     start_ns = clock.now_ns()
     server: BridgeServer | None = None
     try:

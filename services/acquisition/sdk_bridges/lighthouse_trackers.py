@@ -19,7 +19,6 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from dextouch.geometry.rotations import rotation_from_quaternion
-from services.acquisition.clock import StationClock
 from services.acquisition.devices.pose_tracker import (
     NOMINAL_RATE_HZ,
     NORM_TOLERANCE,
@@ -84,17 +83,10 @@ class OpenVrTrackers(bridge.Source):
         "monotonic clock with the middle of the call"
     )
 
-    def __init__(
-        self,
-        devices: Mapping[str, str],
-        *,
-        origin: Origin = "standing",
-        clock: StationClock | None = None,
-    ) -> None:
+    def __init__(self, devices: Mapping[str, str], *, origin: Origin = "standing") -> None:
         super().__init__()
         self._devices = bridge.placed_devices(devices)
         self._origin = origin
-        self._clock = clock or StationClock()
         self._pace = bridge.Pace(NOMINAL_RATE_HZ, self._clock)
         self._longest_call_ns = 0
         self._sdk: ModuleType | None = None

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgeHello
 from services.acquisition.sdk_bridges import bridge
@@ -39,10 +38,9 @@ class LslStream(bridge.Source):
         "CLOCK_MONOTONIC and from there to its raw monotonic clock"
     )
 
-    def __init__(self, value: str, *, by: str = "name", clock: StationClock | None = None) -> None:
+    def __init__(self, value: str, *, by: str = "name") -> None:
         super().__init__()
         self._value, self._by = value, by
-        self._clock = clock or StationClock()
         self._inlet: Any = None
         self._correction_s = self._uncertainty_s = self._corrected_s = 0.0
 

@@ -18,7 +18,6 @@ import numpy as np
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.hands import NODES, NUM_KEYPOINTS, node_order
 from dextouch.tactile.layout import SIDES, Side
-from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgeHello
 from services.acquisition.sdk_bridges import bridge
 
@@ -120,17 +119,10 @@ class ManusGloves(bridge.Source):
         "only distinguishes new data from repeated data"
     )
 
-    def __init__(
-        self,
-        sides: Sequence[Side] = SIDES,
-        *,
-        library: str = LIBRARY,
-        clock: StationClock | None = None,
-    ) -> None:
+    def __init__(self, sides: Sequence[Side] = SIDES, *, library: str = LIBRARY) -> None:
         super().__init__()
         self._devices = {side: bridge.hand_device(i, side, "manus") for i, side in enumerate(sides)}
         self._path = library
-        self._clock = clock or StationClock()
         self._library: ctypes.CDLL | None = None
         self._skeletons: deque[_Skeleton] = deque(maxlen=QUEUE_READINGS)
         self._has_some = threading.Event()

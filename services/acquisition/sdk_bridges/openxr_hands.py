@@ -19,7 +19,6 @@ import numpy as np
 from dextouch.errors import DeviceError
 from dextouch.hands import NODES
 from dextouch.tactile.layout import SIDES, Side
-from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import NOMINAL_RATE_HZ
 from services.acquisition.drivers.sdk_link import BridgeHello
 from services.acquisition.sdk_bridges import bridge
@@ -134,19 +133,12 @@ class OpenXrHands(bridge.Source):
         "below 10 µs); the runtime extrapolates to that moment"
     )
 
-    def __init__(
-        self,
-        sides: Sequence[Side] = SIDES,
-        *,
-        library: str = LIBRARY,
-        clock: StationClock | None = None,
-    ) -> None:
+    def __init__(self, sides: Sequence[Side] = SIDES, *, library: str = LIBRARY) -> None:
         super().__init__()
         self._devices = {
             side: bridge.hand_device(i, side, "openxr") for i, side in enumerate(sides)
         }
         self._path = library
-        self._clock = clock or StationClock()
         self._pace = bridge.Pace(NOMINAL_RATE_HZ, self._clock)
         self._library: ctypes.CDLL | None = None
         self._instance, self._session, self._space = Handle(), Handle(), Handle()
