@@ -50,7 +50,7 @@ COMMANDS = {
     "station bridge": Command(
         "serve samples of other makers' trackers and programs to stations",
         "acquisition.sdk_bridges.command_line:main",
-        "acquisition.sdk_bridges.parser:bridge_parser",
+        "acquisition.sdk_bridges.command_line:bridge_parser",
     ),
     "station enrol": Command(
         "exchange a one-time token for the station's key of the store",

@@ -23,7 +23,7 @@ from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import RecordingAttributes, TakePrompt
 from services.acquisition.mock_station import MockTake
 from services.acquisition.mocks.faults import Fate
-from services.acquisition.mocks.replay import replay_calibration, replay_streams
+from services.acquisition.mocks.replay import replay_streams
 from services.acquisition.uploader import Uploader
 from services.alignment.jobs import align_recording
 from services.alignment.recording_error import compare_with_truth, match_streams
@@ -105,7 +105,7 @@ def record_take(
             task=attributes.task, instruction=attributes.instruction, domain=attributes.domain
         ),
         attributes.success,
-        calibration={**replay_calibration(truth), **gloves},
+        calibration={**truth.attributes.matrices(), **gloves},
         recording_id=f"demo-{attributes.domain}",
         seed=seed,
         unit_seed=seed,

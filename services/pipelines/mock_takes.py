@@ -42,7 +42,7 @@ from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PLAYED_KINDS, ReplayStream
-from services.acquisition.path_latency import add_latencies
+from services.acquisition.watches import add_latencies
 from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
 from services.alignment.calibration.tactile_tare import measure_tare, reading_step
 from services.alignment.retargeting import warm_up

@@ -1,12 +1,15 @@
-"""Simulated finger and pose trackers, connected by HID, USB or a bridge to their SDK."""
+"""Simulated trackers by HID, USB or a bridge, cameras by a bridge or a bus, and a robot's state."""
 
 import socket
+import struct
 from abc import abstractmethod
+from collections.abc import Mapping
 from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.geometry.rotations import (
     quaternion_from_rotation,
     rotation_from_quaternion,
@@ -14,8 +17,14 @@ from dextouch.geometry.rotations import (
 )
 from dextouch.hands import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
-from services.acquisition.clock import PeriodicCall, VirtualClock
-from services.acquisition.devices import finger_tracker, pose_tracker
+from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock, Waiter
+from services.acquisition.devices import (
+    camera,
+    finger_tracker,
+    pose_tracker,
+    robot_state,
+    station_camera,
+)
 from services.acquisition.devices.pose_tracker import TrackingResult, TrackingState
 from services.acquisition.drivers.base import (
     DATA_REPORT,
@@ -23,6 +32,7 @@ from services.acquisition.drivers.base import (
     Driver,
     split_into_reports,
 )
+from services.acquisition.drivers.images import ImageEncoder, ImageEncoding
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     PROTOCOL,
@@ -34,7 +44,7 @@ from services.acquisition.drivers.sdk_link import (
 )
 from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import DeviceFaults, Fate
-from services.acquisition.mocks.ports import HidPort, SocketPort
+from services.acquisition.mocks.ports import HidPort, ReportPort, SocketPort
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
@@ -51,6 +61,9 @@ RESULTS = {
     TrackingState.FALLBACK_ROTATION_ONLY: TrackingResult.FALLBACK_ROTATION_ONLY,
     TrackingState.RUNNING_OK: TrackingResult.RUNNING_OK,
 }
+UNIT_HEADER = struct.Struct("<qHH")
+# With a virtual clock, time must not go on while an image is being encoded.
+LOCKSTEP_WAIT_S = 20.0
 DRIFT_M_PER_S = 0.5
 # Further than a body moves between two samples of any tracker.
 JUMP_M = (1.0, 0.0, 0.0)
@@ -108,11 +121,11 @@ class BridgePort(SocketPort):
 
 
 def bridged_pair(
-    place: replay.MockSlot, source: BridgeSource, decoder: BridgeDecoder
+    slot: replay.MockSlot, source: BridgeSource, decoder: BridgeDecoder
 ) -> replay.MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
-    port, clock = BridgePort(place.name, source.hello), place.clock
-    device = replay.MockDevice(place, source, port)
+    port, clock = BridgePort(slot.name, source.hello), slot.clock
+    device = replay.MockDevice(slot, source, port)
 
     def sign_of_life(sequence: int) -> bytes:
         return encode_packet(source.magic, Packet(VERSION, SOURCES["none"], sequence, 0, b""))
@@ -125,7 +138,7 @@ def bridged_pair(
             clock=clock,
             name="bridge-life",
         )
-    driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
+    driver = BridgeDriver(slot.name, transport=port.transport, decoder=decoder, clock=clock)
     return replay.MockPair(device, driver)
 
 
@@ -145,7 +158,7 @@ class TrackedFingers(replay.PacketSource):
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
         # For each sample one bit a node, in the device's order: whether the device sees it.
-        hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(self._order, _HIDDEN)))
+        hidden = sum(1 << int(node) for node in np.flatnonzero(np.isin(self._order, _HIDDEN)))
         self._seen = np.full(len(stream.t_ns), finger_tracker.ALL_SEEN, dtype=np.int64)
         for start_s, stop_s in faults.occluded_s:
             during = (stream.t_ns >= start_s * 1e9) & (stream.t_ns < stop_s * 1e9)
@@ -220,20 +233,18 @@ class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
         return 100.0 * points_m @ self.frame.ours_from_theirs()
 
 
-def mock_finger_tracker(place: replay.MockSlot) -> replay.MockPair:
-    """A finger tracker of one hand; the stream of its place is [n, 25, 3] in m, wrist frame."""
-    rng = replay.device_rng(place.seed, f"noise_{place.name}")
-    if place.link == "bridge":
-        bridge = BridgeFingerTrackerSource(
-            place.stream, side=place.side, rng=rng, faults=place.faults
-        )
-        return bridged_pair(place, bridge, finger_tracker.BridgeFingerTrackerDecoder(place.side))
-    source = FingerTrackerSource(place.stream, side=place.side, rng=rng, faults=place.faults)
-    port = HidPort(place.name, answer=source.answer)
+def mock_finger_tracker(slot: replay.MockSlot) -> replay.MockPair:
+    """A finger tracker of one hand; the stream of its slot is [n, 25, 3] in m, wrist frame."""
+    rng = replay.device_rng(slot.seed, f"noise_{slot.name}")
+    if slot.link == "bridge":
+        bridge = BridgeFingerTrackerSource(slot.stream, side=slot.side, rng=rng, faults=slot.faults)
+        return bridged_pair(slot, bridge, finger_tracker.BridgeFingerTrackerDecoder(slot.side))
+    source = FingerTrackerSource(slot.stream, side=slot.side, rng=rng, faults=slot.faults)
+    port = HidPort(slot.name, answer=source.answer)
     driver = finger_tracker.FingerTracker(
-        place.name, place.side, transport=port.transport, clock=place.clock
+        slot.name, slot.side, transport=port.transport, clock=slot.clock
     )
-    return replay.MockPair(replay.MockDevice(place, source, port), driver)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
 
 
 class TrackedPoses(replay.PacketSource):
@@ -324,15 +335,165 @@ class BridgePoseSource(TrackedPoses, BridgeSource):
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
-def mock_pose_tracker(place: replay.MockSlot) -> replay.MockPair:
-    """A pose tracker; the stream of its place is [n, 7], x y z (m) qw qx qy qz in the world."""
-    stream, faults = place.stream, place.faults
+def mock_pose_tracker(slot: replay.MockSlot) -> replay.MockPair:
+    """A pose tracker; the stream of its slot is [n, 7], x y z (m) qw qx qy qz in the world."""
+    stream, faults = slot.stream, slot.faults
     where = stream.descriptor.name
-    rng = replay.device_rng(place.seed, f"noise_{place.name}")
-    if place.link == "bridge":
+    rng = replay.device_rng(slot.seed, f"noise_{slot.name}")
+    if slot.link == "bridge":
         bridge = BridgePoseSource(stream, faults=faults, rng=rng)
-        return bridged_pair(place, bridge, pose_tracker.BridgePoseTrackerDecoder(where))
-    source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(place.name)
+        return bridged_pair(slot, bridge, pose_tracker.BridgePoseTrackerDecoder(where))
+    source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(slot.name)
     decoder = pose_tracker.PoseTrackerDecoder(where)
-    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return replay.MockPair(replay.MockDevice(place, source, port), driver)
+    driver = Driver(slot.name, transport=port.transport, decoder=decoder, clock=slot.clock)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
+
+
+class CameraSource(replay.PacketSource):
+    """Packets of one camera, of a stream uint8 [n, h, w, 3]."""
+
+    def __init__(self, stream: replay.ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
+        self.t_ns = stream.t_ns
+        self._images = stream.values
+        self._encoding: ImageEncoding = encoding
+        height_px, width_px = stream.descriptor.shape[:2]
+        self._encoder = ImageEncoder(
+            encoding, (height_px, width_px), rate_hz=stream.descriptor.nominal_rate_hz
+        )
+        self._last_sequence: int | None = None
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        image = self._images[index]
+        header = camera.PAYLOAD_HEADER.pack(*image.shape[:2], camera.ENCODING_CODES[self._encoding])
+        body = image.tobytes() if self._encoding == "rgb8" else self._encoded(index, sequence)
+        packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, header + body)
+        return [encode_packet(camera.MAGIC, packet)]
+
+    def _encoded(self, index: int, sequence: int) -> bytes:
+        # Packets that get lost were encoded too: a lost H.264 image tears its group.
+        first = sequence if self._last_sequence is None else self._last_sequence + 1
+        data = b""
+        for number in range(max(first, sequence - index), sequence + 1):
+            image = self._images[index - (sequence - number)]
+            data = self._encoder.encode(image, begins=False).item()
+        self._last_sequence = sequence
+        return data
+
+
+class VideoPort(ReportPort):
+    """The device's end of a camera; each opening of the host gets a new capture."""
+
+    # V4L2 drivers fill their buffers and lose later images.
+    max_reports = 4
+    transport: "MockCapture"
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        # What the camera states, if anything.
+        self.exposure_ns: int | None = None
+        self.transport = MockCapture(self, name)
+
+
+class MockCapture(station_camera.CaptureLink[VideoPort]):
+    """The host's end of a mock camera."""
+
+    def __init__(self, port: VideoPort, name: str) -> None:
+        super().__init__(address=f"mock:{name}", serial_number=name)
+        self._port = port
+        self._unit = b""
+
+    def wait(self, timeout_s: float) -> bool:
+        """Fetch the next image; images fetched before have been processed by now."""
+        port = self._opened()
+        port.link.add_consumed(len(self._unit))
+        try:
+            self._unit = port.fetch(timeout_s)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading") from error
+        return bool(self._unit)
+
+    def retrieve(self) -> station_camera.CapturedImage | None:
+        """The image fetched."""
+        t_driver_ns, height_px, width_px = UNIT_HEADER.unpack_from(self._unit)
+        pixels = np.frombuffer(self._unit, dtype=np.uint8, offset=UNIT_HEADER.size)
+        if pixels.size != height_px * width_px * 3:
+            return None
+        return station_camera.CapturedImage(pixels.reshape(height_px, width_px, 3), t_driver_ns)
+
+    def _connect(self) -> VideoPort:
+        port = self._port
+        port.check_plugged()
+        port.flush()
+        port.link.set_open(is_open=True)
+        self.exposure_ns, self._unit = port.exposure_ns, b""
+        return port
+
+    def _release(self, handle: VideoPort) -> None:
+        handle.link.set_open(is_open=False)
+
+
+class VideoSource(replay.PacketSource):
+    """Images, uint8 [n, h, w, 3], with the stamps of the kernel."""
+
+    def __init__(self, stream: replay.ReplayStream) -> None:
+        self.t_ns = stream.t_ns
+        self._images = stream.values
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One image; cameras have no sequence."""
+        image = self._images[index]
+        return [UNIT_HEADER.pack(t_device_ns, *image.shape[:2]) + image.tobytes()]
+
+
+class VideoDevice(replay.MockDevice):
+    """A mock device whose clock is the host's, since the host's kernel stamps its images."""
+
+    def play(
+        self, clock: StationClock, waiter: Waiter, *, start_host_ns: int, offset_ns: int = 0
+    ) -> bool:
+        """Play the whole source once, as every mock device does."""
+        self._boot_ns = start_host_ns
+        return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
+
+
+def video_camera(slot: replay.MockSlot, **settings: float | str) -> replay.MockPair:
+    """A mock camera that plays a stream of images, and its driver with other settings."""
+    port, descriptor = VideoPort(slot.name), slot.stream.descriptor
+    known = {
+        "stream": slot.name,
+        "rate_hz": descriptor.nominal_rate_hz,
+        "height_px": descriptor.shape[0],
+        "width_px": descriptor.shape[1],
+    }
+    driver = station_camera.StationCamera(
+        station_camera.StationCameraSettings.model_validate({**known, **settings}),
+        link=port.transport,
+        clock=slot.clock,
+        max_encode_wait_s=LOCKSTEP_WAIT_S,
+    )
+    return replay.MockPair(VideoDevice(slot, VideoSource(slot.stream), port), driver)
+
+
+class RobotStateSource(replay.PacketSource):
+    """Packets of one robot, of the six streams of `STREAM_SIZES`, all with the same times.
+
+    Raises:
+        InvalidInputError: one is missing, or their times differ.
+    """
+
+    def __init__(self, streams: Mapping[str, replay.ReplayStream]) -> None:
+        missing = sorted(set(robot_state.STREAM_SIZES) - set(streams))
+        if missing:
+            raise InvalidInputError(f"robot state: streams {missing} are missing")
+        parts = [streams[name] for name in robot_state.STREAM_SIZES]
+        if any(not np.array_equal(part.t_ns, parts[0].t_ns) for part in parts):
+            raise InvalidInputError("robot state: the six streams have different times")
+        self.t_ns = parts[0].t_ns
+        self._numbers = np.concatenate([part.values for part in parts], axis=1).astype("<f8")
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        payload = self._numbers[index].tobytes()
+        packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, payload)
+        return [encode_packet(robot_state.MAGIC, packet)]
