@@ -260,7 +260,6 @@ class _Latest:
         self.static: dict[str, dict[str, Any]] = {}
         self._patterns: dict[tuple[str, str], set[frozenset[str]]] = {}
         self._history: dict[tuple[str, str], list[tuple[int, Any]]] = {}
-        self._moments: dict[tuple[str, str], list[int]] = {}
         self._num_values = 0
 
     def add_static(self, chunk: Chunk) -> None:
@@ -296,9 +295,8 @@ class _Latest:
         for chunk in chunks:
             if not chunk.is_static and timeline in chunk.timeline_names:
                 self._add(chunk, timeline)
-        for key, found in self._history.items():
+        for found in self._history.values():
             found.sort(key=itemgetter(0))
-            self._moments[key] = [moment for moment, _ in found]
 
     def _add(self, chunk: Chunk, timeline: str) -> None:
         entity, batch = chunk.entity_path, chunk.to_record_batch()
@@ -323,10 +321,10 @@ class _Latest:
         for name in _COMPLETED_OF.get(archetype, ()):
             if name in row:
                 found[name] = _plain(row[name])
-            elif moments := self._moments.get((entity, name)):
-                index = bisect_right(moments, moment)
+            elif history := self._history.get((entity, name)):
+                index = bisect_right(history, moment, key=itemgetter(0))
                 if index:
-                    found[name] = self._history[entity, name][index - 1][1]
+                    found[name] = history[index - 1][1]
         return found
 
 
