@@ -1,8 +1,4 @@
-"""Poses of an episode's objects: from its streams at any time, and from clicks at its first step.
-
-A clicked pixel is a ray; where the ray meets the height of the clicked point over the table, there
-the point is. Of an object that is not symmetric, a second click says where it points.
-"""
+"""Poses of an episode's objects: from its streams at any time, and clicks at its first step."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -237,11 +233,9 @@ def clicked_poses(
 
     Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away. If
     they `may_lack_headings`, an object whose second click is missing is unknown, and not refused.
-
-    Raises:
-        UnknownNameError: a task or an object that the file of objects does not have.
-        InvalidInputError: a click outside the image or beside the table, or a missing or too near
-            second click.
+    Raises UnknownNameError: a task or an object that the file of objects does not have;
+    InvalidInputError: a click outside the image or beside the table, or a missing or too near
+    second click.
     """
     listed = listed_objects(about, objects)
     names = [one.name for one in listed]

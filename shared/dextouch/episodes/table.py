@@ -1,8 +1,4 @@
-"""Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash.
-
-World models, tokenizers, success classifiers, cloned policies and the figures of predictions all
-select episodes here and read them through `EpisodeGrid`, so that they agree on what an episode is.
-"""
+"""Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash."""
 
 import hashlib
 import math
@@ -21,7 +17,7 @@ from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.validity import interpolated_actions, measured_actions, measured_taxels
+from dextouch.episodes.validity import interpolated_actions, measured_actions
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
@@ -75,11 +71,9 @@ def select_episodes(
 
     Those that were rejected in review and those that lack what is needed, beside actions, are left
     out, counted and logged by reason. A domain of None is people and robots; tasks, splits of their
-    scenes and origins that are empty are all.
-
-    Raises:
-        NotFoundError: an empty store, or no such episode; what those that there are lack is named.
-        ConflictError: an id in two stores, two episodes of one recording, or other model rates.
+    scenes and origins that are empty are all. Raises NotFoundError for an empty store, or without
+    such an episode (what those that there are lack is named), ConflictError for an id in two
+    stores, two episodes of one recording, or other model rates.
     """
     passed_over: Counter[str] = Counter()
     unfit: Counter[str] = Counter()
@@ -194,14 +188,8 @@ class EpisodeGrid:
     """One episode on the model grid, read when it is asked for.
 
     Touch and images, which take the memory, are read anew by each call; only the images that are
-    asked for are decoded.
-
-    Args:
-        reader: the episode.
-        image_px: side that the middle square of larger images is scaled to; None for no scaling.
-
-    Attributes:
-        about: domain, origin, outcome, event times, names of objects and so on.
+    asked for are decoded. `image_px` is the side that the middle square of larger images is scaled
+    to, None for no scaling; `about` has domain, origin, outcome, event times and so on.
     """
 
     def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:
@@ -300,7 +288,7 @@ class EpisodeGrid:
     @property
     def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
-        return measured_taxels(self.about.calibration, self.tactile_layout.num_taxels)
+        return self.reader.measured_taxels
 
     @property
     def tactile_layout(self) -> TactileLayout:

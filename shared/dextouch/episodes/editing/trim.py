@@ -9,15 +9,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome
-from dextouch.episodes.editing.notes import time_span_ns
+from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome, time_span_ns
 from dextouch.episodes.format import GOP_IMAGES, STAMPS
-from dextouch.episodes.reader import (
-    ACTION_STREAMS,
-    SAME_INSTANT_NS,
-    EpisodeReader,
-    RecordingReader,
-)
+from dextouch.episodes.reader import ACTION_STREAMS, SAME_INSTANT_NS, EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.validity import interpolated_actions
 from dextouch.episodes.writer import EpisodeWriter
@@ -77,13 +71,8 @@ def trim_episode(
 ) -> EditedItem:
     """Write the steps first … stop − 1 of an episode as a new one, which supersedes it.
 
-    Args:
-        store: where the episode is.
-        episode_id: of the source.
-        steps: first step, and the one after the last.
-        outcome: of the result; None keeps it, which the end of a judged episode must not lack.
-        exact: encode H.264 images anew from the cut on.
-        options: of all edits.
+    The outcome stays if none is given, which the end of a judged episode must not lack; `exact`
+    encodes H.264 images anew from the cut on.
 
     Raises:
         InvalidInputError: steps outside the episode, or no outcome where one must be given.
