@@ -53,7 +53,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Tests of `LONG_FOLDERS` are long, but for those that have a mark of their own, whose time has no limit."""
+    """Tests of `LONG_FOLDERS` are long, but for those that have a mark of their own.
+
+    Those may take any time.
+    """
     is_in_folder = item.path.relative_to(ROOT / "tests").parts[0] in LONG_FOLDERS
     if any(item.get_closest_marker(name) for name in OTHER_MARKS):
         item.add_marker(pytest.mark.timeout(0))
