@@ -22,7 +22,7 @@ from services.evaluation.policies.cloning_training import read_cloning_episodes,
 from services.evaluation.policies.outside import load_policies
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
+from services.evaluation.reporting.sections import failure_rows, undecided_note
 from services.evaluation.settings import (
     DEFAULT_PROBE,
     PACKAGE,
@@ -37,6 +37,7 @@ from services.evaluation.success_classifier_training import (
     calibrate_success_classifier,
     train_success_classifier,
 )
+from services.evaluation.templates import figure
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, save_checkpoint
 
 EXIT_FAILED = 1

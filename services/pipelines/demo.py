@@ -35,7 +35,8 @@ from services.evaluation.reporting import (
     episode_picture,
     write_report,
 )
-from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
+from services.evaluation.reporting.sections import comparison_bars, error_rows
+from services.evaluation.templates import figure
 from services.pipelines import demo_scoring as scoring
 from services.pipelines import demo_takes as recording
 from services.pipelines.parsers import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, demo_plan

@@ -29,10 +29,10 @@ from services.evaluation.statistics import (
     central_interval,
     start_counts,
 )
+from services.evaluation.templates import UNDEFINED
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
-UNDEFINED = "undefined"
 # Of a rollout without marks of people.
 _UNDECIDED: Final[dict[str, Any]] = {"decided_score": UNDEFINED, "tied": [], "was_tied": False}
 

@@ -13,8 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-
 from dextouch import __version__
 from dextouch.free_text import printable
 from services.evaluation.reporting.pictures import (
@@ -40,11 +38,11 @@ from services.evaluation.reporting.sections import (
     comparison_bars,
     error_rows,
     failure_rows,
-    figure,
     stage_bars,
     tiles,
     undecided_note,
 )
+from services.evaluation.templates import environment
 
 __all__ = [
     "MAX_MOVING",
@@ -61,16 +59,11 @@ __all__ = [
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
     """Write the page atomically; NaN and None are shown as "undefined"."""
-    environment = Environment(
-        loader=PackageLoader("services.evaluation.reporting"),
-        autoescape=select_autoescape(["j2"], default=True),
-        undefined=StrictUndefined,
-        finalize=_visible,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    # Texts from elsewhere with their unusual characters escaped; drawings and numbers as given.
+    pages = environment().overlay(
+        finalize=lambda value: printable(value, lines=True) if type(value) is str else value
     )
-    environment.filters["figure"] = figure
-    text = environment.get_template("report.html.j2").render(
+    text = pages.get_template("report.html.j2").render(
         title=report.get("title", "DexTouch report"),
         about=report.get("about", {}),
         raw_report=report,
@@ -102,8 +95,3 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)
-
-
-def _visible(value: object) -> object:
-    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
-    return printable(value, lines=True) if type(value) is str else value

@@ -25,7 +25,6 @@ from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import (
     LEAST_DECIDED,
     REAL,
-    UNDEFINED,
     VAGUE_R,
     ClosedLoopReport,
     RolloutFailure,
@@ -42,6 +41,7 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
+from services.evaluation.templates import UNDEFINED
 
 logger = structlog.get_logger(__name__)
 

@@ -29,7 +29,8 @@ from services.evaluation.reporting.pictures import (
     scale_colours,
     ticks,
 )
-from services.evaluation.reporting.sections import clock_rows, error_rows, figure, tiles
+from services.evaluation.reporting.sections import clock_rows, error_rows, tiles
+from services.evaluation.templates import figure
 
 rng = np.random.default_rng(11)
 TIMES = np.linspace(0, 5, 4)
