@@ -27,7 +27,6 @@ from dextouch.tactile.layout import (
     TactileLayout,
 )
 from services.evaluation.reporting.policy_picture import NAMESPACE, Rate, policy_picture
-from services.evaluation.reporting.sections import AgreementFigure, agreement_figures
 from services.evaluation.templates import is_number, rendered
 
 # Photographs larger than this are embedded as JPEG.
@@ -351,19 +350,10 @@ class PolicyPanel:
 
     task: str
     rows: list[Mapping[str, Any]]
-    agreement: list[AgreementFigure]
+    agreement: Mapping[str, Any]
     comments: list[str]
     chart: Markup | None
     rubric: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Images in rows over time: an episode, or ground truth above prediction."""
-
-    title: str
-    kind: str
-    rows: list[tuple[str, list[Moment]]]
 
 
 def clock_chart(pictures: ReportPictures) -> NamedChart | None:
@@ -433,7 +423,7 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
         drawn = policy_picture(pairs, title, "svg").decode() if pairs else ""
         # Names are escaped, the rest are numbers; within a page a picture needs no namespace.
         chart = Markup(drawn.replace(f" {NAMESPACE}", "")) if drawn else None  # noqa: S704
-        figures = agreement_figures(agreement.get(task, {}))
+        figures = agreement.get(task, {})
         rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
         panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
     return panels
@@ -443,19 +433,6 @@ def _rate(entry: Mapping[str, Any], world: str) -> Rate:
     """A score with its interval, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
     return float(entry[world]), float(low), float(high)
-
-
-def strips(pictures: ReportPictures) -> list[Strip]:
-    """Episodes as one row of images, predictions below their ground truth."""
-    found = [
-        Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa, e.layout))])
-        for e in pictures.episodes
-    ]
-    for p in pictures.predictions:
-        true = moments(p.times_s, p.true_images, p.true_tactile_kpa, p.layout)
-        predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa, p.layout)
-        found.append(Strip(p.title, "prediction", [("true", true), ("predicted", predicted)]))
-    return found
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:

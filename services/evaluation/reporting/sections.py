@@ -1,4 +1,4 @@
-"""Sections of the report page: tiles, bars and error rows."""
+"""Sections of the report page: tiles, bars and error rows; tables for papers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,6 @@ ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("fingertip_error_mm", "Fingertip error", "mm", None),
 )
 CLOCK_BOUND_MS = 1.0
-# Smaller errors with measured and true calibration are not told apart.
-LEAST_SHOWN = 0.001
 AGREEMENT: tuple[tuple[str, str], ...] = (
     ("pearson", "Pearson"),
     ("mmrv", "MMRV, ties counted"),
@@ -84,25 +82,6 @@ class ErrorRow:
 
 
 @dataclass(frozen=True)
-class CalibrationRow:
-    """One error of a take with the measured and with the true calibration of its devices."""
-
-    name: str
-    measured: str
-    true: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class AgreementFigure:
-    """One agreement figure, with its 95 % interval if it has one."""
-
-    name: str
-    value: Any
-    interval: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
 class Tile:
     """One headline figure."""
 
@@ -130,14 +109,6 @@ def undecided_note(row: Mapping[str, Any], name: str) -> str:
         return ""
     note = f"{undecided} of {row[f'{name}_rollouts']} cannot tell"
     return note if row[f"{name}_comparable"] else f"{note}, not comparable"
-
-
-def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
-    """Seconds of every stage."""
-    names = [str(stage["name"]).replace("_", " ").capitalize() for stage in stages]
-    seconds = [float(stage["seconds"]) for stage in stages]
-    longest = max(seconds, default=1.0) or 1.0
-    return [Bar(name, took, took / longest) for name, took in zip(names, seconds, strict=True)]
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
@@ -175,23 +146,6 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
     return rows
 
 
-def calibration_rows(report: Mapping[str, Any]) -> list[CalibrationRow]:
-    """Errors of each take with the measured calibration, and those with the true one."""
-    rows = []
-    for take, found in report.get("errors_by_calibration", {}).items():
-        for key, name, unit, _ in ERRORS:
-            if key in found["measured"]:
-                shown = f"{take.capitalize()}: {name.lower().removesuffix(' error')}"
-                measured, true = _at_least(found["measured"][key]), _at_least(found["true"][key])
-                rows.append(CalibrationRow(shown, measured, true, unit))
-    return rows
-
-
-def _at_least(value: object) -> str:
-    is_small = is_number(value) and abs(float(str(value))) < LEAST_SHOWN
-    return f"< {LEAST_SHOWN}" if is_small else figure(value)
-
-
 def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
     """Errors of the clock fits of all streams."""
     return [
@@ -204,17 +158,6 @@ def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
         )
         for stream, value in dict(errors.get("clock_rms_ms", {})).items()
     ]
-
-
-def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
-    """Agreement figures available for a task."""
-    found = []
-    for key, name in AGREEMENT:
-        if key in agreement:
-            interval = agreement.get(f"{key}_interval")
-            known = (interval[0], interval[1]) if isinstance(interval, list) else None
-            found.append(AgreementFigure(name, agreement[key], known))
-    return found
 
 
 def failure_rows(report: Mapping[str, Any]) -> list[FailureRow]:
