@@ -41,8 +41,7 @@ from services.evaluation.studies.results import (
     planned_rollouts_of,
     read_definition,
 )
-from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
-from services.evaluation.studies.study_pictures import write_pictures
+from services.evaluation.studies.study_figures import REPORT_FILE, write_pictures, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
