@@ -135,7 +135,7 @@ _COMMANDS = {
     "camera": (
         "photos of a board → K and distortion of a camera",
         _CAMERA,
-        "pipelines.calibrate.cameras:calibrate",
+        "pipelines.calibrate.commands:calibrate",
     ),
     "hand-eye": (
         "photos and poses → camera on its tracker",
@@ -150,17 +150,17 @@ _COMMANDS = {
     "wrist": (
         "flat hand → wrist axes of a glove's keypoints",
         _WRIST,
-        "pipelines.calibrate.takes:measure_wrist",
+        "pipelines.calibrate.commands:measure_wrist",
     ),
     "profile": (
         "moving hand → the person's bones and knuckles",
         _PROFILE,
-        "pipelines.calibrate.takes:measure_person",
+        "pipelines.calibrate.commands:measure_person",
     ),
     "robot-base": (
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
-        "pipelines.calibrate.cameras:calibrate_base",
+        "pipelines.calibrate.commands:calibrate_base",
     ),
     "time": (
         "shaking everything together → all path delays",
@@ -170,7 +170,7 @@ _COMMANDS = {
     "latency": (
         "taps of a hand → path delay of glove or tracker",
         _LATENCY,
-        "pipelines.calibrate.takes:measure_latency",
+        "pipelines.calibrate.commands:measure_latency",
     ),
     "show": ("contents, age and accuracy of a calibration", _SHOW, "pipelines.calibrate.show:show"),
 }
