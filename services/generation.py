@@ -44,20 +44,12 @@ def imagine_episode(
     step 1 on; the world's uncertainty about the whole rollout, and its own estimate of success, are
     quality figures (`RolloutUncertainty.to_quality`).
 
-    Args:
-        source: a robot episode with head camera, touch and actions.
-        client: of the service with the world.
-        world: its name at the service.
-        store: destination of the imagined episode.
-        image_steps: steps whose images are needed; None for all. Images are kept for the chunks of
-            four steps that contain one of these. Use it only with worlds whose state does not
-            depend on chunk boundaries, since chunks are then shorter.
+    With `image_steps`, images are kept of the chunks of four steps that contain one of these. Use
+    it only with worlds whose state does not depend on chunk boundaries, since chunks are then
+    shorter.
 
-    Returns:
-        Its id; equal source and world give an equal id, and an existing episode is kept.
-
-    Raises:
-        UnknownNameError: no such world, or a source without head camera.
+    Returns its id; equal source and world give an equal id, and an existing episode is kept. Raises
+    UnknownNameError for no such world, or a source without head camera.
     """
     described = {description.name: description for description in client.worlds()}
     if world not in described:

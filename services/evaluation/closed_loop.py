@@ -73,11 +73,9 @@ def evaluate(
     probe: SuccessClassifier,
     keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
-    """Roll out every policy from every start in every world.
+    """Roll out every policy from every start in every world, by their names in the report.
 
-    The real world reports success itself; imagined worlds, of which there may be none, and policies
-    are given by their names in the report. `keep` is called with every outcome as soon as it is
-    known.
+    There may be no imagined world. `keep` is called with every outcome as soon as it is known.
 
     Raises:
         ConflictError: a start was trained on.
@@ -300,12 +298,9 @@ class RolloutRunner:
 
 
 class ResultLog:
-    """Appends rollouts one by one, so that an interrupted study keeps its results.
+    """Appends rollouts one by one to a file, so that an interrupted study keeps its results.
 
     Rows of earlier studies are kept and distinguished by `study`, the start time of the study.
-
-    Args:
-        path: file to append to; it and its folder are created with the first row.
     """
 
     def __init__(self, path: Path) -> None:

@@ -35,10 +35,8 @@ class StudyWorlds:
     def ask(cls, real: WorldAddress, imagined: Mapping[str, WorldAddress]) -> "StudyWorlds":
         """Request the description of every world from its service.
 
-        Raises:
-            UnavailableError: a service does not answer.
-            UnknownNameError: a service has no world of this name.
-            InvalidInputError: an imagined world has the name of the real one.
+        Raises UnavailableError if one does not answer, UnknownNameError if it has no world of this
+        name, and InvalidInputError if an imagined world has the name of the real one.
         """
         if REAL in imagined:
             raise InvalidInputError(

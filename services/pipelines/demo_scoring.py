@@ -64,10 +64,8 @@ def committed_models() -> Models:
 def train_models(folder: Path) -> Models:
     """Record training episodes and train a small state model, a policy and a success classifier.
 
-    The probe is trained on true endings and on those imagined by the state model.
-
-    Args:
-        folder: folder of episodes and checkpoints; existing episodes are reused.
+    The probe is trained on true endings and on those imagined by the state model. The folder is for
+    episodes, of which existing ones are reused, and checkpoints.
     """
     episodes, exact, endings, unseen, imagined = (
         str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
@@ -128,9 +126,7 @@ def score_policies(
 ) -> tuple[dict[str, Any], tuple[PredictionPicture, ...]]:
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
-    Returns:
-        `policies`, `agreement`, `mistakes` and other entries of `report.json`, and a pair of
-        rollouts of every task to show.
+    Returns entries of `report.json`, and a pair of rollouts of every task to show.
     """
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(

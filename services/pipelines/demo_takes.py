@@ -169,9 +169,7 @@ def upload(spool_root: Path, store_url: str) -> None:
 def align(alignment_url: str, recording_id: str) -> AlignmentJob:
     """Align a recording with the alignment service, and wait for the job.
 
-    Raises:
-        DexTouchError: what the service refused, with its reason.
-        UnavailableError: it does not answer.
+    Raises what the service refused, with its reason, or UnavailableError if it does not answer.
     """
     link = HttpLink(alignment_url, timeout_s=ALIGNMENT_TIMEOUT_S)
     body = json.dumps({"recording_id": recording_id}).encode()
@@ -187,10 +185,8 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
 def align_truly(take: MockTake, store: EpisodeStore, options: AlignmentOptions) -> EpisodeReader:
     """Align a take as if its gloves and path delays had been calibrated without error.
 
-    Args:
-        take: still in its spool.
-        store: for the recording with its true calibration, and the episode.
-        options: of the other alignment.
+    The take is still in its spool; the store gets the recording with its true calibration, and the
+    episode.
     """
     attributes = SpoolReader(take.spool_path).attributes
     calibration = {**attributes.calibration, **take.true_calibration}

@@ -126,14 +126,8 @@ def measure_gloves(
 
     By default the take runs in real time, in which the station asks its gloves for their time, and
     path delays are measured, too. With a virtual clock they are not (a mock station knows them with
-    an error), but equal arguments give equal matrices.
-
-    Args:
-        streams: of the take that follows; its gloves are calibrated.
-        spool_root: folder for the calibration takes.
-        seed: of the mock station, whose gloves differ by seed, and of the errors of the pressures.
-        clock: of the station.
-
+    an error), but equal arguments give equal matrices. The seed is that of the mock station, whose
+    gloves differ by it, and of the errors of the pressures; `spool_root` is for calibration takes.
     Raises UnavailableError if a glove's path delay could not be measured in several takes.
     """
     gloves = {side: s for s in streams for side in SIDES if s.descriptor.name == f"tactile_{side}"}
@@ -231,17 +225,9 @@ def write_by_station(
     `objects`, poses of objects are those of the markers in the images, and of the twin's truth the
     episode has only the outcome, which an operator would see. The recording itself is not kept.
 
-    Args:
-        store: where the episode goes.
-        truth: recorded with `device_options`; with `objects` by a stage that shows the markers.
-        objects: of the task, with their markers.
-        episode_id: of the new episode.
-        options: `streams` and `image_every` say what the episode has.
-
-    Raises:
-        ConflictError: the episode exists.
-        InvalidInputError: the take could not be aligned.
-        DeviceError: a mock device failed.
+    The truth is recorded with `device_options`, with `objects` by a stage that shows the markers;
+    `streams` and `image_every` of the options say what the episode has. Raises ConflictError if it
+    exists, InvalidInputError if the take could not be aligned, DeviceError if a mock device failed.
     """
     alignment = ALIGNMENT.model_copy(update={"objects": objects}) if objects else ALIGNMENT
     attributes, streams, origin_ns = _aligned(truth, alignment, episode_id)

@@ -93,9 +93,8 @@ def read_places(
 ) -> Places:
     """Find the objects in the first step of an observation.
 
-    Raises:
-        UnknownNameError: no head camera, or a task that the readers do not know.
-        InvalidInputError: an image of another size.
+    Raises UnknownNameError without a head camera or for a task that the readers do not know, and
+    InvalidInputError for an image of another size.
     """
     if task not in config.tasks:
         raise UnknownNameError("task of the place policy", task, list(config.tasks))
@@ -248,9 +247,7 @@ class PlacePolicy:
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """The next 16 commanded actions, relative to the rollout's step 0; at the end, the last.
 
-        Raises:
-            InvalidInputError: `reset` was not called, or an image of another size.
-            UnknownNameError: the first observation has no head camera.
+        Raises InvalidInputError before `reset`, and as `read_places`.
         """
         start = self._start
         if start is None:
@@ -331,9 +328,7 @@ def train_place_policy(
 ) -> Checkpoint:
     """Fit the motions of every task; the start readers of the state model `model` find the objects.
 
-    Raises:
-        InvalidInputError: too few takes of a task.
-        UnknownNameError: a task that the readers do not know.
+    Raises InvalidInputError for too few takes of a task, and as `read_places`.
     """
     found = read_state_checkpoint(model)
     config, readers = found.metadata.dynamics, found.dynamics.readers()

@@ -64,9 +64,8 @@ class BoundAddress:
 def bind(name: str, *, host: str, port: int) -> BoundAddress:
     """Bind a port; 0 selects a free one.
 
-    Raises:
-        ConflictError: the port is in use.
-        InvalidInputError: the host is not local, or the port needs rights.
+    Raises ConflictError for a port in use, and InvalidInputError if it needs rights or the host is
+    not local.
     """
     flag = f"--{name.replace('_', '-')}-port"
     advice = f"choose another port with {flag}, or 0 for any free one"

@@ -194,10 +194,8 @@ def _own_probes(
 ) -> dict[str, SuccessClassifier]:
     """Success classifiers of single worlds, by world.
 
-    Raises:
-        InvalidInputError: one does not know a task of the study, or sees images of another size
-            than `probe`.
-        NotFoundError, CorruptDataError: a checkpoint that cannot be read.
+    Raises InvalidInputError if one sees images of another size than `probe`, and UnknownNameError
+    if one does not know a task of the study.
     """
     own: dict[str, SuccessClassifier] = {}
     for name, path in _own_paths(definition):
@@ -225,9 +223,8 @@ def _finish(results: StudyResults, json_path: Path | None) -> int:
 def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, ServedWorld]]:
     """Addresses of all worlds by name; those without a URL are served until the block ends.
 
-    Raises:
-        UnavailableError: a process could not serve its world; its messages are above.
-        InvalidInputError: a checkpoint that cannot be served, or a key's variable is not set.
+    Raises UnavailableError if a process could not serve its world (its messages are above), and
+    InvalidInputError for a checkpoint that cannot be served, or a key's variable that is not set.
     """
     choices = {REAL: definition.real, **definition.imagined}
     with ExitStack() as children:
@@ -270,11 +267,9 @@ def connect(addresses: Mapping[str, ServedWorld], connections: ExitStack) -> Stu
 
 
 def refuse_training_seeds(definition: StudyDefinition) -> None:
-    """Refuse starts whose task and seed a world model was trained on.
+    """Refuse starts whose task and seed a world model was trained on, by ConflictError.
 
-    Raises:
-        ConflictError: a start was trained on.
-        NotFoundError: a checkpoint is missing.
+    Raises NotFoundError if a checkpoint is missing.
     """
     for name, choice in definition.imagined.items():
         path = default_checkpoint() if choice.builtin == "world-model" else choice.checkpoint

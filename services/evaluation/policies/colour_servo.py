@@ -155,9 +155,7 @@ class ColourServo:
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """The next 16 commanded actions, relative to the rollout's step 0.
 
-        Raises:
-            InvalidInputError: `reset` was not called.
-            UnknownNameError: the observation has no head camera.
+        Raises InvalidInputError before `reset`, and UnknownNameError without a head camera.
         """
         if self._start is None:
             raise InvalidInputError("colour servo: act before reset; call reset with the start")

@@ -51,12 +51,8 @@ def action_chunk(
 ) -> Float64[np.ndarray, "steps 67"]:
     """Validate the return value of a policy's `act` as an action chunk of a world.
 
-    `answer` is an array, nested list or tensor [K, 67] of any kind of real number; `where` names
-    policy, task, seed and chunk in error messages.
-
-    Raises:
-        ShapeError: wrong shape or dtype, or a K that the world does not accept.
-        NonFiniteError: NaN or infinity.
+    `answer` is an array, nested list or tensor [K, 67] of any kind of real number. Raises
+    ShapeError for another shape, dtype or K than the world accepts, NonFiniteError for NaN.
     """
     rows = _array(answer, where)
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != ACTION_DIM:
@@ -97,10 +93,7 @@ class PolicySource:
 
     @classmethod
     def parse(cls, text: str) -> "PolicySource":
-        """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`.
-
-        Raises InvalidInputError for any other text.
-        """
+        """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`; InvalidInputError for other texts."""
         match = _SOURCE.fullmatch(text)
         if match is None:
             raise InvalidInputError(

@@ -54,13 +54,8 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
     "Computing Krippendorff's Alpha-Reliability", 2011). Rollouts with fewer than two ratings do not
     count.
 
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-        level: "nominal" for marks that are equal or not; "interval" for scores, whose squared
-            difference counts.
-
-    Returns:
-        Alpha; NaN where it is undefined: no rollout with two ratings, or all ratings equal.
+    The level is "nominal" for marks that are equal or not, "interval" for scores, whose squared
+    difference counts. NaN where it is undefined: no rollout with two ratings, or all equal.
     """
     known = np.isfinite(ratings)
     rows = known.sum(axis=1) >= 2
@@ -82,11 +77,6 @@ def alpha_interval(
     """95 % bootstrap interval of alpha of scores: rollouts are drawn, with all of their ratings.
 
     None if alpha is undefined, or is in more than one of twenty draws, as for very few rollouts.
-
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-        generator: random numbers of the draws.
-        num_draws: how many.
     """
     rated = ratings[np.isfinite(ratings).sum(axis=1) >= 2]
     if len(rated) < 2:
@@ -117,13 +107,7 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
     """ICC(2,k): reliability of the mean of all raters, each of whom rated every rollout.
 
     Two-way random effects, absolute agreement (Shrout and Fleiss 1979). Rollouts that a rater did
-    not rate do not count.
-
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-
-    Returns:
-        The coefficient; NaN for fewer than two raters or two complete rollouts, or without spread.
+    not rate do not count. NaN for fewer than two raters or complete rollouts, or without spread.
     """
     complete = ratings[np.isfinite(ratings).all(axis=1)]
     num_rollouts, num_raters = complete.shape
@@ -169,14 +153,9 @@ def rating_report(
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
-    Marks of programs are listed separately from those of people.
-
-    Args:
-        marks: those that count (`MarkLog.latest`).
-        task_of: task of each episode id; marks of others are skipped.
-        rubrics: by task.
-        state_scores: true scores by episode id, where they are known.
-        raters_per_rollout: of fewer nothing is tied yet.
+    Of the marks that count (`MarkLog.latest`), those of programs are listed separately, and those
+    of episodes without a task are skipped. `state_scores` are true scores by episode id, where they
+    are known; with fewer than `raters_per_rollout` marks nothing is tied yet.
     """
     known = [one.mark for one in marks if one.mark.episode_id in task_of]
     decided = _decided(known, task_of, rubrics, raters_per_rollout)

@@ -85,9 +85,8 @@ class _Control:
     async def run(self) -> None:
         """Answer the first message, which starts the hand; then command it until the end.
 
-        Raises:
-            WebSocketDisconnect: the client is gone before it started.
-            InvalidInputError: the first message is no valid start.
+        Raises WebSocketDisconnect if the client is gone before it started, and InvalidInputError if
+        the first message is no valid start.
         """
         form, value = _message(await self._socket.receive())
         if form != "start":
@@ -188,9 +187,7 @@ class _Control:
 def _message(received: Any) -> tuple[str, Any]:  # noqa: ANN401 - of ASGI
     """Name and content of a message: angles by joint of a start, a sample, or nothing of a stop.
 
-    Raises:
-        WebSocketDisconnect: the client is gone.
-        InvalidInputError: it is none of these.
+    Raises WebSocketDisconnect if the client is gone, and InvalidInputError for anything else.
     """
     if received["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(received.get("code", 1005))
