@@ -72,7 +72,6 @@ def apply_configuration() -> None:
     """Use the data folder of the configuration file, and refuse sections that no command has.
 
     The folder is relative to the file; the environment variable DEXTOUCH_DATA comes before it.
-    Raises InvalidInputError for an unknown section, or an unreadable file.
     """
     path = serving.configuration_path()
     if path is None:

@@ -1,8 +1,4 @@
-"""Command `dextouch doctor`: checks what this machine can do and what is missing.
-
-The machine is read below a root folder, so that tests give a tree of their own. Each finding that
-is not in order has the command that puts it right.
-"""
+"""Command `dextouch doctor`: checks what this machine can do, and says what puts it right."""
 
 import ctypes.util
 import importlib.metadata

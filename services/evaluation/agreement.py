@@ -1,9 +1,4 @@
-"""Agreement of policies' scores between two worlds: figures, intervals and significance.
-
-`task_agreement` and `pooled_agreement` are what a study reports: correlations, mean maximum rank
-violation, bias and error with 95 % intervals, the influence of each policy, and how likely chance
-alone would order the policies as well. `paired_differences` compares policies inside one world.
-"""
+"""Agreement of policies' scores between two worlds: figures, intervals and significance."""
 
 import itertools
 import math
@@ -234,11 +229,9 @@ def paired_differences(
 ) -> list[Difference]:
     """Differences of mean scores of all pairs of policies over matched starts.
 
-    A score that is NaN is missing: a pair is compared over the starts that both have, and left out
-    if there are none.
-
-    The interval is that of Bonett and Price (2012) for paired rates, which adds one difference of
-    +1 and one of −1; for graded scores in 0 … 1 the same two are added.
+    A pair is compared over the starts that both have a score of, which is not NaN. The interval is
+    that of Bonett and Price (2012) for paired rates, which adds one difference of +1 and one of −1;
+    for graded scores in 0 … 1 the same two are added.
     """
     found = []
     for first, second in itertools.combinations(range(len(policies)), 2):

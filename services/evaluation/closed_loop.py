@@ -1,9 +1,7 @@
 """Closed-loop evaluation: rolls out policies in worlds from matched starts and scores them.
 
-The real world starts each (task, seed) once for every policy; every imagined world starts from
-exactly that first observation, anchor and camera. Real success is reported by the real world,
-imagined success is the probe's decision on the last three steps. A failed rollout is recorded as a
-failure, and the others continue.
+Imagined worlds start from exactly the first observation, anchor and camera of the real one. Real
+success is reported by the real world, imagined success is the probe's decision on the ending.
 """
 
 import itertools

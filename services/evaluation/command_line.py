@@ -149,12 +149,7 @@ def run_evaluation(arguments: list[str]) -> int:
 
 
 def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str, Sequence[str]]]:
-    """All requested policies by name, and the training starts of the bundled ones.
-
-    Raises:
-        InvalidInputError: two policies of one name, or a user policy that does not load.
-        UnknownNameError: arguments for a policy that was not requested.
-    """
+    """All requested policies by name, and the training starts of bundled ones; `load_policies`."""
     policies = load_policies(
         settings.policy,
         settings.policy_arguments,

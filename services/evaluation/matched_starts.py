@@ -62,12 +62,9 @@ class StudyWorlds:
     def check(self, tasks: Sequence[str], num_steps: int, image_size_px: int) -> None:
         """Reject incompatible worlds before the first rollout.
 
-        Raises:
-            UnknownNameError: a task that a world does not have.
-            InvalidInputError: a real world that does not report success or does not start from
-                task and seed, an imagined one that does not start from its observations, touch of
-                a glove that success classifiers do not support, images of another size than
-                theirs, or a length that is not a multiple of a world's chunk.
+        Raises UnknownNameError for a task that a world does not have, and InvalidInputError for
+        worlds that cannot report or start what is needed, or for images, touch or a length of
+        rollouts that do not fit success classifiers or a world's chunk.
         """
         real = self.descriptions[REAL]
         if not real.knows_success or "task_seed" not in real.starts_from:

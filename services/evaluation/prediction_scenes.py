@@ -195,9 +195,7 @@ class Scene:
 def read_rollout(reader: EpisodeReader) -> Scene:
     """A whole episode as one scene, up to its last complete chunk.
 
-    Raises:
-        InvalidInputError: an episode shorter than one chunk.
-        UnknownNameError: no head camera.
+    Raises InvalidInputError if it is shorter than one, UnknownNameError without head camera.
     """
     num_steps = (reader.num_steps - 1) // CHUNK_STEPS * CHUNK_STEPS
     if num_steps == 0:

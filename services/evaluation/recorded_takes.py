@@ -1,8 +1,6 @@
 """Policies scored in a world model from the first observations of recorded takes.
 
-A lab without a simulation has takes of its robot, with outcomes that operators entered. Replayed in
-the world model, their actions show how far its verdicts can be trusted; policies that act from the
-same first observations are scored by the same judge.
+The takes' own actions, replayed there, show how far its verdicts can be trusted.
 """
 
 from collections import Counter
@@ -191,13 +189,8 @@ def score_recorded(
 
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
-    digests of their training starts.
-
-    Raises:
-        ConflictError: a take was trained on.
-        InvalidInputError: a task that the world or the judge does not know, touch of a glove that
-            judges do not support, images of another size than the judge's, or a take that is
-            shorter than a chunk.
+    digests of their training starts. Raises ConflictError for a take that was trained on, and
+    InvalidInputError for a task, touch, images or a length that the world or the judge do not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}

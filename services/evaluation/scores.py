@@ -341,12 +341,7 @@ def matched(
 
     Excludes policies without a start that finished in both worlds, then starts that did not
     finish in both worlds for every remaining policy, then policies without a decided one of these.
-
-    Args:
-        policies: names, in the order of the outcomes.
-        real: outcomes in the real world.
-        imagined: outcomes in the imagined one, undecided ones with the likelier.
-        decided: the same with NaN for undecided ones, which is what is returned.
+    `imagined` has the likelier outcome of undecided rollouts, `decided` NaN.
     """
     known = np.isfinite(real) & np.isfinite(imagined)
     rows = known.any(axis=1)

@@ -166,9 +166,8 @@ def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor,
 def probe_batch(endings: Sequence[Ending], shape: ClassifierShape) -> ClassifierBatch:
     """Network tensors of endings, for training and prediction alike.
 
-    Raises:
-        UnknownNameError: a task that the probe was not trained for.
-        InvalidInputError: images of another size, or neither images nor object poses.
+    Raises UnknownNameError for a task that the probe was not trained for, and InvalidInputError for
+    images of another size, or neither images nor object poses.
     """
     for ending in endings:
         _check(ending, shape)
@@ -322,9 +321,7 @@ class SuccessClassifier:
     def log_odds(self, endings: Sequence[Ending]) -> Float64[np.ndarray, "n outputs"]:
         """Uncalibrated log odds of success and of the task's milestones.
 
-        Raises:
-            UnknownNameError: a task that the probe was not trained for.
-            InvalidInputError: no endings, images of another size, or missing images.
+        Raises InvalidInputError without endings, and as `probe_batch`.
         """
         if not endings:
             raise InvalidInputError("success classifier: got no endings, expected at least one")

@@ -1,8 +1,4 @@
-"""Training of the success classifier on true and imagined endings of known outcome.
-
-Three disjoint sets of episodes: training, development (to calibrate the probabilities) and held out
-(for the metrics in the checkpoint).
-"""
+"""Training of the success classifier on true and imagined endings of known outcome."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -201,7 +197,7 @@ def object_scale(batch: ClassifierBatch) -> tuple[torch.Tensor, torch.Tensor]:
 
 @dataclass(frozen=True)
 class ClassifierSets:
-    """Disjoint sets of episodes; no two sets share a start."""
+    """Episodes to train on, to calibrate on, and for metrics; no two sets share a start."""
 
     training: Sequence[EndingEpisode]
     development: Sequence[EndingEpisode]
@@ -268,12 +264,9 @@ def train_success_classifier(
 
     `development` are the episodes to calibrate on, and `held_out` those of the metrics in the
     metadata; by default each is a share of the scenes of `episodes`, true and imagined ones. Each
-    of `jobs` processes trains one task at a time; the weights do not depend on their number. The
-    checkpoint stores the `command`.
-
-    Raises:
-        ConflictError: a held-out or development episode starts like a training episode.
-        InvalidInputError: a task has only one outcome.
+    of `jobs` processes trains one task at a time; the weights do not depend on their number. Raises
+    ConflictError if a held-out or development episode starts like a training episode, and
+    InvalidInputError for a task with only one outcome.
     """
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)

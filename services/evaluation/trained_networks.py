@@ -61,12 +61,7 @@ def network_tensors(network: nn.Module, *, halved: Collection[str] = ()) -> dict
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write the file atomically.
-
-    Raises:
-        NonFiniteError: weights that are not finite.
-        LimitExceededError: more than 8 MiB.
-    """
+    """Write the file atomically; raises NonFiniteError, or LimitExceededError over 8 MiB."""
     refuse_non_finite(checkpoint.tensors, "checkpoint")
     size = sum(t.numel() * t.element_size() for t in checkpoint.tensors.values())
     if size > MAX_CHECKPOINT_BYTES:
@@ -79,9 +74,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
     """Read a checkpoint of a kind, or of one of several.
 
-    Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: a checkpoint of another kind or a newer format.
+    Raises as `read_weights`, and InvalidInputError for a checkpoint of another kind.
     """
     tensors, metadata, _ = read_weights(
         path, CheckpointMetadata, _METADATA_KEY, max_bytes=2 * MAX_CHECKPOINT_BYTES

@@ -116,7 +116,7 @@ def _check_exists(path: Path) -> None:
 
 
 def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read tensors and metadata of a safetensors file; CorruptDataError, with `where`, for another."""
+    """Tensors and metadata of a safetensors file; raises CorruptDataError for another."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -248,7 +248,7 @@ def fill(tensor: Tensor, whole: Tensor) -> None:
 
 
 def check_memory(num_bytes: int, *, where: str, max_bytes: int | None = None) -> None:
-    """Refuse weights that need more than `max_bytes`, or than is available, by LimitExceededError."""
+    """Raise LimitExceededError for weights that need more than a limit, or than is available."""
     limit = available_memory() if max_bytes is None else max_bytes
     if limit is not None and num_bytes > limit:
         raise LimitExceededError(

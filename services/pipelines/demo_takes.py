@@ -1,8 +1,4 @@
-"""The demo's takes: recorded in the twin, played through mock devices, aligned and compared.
-
-The path is the real one: mock devices send packets, real drivers decode them, the recorder spools,
-the uploader sends over HTTP, the alignment service creates the episode.
-"""
+"""The demo's takes: recorded in the twin, played through mock devices, aligned and compared."""
 
 import json
 import os

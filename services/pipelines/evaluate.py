@@ -1,8 +1,4 @@
-"""Commands that judge world models and policies by episodes of a store.
-
-`dextouch evaluate prediction` measures predicted images and touch on held-out episodes,
-`dextouch evaluate recorded` scores policies from recorded first observations.
-"""
+"""Commands that judge world models and policies by episodes of a store."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence

@@ -1,14 +1,7 @@
 """Takes of the twin recorded by a mock station: packets, real drivers, recorder and spool.
 
-The mock gloves know their own tare and gain, and their script its path delay; all are measured the
-same as at a station, by a rest take, known pressures and answers to time requests, so that errors
-contain those of a calibration.
-
-`write_by_station` makes episodes of such takes in one process: the way from a person's hands to
-67-D actions of the robot, without HTTP. Episodes have the errors of an ordinary station (clocks,
-delays, tracking, calibration, lost packets) and, as labels, what only the twin knows: object poses,
-milestones and success. Labels are on the episode's time axis: the clock of the simulated host is
-that of the simulation.
+Tare, gain and path delay are measured as at a station, by a rest take, known pressures and answers
+to time requests, so that errors contain those of a calibration.
 """
 
 import tempfile

@@ -246,12 +246,9 @@ def make_training_data(
     """Record one episode per seed, task and domain; existing episodes are kept.
 
     By default, each core records one at a time. A policy acts instead of the scripts of `mix`.
-
-    Returns:
-        Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
-        or the take could not be aligned), and of those made, how many `succeeded`.
-
-    Raises InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
+    Returns numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy
+    failed, or the take could not be aligned), and of those made, how many `succeeded`. Raises
+    InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
     """
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(

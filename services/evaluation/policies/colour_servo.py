@@ -1,8 +1,6 @@
 """Colour servo: a policy without learning that reaches for a colour and reacts to touch.
 
-The bundled policy `colour-servo`, and an example of a custom policy: it is independent of the
-scripts and of behaviour cloning, knows the object colours of two tasks and needs five chunks of 16
-steps.
+It knows the object colours of two tasks and needs five chunks of 16 steps.
 """
 
 from dataclasses import dataclass, replace

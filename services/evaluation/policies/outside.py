@@ -107,11 +107,8 @@ class PolicySource:
     def load(self, arguments: Mapping[str, Any]) -> Policy:
         """Import the module, also from the current directory, and call the factory.
 
-        Raises:
-            NotFoundError: no such module.
-            UnknownNameError: no such factory in the module; its callables are listed.
-            InvalidInputError: the module or the factory raised (with its own traceback), or the
-                policy has no `act`.
+        Raises NotFoundError without such a module, UnknownNameError without such a factory, and
+        InvalidInputError if one of them raised (with its own traceback), or for no `act`.
         """
         where = f"policy {self.name!r}"
         module = self._module(where)
@@ -167,11 +164,9 @@ def load_policies(
 ) -> dict[str, Policy]:
     """Custom policies by name, with the arguments of their factories by name.
 
-    `others` are the names of all policies beside them, which `other_option` gives.
-
-    Raises:
-        InvalidInputError: two policies of one name, or one that does not load.
-        NotFoundError, UnknownNameError: as `PolicySource.load`; also arguments of another policy.
+    `others` are the names of all policies beside them, which `other_option` gives. Raises as
+    `PolicySource.load`, InvalidInputError for two policies of one name, and UnknownNameError for
+    arguments of another policy.
     """
     sources = [PolicySource.parse(text) for text in addresses]
     names = [source.name for source in sources]

@@ -92,12 +92,7 @@ class StudyFolders:
         return [self._summary(path.parent.name) for _, path in newest]
 
     def figures(self, name: str) -> StudyFigures:
-        """Figures of a study.
-
-        Raises:
-            NotFoundError: no such study.
-            CorruptDataError: its results are damaged.
-        """
+        """Figures of a study; raises NotFoundError if there is none, or as `StudyResults.read`."""
         with self._lock:
             study = self._read(name)
             if "figures" not in vars(study):

@@ -89,15 +89,11 @@ class StudySummary(FrozenModel):
 
 
 class StudyRate(FrozenModel):
-    """Success rate of a policy in a task of a world; None without decided rollouts.
+    """Success rate of a policy in a task of a world, with its 95 % Wilson interval.
 
-    Attributes:
-        interval: 95 % Wilson interval.
-        num_missing: rollouts without a result yet.
-        num_unreliable: rollouts on which the success classifier abstains, and `reasons` why; they
-            count in no rate.
-        is_comparable: whether enough of the rollouts are decided to compare the policy.
-        num_disagreements: starts whose outcome differs from the real one.
+    It is None without decided rollouts: the success classifier abstains on `num_unreliable`, for
+    `reasons`, which count in no rate; `is_comparable` if it decided enough. `num_missing` have no
+    result yet, and `num_disagreements` starts have another outcome than in the real world.
     """
 
     world: str

@@ -65,13 +65,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
 
 
 def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
-    """Estimate a robot's base from pairs of poses of a tracker on the effector and the effector.
-
-    Raises:
-        DegenerateMotionError: the effector was rotated or moved too little; the message names the
-            axes.
-        InvalidInputError: too few pairs, or pairs that contradict each other.
-    """
+    """Estimate a robot's base from pairs of poses of a tracker on the effector and the effector."""
     pairs = read_pairs(options.poses, PAIRS_HELP)
     mount = np.eye(4) if options.same_frame else None
     result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
@@ -154,12 +148,7 @@ def _keypoints(options: argparse.Namespace) -> TakeStream:
 
 
 def measure_latency(options: argparse.Namespace) -> dict[str, object]:
-    """Measure the delay between a glove and a tracker, in addition to calibrated latencies.
-
-    Raises:
-        DegenerateMotionError: no taps.
-        InvalidInputError: not a glove and a tracker.
-    """
+    """Measure the delay between a glove and a tracker, in addition to calibrated latencies."""
     stream = read_stream(options.take, options.stream, options.store)
     reference = read_stream(options.take, options.reference, options.store)
     kinds = (reference.descriptor.kind, stream.descriptor.kind)
