@@ -119,7 +119,6 @@ def whole_steps(num_steps: int, chunk_multiple: int) -> int:
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:
-    """First step, end step and image request of every chunk."""
     if image_steps is None:
         firsts = range(1, num_steps, CHUNK_STEPS)
         return [(first, min(first + CHUNK_STEPS, num_steps), True) for first in firsts]

@@ -170,7 +170,6 @@ def _leaves(values: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[
 def _defaults(
     kind: type[BaseModel], given: BaseModel | None = None, above: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Defaults of all settings, also of nested ones."""
     for name, field in kind.model_fields.items():
         keys = (*above, field.alias or name)
         value = field.get_default(call_default_factory=True, validated_data={})
@@ -185,7 +184,6 @@ def _defaults(
 
 
 def _place(kind: type[BaseModel], keys: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Order of a setting: as it is declared."""
     names = [field.alias or name for name, field in kind.model_fields.items()]
     return (names.index(keys[0]) if keys[0] in names else len(names)), keys
 
@@ -207,7 +205,6 @@ def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def _secret_names(kind: type[BaseModel]) -> set[str]:
-    """Names of fields that hold secrets, at any depth."""
     found = set()
     for name, field in kind.model_fields.items():
         if field.annotation is SecretStr or SecretStr in get_args(field.annotation):

@@ -155,7 +155,6 @@ class Machine:
             return None
 
     def _devices(self) -> list[Finding]:
-        """Which devices there are, and whether they may be opened."""
         findings, dev = [], self.root / "dev"
         access = (
             f"sudo install -m 644 {self.rules} /etc/udev/rules.d/ && "
@@ -225,7 +224,6 @@ class Machine:
         return [_advice("free memory", found, do)]
 
     def _gpu(self) -> Finding:
-        """NVIDIA graphics cards, and whether their driver runs."""
         what = "GPU (optional)"
         if self._text("proc/driver/nvidia/version") is not None:
             files = sorted((self.root / "proc/driver/nvidia/gpus").glob("*/information"))
@@ -338,7 +336,6 @@ def _loaded_opencv() -> tuple[str, str] | None:
 
 
 def _optional(name: str, purpose: str) -> Finding:
-    """A package that only one purpose needs; it is in order to do without."""
     what = f"{name} (optional, {purpose})"
     found = _package(name, purpose)
     return Finding(what, found.found if found.ok else f"no: {found.do}")
@@ -355,7 +352,6 @@ def _package(name: str, purpose: str) -> Finding:
 
 
 def _outdated() -> list[Finding]:
-    """Installed packages of other versions than dextouch-wm asks for."""
     try:
         from packaging.requirements import Requirement
 

@@ -258,7 +258,6 @@ def _found(place: str) -> Any:  # noqa: ANN401 - functions and classes
 
 
 def _show_help(flags: str, arguments: list[str]) -> None:
-    """Print the help of a command, and exit."""
     from dextouch.serving import load_settings
     from services.cli.configuration import SECTIONS
 

@@ -148,7 +148,6 @@ def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, Figure]:
-    """Figures of scores [tasks, policies] with their intervals."""
     posterior, bootstrap = figures_of_draws(draws.posterior), figures_of_draws(draws.bootstrap)
     num_policies, found = real.shape[1], {}
     for name in FIGURES:

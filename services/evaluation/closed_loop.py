@@ -209,10 +209,6 @@ class RolloutRunner:
         return score, played
 
     def _begin(self, start: MatchedStart, policy: str, world: str, repeat: int) -> Rollout:
-        """Start a rollout from a matched start (by task and seed in the real world).
-
-        Raises ConflictError if the real world started differently than before.
-        """
         address = self.worlds.addresses[world]
         client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras), name=policy)
         is_real = world == REAL
@@ -235,7 +231,6 @@ class RolloutRunner:
     def _play(
         self, start: MatchedStart, actor: Policy, policy: str, world: str, repeat: int
     ) -> PlayedRollout:
-        """Run a policy in a rollout."""
         description = self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
         with self._begin(start, policy, world, repeat) as rollout:
@@ -271,11 +266,7 @@ class RolloutRunner:
     def _step(
         self, rollout: Rollout, chunk: np.ndarray, left: int, *, images: bool | str, multiple: int
     ) -> Iterator[Observation]:
-        """Advance by a chunk; images, which take most of the time, only where they are needed.
-
-        `left` is the number of steps to the end of the rollout, including this chunk, `images` the
-        policy's `uses_images` (`dextouch.clients.Policy`), `multiple` the world's chunk multiple.
-        """
+        """Advance by a chunk; images, which take most of the time, only where they are needed."""
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or images is True or (images and is_last):
             selector = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))

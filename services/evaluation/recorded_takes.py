@@ -234,10 +234,7 @@ def score_recorded(
 
 
 def _digests(start: MatchedStart) -> tuple[str, ...]:
-    """Digests of a start: as recorded, and as a world that saw it shows it, which may be imagined.
-
-    Such worlds scale the image and take no negative pressure.
-    """
+    """Digests of a start: as recorded, and with the image and touch that worlds make of it."""
     touch = start.observation.tactile_kpa[0]
     images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]

@@ -352,7 +352,6 @@ def matched(
 
 
 def _entries(agreement: Agreement, num_policies: int) -> dict[str, Any]:
-    """Report entries of figures and intervals, correlations without one policy, and chance."""
     found: dict[str, Any] = {}
     for name, figure in agreement.figures.items():
         interval = figure.interval
@@ -406,7 +405,6 @@ def task_comments(
 
 
 def _separated(rows: Sequence[Mapping[str, Any]], low: str, high: str) -> list[Mapping[str, Any]]:
-    """Rows whose 95 % intervals in two worlds do not overlap, the largest gap first."""
     found = [row for row in rows if row[f"{low}_interval"][1] < row[f"{high}_interval"][0]]
     return sorted(found, key=lambda row: -abs(row["imagined"] - row["real"]))
 

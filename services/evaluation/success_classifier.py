@@ -394,11 +394,7 @@ class SuccessClassifier:
         )
 
     def _judged(self, ending: Ending, probability: float) -> tuple[float, str | None]:
-        """Probability of success by all that is known, and why nothing is decided from it.
-
-        The bands are those of the checkpoint, fitted by `calibration`; `probability` is the
-        calibrated one of the probe alone.
-        """
+        """Probability of success by all that is known, and why nothing is decided from it."""
         band = self.calibration(ending.task, imagined=ending.imagined).band
         contradiction = unknown_size = None
         if ending.success_probability is not None:

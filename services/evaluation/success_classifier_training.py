@@ -359,7 +359,6 @@ def _metadata(
 def _calibrated(
     checkpoint: Checkpoint, development: Sequence[EndingEpisode], settings: ClassifierSettings
 ) -> Checkpoint:
-    """The checkpoint with all that is fitted to the development episodes."""
     probe = SuccessClassifier(checkpoint)
     calibrations = fit_calibrations(probe, development, risk=settings.risk)
     fitted = {
@@ -378,7 +377,6 @@ def _calibrated(
 
 
 def _with(checkpoint: Checkpoint, part: str, added: Mapping[str, object]) -> Checkpoint:
-    """The checkpoint with more settings or metrics, as `part` says."""
     metadata = checkpoint.metadata
     update = {part: {**getattr(metadata, part), **added}}
     return replace(checkpoint, metadata=metadata.model_copy(update=update))
@@ -422,7 +420,6 @@ def _optimized(
 
 
 def _loss(odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of success and, with less weight, milestones, where they are known."""
     each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
     success = each[:, 0].sum() / known[:, 0].sum().clamp_min(1)
     milestones = each[:, 1:].sum() / known[:, 1:].sum().clamp_min(1)

@@ -153,7 +153,6 @@ def recorded_main(arguments: Sequence[str]) -> int:
 
 
 def _policies(options: argparse.Namespace) -> dict[str, Policy]:
-    """All requested policies by name; raises as `load_policies` and `trained_policy`."""
     held = ["hold"] if options.hold else []
     others = [REPLAY, *(name for name, _ in options.cloned), *held]
     policies = load_policies(

@@ -227,7 +227,6 @@ def refuse_trained_episodes(
 def _picture(
     source: EpisodeStore, imagined: EpisodeReader, num_moments: int | None
 ) -> PredictionPicture:
-    """An episode beside its true one, as `episode_pair`."""
     (true_id,) = {one.id for one in imagined.attributes.lineage if one.kind == "episode"}
     title = f"{imagined.attributes.task}: {true_id}"
     return episode_pair(title, source.open(true_id), imagined, num_moments)

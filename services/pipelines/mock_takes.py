@@ -188,7 +188,6 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
 
 
 def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
-    """Readings of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)
     # By the number of the sample: when it came depends on the machine's other work.
@@ -236,10 +235,7 @@ def write_by_station(
 def _aligned(
     truth: TruthEpisode, alignment: AlignmentOptions, episode_id: str
 ) -> tuple[EpisodeAttributes, list[TruthStream], int]:
-    """Play a take through a mock station and align its recording.
-
-    Returns attributes and streams of the episode, and its time 0 (ns) on the axis of the truth.
-    """
+    """Attributes and streams of an episode, and its time 0 (ns) on the axis of the truth."""
     about = truth.attributes
     if about.seed is None:
         raise InvalidInputError(f"device takes: {episode_id} has no seed; expected a twin's take")
@@ -276,7 +272,6 @@ def _write(
     streams: Sequence[TruthStream],
     options: TakeOptions,
 ) -> None:
-    """Write those streams and images that the options ask for."""
     written = list(streams)
     if options.streams == "training":
         names = (*_TRAINED, *options.images, *map(object_stream, attributes.object_names))
@@ -292,20 +287,17 @@ def _write(
 
 @lru_cache(maxsize=1)
 def _warm_up() -> None:
-    """Load the compiled solver once per process."""
     warm_up()
 
 
 @lru_cache(maxsize=4)
 def _session_gloves(session: int) -> dict[str, Matrix]:
-    """Calibration of the gloves of a session, measured by a take with known pressures."""
     gloves = [stream for stream in pattern_streams(1.0) if stream.descriptor.kind == "tactile"]
     with tempfile.TemporaryDirectory(prefix="dextouch-calibration-") as folder:
         return measure_gloves(gloves, Path(folder), seed=session, clock=VirtualClock())
 
 
 def _played(streams: Mapping[str, TruthStream]) -> list[ReplayStream]:
-    """Streams that devices send; actions are made by alignment."""
     return [
         ReplayStream(stream.descriptor, stream.t_ref_ns, stream.values)
         for name, stream in streams.items()
@@ -333,7 +325,6 @@ def _label(truth: TruthStream, origin_ns: int, grid_ns: np.ndarray) -> TruthStre
 
 
 def _thinned(stream: TruthStream, grid_ns: np.ndarray, image_every: int) -> TruthStream:
-    """An image stream with the images nearest to every N-th step and to the last three."""
     if stream.descriptor.kind != "image":
         return stream
     steps = sorted(

@@ -267,7 +267,6 @@ def training_data_parser() -> argparse.ArgumentParser:
 
 
 def _imagination_parser(**about: str) -> CommandParser:
-    """Parser of a command that imagines episodes; `imagine` takes what it parses."""
     parser = CommandParser(**about)
     add = parser.add_argument
     add("--episodes", required=True, metavar="URL", help="store of the episodes to imagine")
@@ -414,7 +413,6 @@ def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
 
 
 def _add_filters(parser: argparse.ArgumentParser) -> None:
-    """Add the filters of the dashboard's list, by the names that `ItemFilter` has."""
     about = "only items that match all of them; a DAY may be a time, too"
     add = parser.add_argument_group("filters", about).add_argument
     add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
@@ -526,7 +524,6 @@ def import_parser() -> argparse.ArgumentParser:
 
 
 def _camera_matrix(text: str) -> tuple[tuple[float, float, float], ...]:
-    """Parse FX,FY,CX,CY, for argparse."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:

@@ -118,10 +118,7 @@ def _parts(
 
 @dataclass(frozen=True)
 class _Block:
-    """Rollouts in one world from some starts of a task, for a machine of a cluster.
-
-    `definition` is the study's with these starts and this world alone.
-    """
+    """Rollouts of one world from some starts of a task, of which alone the definition is."""
 
     definition: StudyDefinition
     rollouts: tuple[PlannedRollout, ...]
@@ -136,10 +133,7 @@ def _run_on_cluster(
     store_url: str | None,
     ray_address: str,
 ) -> None:
-    """Run rollouts on the machines of a Ray cluster, which see the study's files.
-
-    Raises DexTouchError if a block of rollouts failed; those of the others are kept.
-    """
+    """Run rollouts on a Ray cluster; raises if a block of them failed, and keeps the others."""
     blocks = blocks_of(definition, missing, results.header, store_url)
     folders = [results.path.parent, *(EpisodeStore(store_url).folders if store_url else ())]
     jobs = run_jobs(run_block, blocks, Workers(ray_address=ray_address), folders=folders)
@@ -185,18 +179,13 @@ def run_block(block: _Block) -> list[Outcome]:
 
 
 def _own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:
-    """Names of worlds that have a success classifier of their own, and its file."""
     return [(name, one.probe) for name, one in definition.imagined.items() if one.probe is not None]
 
 
 def _own_probes(
     definition: StudyDefinition, probe: SuccessClassifier
 ) -> dict[str, SuccessClassifier]:
-    """Success classifiers of single worlds, by world.
-
-    Raises InvalidInputError if one sees images of another size than `probe`, and UnknownNameError
-    if one does not know a task of the study.
-    """
+    """Success classifiers of single worlds, by world, that fit the study's."""
     own: dict[str, SuccessClassifier] = {}
     for name, path in _own_paths(definition):
         own[name] = SuccessClassifier.load(path)

@@ -161,10 +161,7 @@ def _policy(choice: PolicyChoice) -> Policy:
 
 
 def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
-    """Closed-loop actions of a policy in the twin, from the start of a seed.
-
-    The twin is deterministic, so that an episode with these actions is the rollout.
-    """
+    """Actions of a policy in the twin, which is deterministic: their episode is the rollout."""
     world, policy, task = _world(), _policy(choice), stage.task
     start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)
     begun = world.reset(start)

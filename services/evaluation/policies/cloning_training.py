@@ -333,11 +333,7 @@ def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
 def _disturbed(
     batch: CloningBatch, network: CloningNetwork, generator: torch.Generator
 ) -> CloningBatch:
-    """Augment with pixel noise, a random brightness per sample, and noise on poses.
-
-    The target stays where it is in the world, so that the policy learns to recover from
-    deviations.
-    """
+    """Augment; the target stays where it is in the world, so that the policy learns to recover."""
     state = batch.state.clone()
     noise = torch.randn((len(state), NUM_POSE_FEATURES), generator=generator)
     network.poses(state).add_(noise * network.pose_scale * _POSE_NOISE)

@@ -190,10 +190,7 @@ class _WithoutReset:
 
 
 def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401
-    """`ask`, with the traceback in the message for the policy's author.
-
-    The cause of the error is the original exception.
-    """
+    """`ask`, with the traceback in the message for the policy's author."""
     try:
         return ask(call, *arguments, where=where, **keywords)
     except InvalidInputError as error:
@@ -203,7 +200,6 @@ def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> An
 
 
 def _callables(module: ModuleType) -> list[str]:
-    """Functions and classes that a module defines itself."""
     return [
         name
         for name, value in vars(module).items()

@@ -209,7 +209,6 @@ def _is_rated(about: EpisodeAttributes) -> bool:
 
 
 def _studies(about: EpisodeAttributes) -> set[str]:
-    """Names of the studies whose rollout an episode is."""
     return {entry.id.partition(": ")[0] for entry in about.lineage if entry.kind == "rollout"}
 
 

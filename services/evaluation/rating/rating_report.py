@@ -221,7 +221,6 @@ def _decided(
 
 
 def _conflicts(decided: list[dict[str, Any]]) -> dict[str, Any]:
-    """Ties among the raters of a task's rollouts, and the mean score of the majorities."""
     scores = [one["decided_score"] for one in decided if one["decided_score"] != UNDEFINED]
     num_tied = sum(bool(one["tied"]) for one in decided)
     num_settled = sum(one["was_tied"] and not one["tied"] for one in decided)
@@ -232,7 +231,6 @@ def _conflicts(decided: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _less_state(rollouts: list[dict[str, Any]]) -> float | str:
-    """Mean of people's scores minus the ground truth, over the rollouts that have both."""
     both = [row for row in rollouts if UNDEFINED not in {row["score"], row["state_score"]}]
     if not both:
         return UNDEFINED

@@ -236,7 +236,6 @@ def _webp(frames: Sequence[Image.Image], quality: int, duration_ms: int) -> byte
 
 
 def _frame(pair: PredictionPicture, index: int, progress: float) -> Image.Image:
-    """Images above hands, real beside imagined, and how much of the time has passed."""
     worlds = (
         (pair.true_images, pair.true_tactile_kpa),
         (pair.predicted_images, pair.predicted_tactile_kpa),
@@ -430,7 +429,6 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
 
 
 def _rate(entry: Mapping[str, Any], world: str) -> Rate:
-    """A score with its interval, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
     return float(entry[world]), float(low), float(high)
 

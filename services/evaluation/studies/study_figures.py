@@ -195,7 +195,6 @@ def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[
 
 
 def _unlike(rollout: StudyRollout) -> tuple[bool, bool, float]:
-    """Disagreements first, and of these the ones that the probe is sure of."""
     sureness = abs((rollout.probability or 0.0) - 0.5)
     return not rollout.disagrees, rollout.unreliable is not None, -sureness * rollout.disagrees
 
@@ -405,6 +404,5 @@ def write_pictures(results: StudyResults) -> None:
 
 
 def _values(rate: StudyRate) -> Rate:
-    """The rate and its interval."""
     value = float(rate.rate or 0.0)
     return value, *(rate.interval or (value, value))

@@ -71,8 +71,6 @@ class TeleoperationMetrics:
 
 
 class _Control:
-    """One connection that controls one hand."""
-
     def __init__(
         self, socket: WebSocket, side: Side, follower: HandFollower, metrics: TeleoperationMetrics
     ) -> None:
