@@ -37,7 +37,7 @@ from services.evaluation.success_classifier_training import (
     calibrate_success_classifier,
     train_success_classifier,
 )
-from services.evaluation.templates import figure
+from services.evaluation.templates import rendered
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, save_checkpoint
 
 EXIT_FAILED = 1
@@ -189,39 +189,7 @@ def opened(world: ServedWorld, connections: ExitStack) -> WorldAddress:
 
 def print_scores(report: Mapping[str, Any]) -> None:
     """Print success rates, of how many decided rollouts, and agreement of a report."""
-    worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
-    print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>16}" for world in worlds))
-    for row in report["policies"]:
-        rates = "".join(
-            f"{figure(row[world])} of {_num_decided(row, world)}".rjust(16) for world in worlds
-        )
-        note = undecided_note(row, worlds[-1])
-        print(f"{row['task']:<16}{row['policy']:<22}{rates}{f'  {note}' if note else ''}")
-    for task, rows in report["real_differences"].items() if not report["agreement"] else ():
-        print(f"\n{task}: differences of success rates")
-        for row in rows:
-            pair, (low, high) = f"{row['first']} - {row['second']}", row["interval"]
-            interval = f"({low:+.2f} … {high:+.2f})"
-            print(f"  {pair}: {row['difference']:+.2f} {interval}, p {figure(row['p'])}")
-    for task, figures in report["agreement"].items():
-        error = figure(figures.get("mean_absolute_error"))
-        print(
-            f"\n{task}: Pearson {figure(figures['pearson'])}{_interval(figures, 'pearson')}, MMRV "
-            f"{figure(figures['mmrv'])} with ties counted, {figure(figures['mmrv_paper'])} by the "
-            f"paper's rule; mean absolute error of the success rates {error}"
-            f"{_interval(figures, 'mean_absolute_error')}"
-        )
-        for comment in report["comments"][task]:
-            print(f"  {comment}")
-
-
-def _num_decided(row: Mapping[str, Any], world: str) -> int:
-    return int(row[f"{world}_rollouts"] - row.get(f"{world}_undecided", 0))
-
-
-def _interval(figures: Mapping[str, Any], name: str) -> str:
-    interval = figures.get(f"{name}_interval")
-    return f" (95 % {interval[0]:.2f} … {interval[1]:.2f})" if isinstance(interval, list) else ""
+    print(rendered("scores.txt.j2", report=report, undecided_note=undecided_note), end="")
 
 
 def print_failures(report: Mapping[str, Any], results: Path) -> None:

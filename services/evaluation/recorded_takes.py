@@ -38,6 +38,7 @@ from services.evaluation.progress import Progress
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
 from services.evaluation.statistics import area_under_roc, central_interval, wilson_interval
 from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.templates import rendered
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
@@ -257,38 +258,4 @@ def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
 
 def score_lines(scores: RecordedScores) -> list[str]:
     """The result as text: first how far to trust it, then the policies."""
-    lines = [
-        "How far to trust it: recorded actions, judged in imagination, against their outcomes",
-        f"{'task':<18}{'takes':>6}{'real':>7}{'imagined':>10}{'decided':>9}{'wrong':>7}"
-        "   AUC (95 %)",
-    ]
-    for task in scores.tasks:
-        found = scores.trust(task)
-        area = "   too few takes of one outcome"
-        if "auc" in found:
-            low, high = found["auc_interval"]
-            area = f"   {found['auc']:.2f} ({low:.2f} … {high:.2f})"
-        cells = (_share(found, "real", 7), _share(found, "imagined", 10))
-        decided = f"{found['decided']}".rjust(9)
-        lines.append(
-            f"{task:<18}{found['takes']:>6}{cells[0]}{cells[1]}{decided}"
-            f"{_share(found, 'wrong', 7)}{area}"
-        )
-    if scores.policies:
-        lines += ["", "Policies from the same first observations: imagined success (95 %)"]
-    for task in scores.tasks:
-        for policy in scores.policies:
-            row = scores.policy_row(policy, task)
-            rate = "cannot tell"
-            if "imagined" in row:
-                low, high = row["imagined_interval"]
-                rate = f"{row['imagined']:.2f} ({low:.2f} … {high:.2f})"
-            lines.append(
-                f"{task:<18}{policy:<24}{rate:<24}of {row['decided']} decided, "
-                f"{row['rollouts']} rollouts"
-            )
-    return lines
-
-
-def _share(found: Mapping[str, Any], name: str, width: int) -> str:
-    return (f"{found[name]:.2f}" if name in found else "-").rjust(width)
+    return rendered("recorded.txt.j2", report=scores.to_report()).splitlines()
