@@ -41,6 +41,8 @@ _PRIOR_ENDINGS: Final = 2.0
 MIN_OUTCOMES: Final = 5
 # Milestones with a lower area under the ROC curve are not reported by the probe.
 MIN_MILESTONE_AUC: Final = 0.9
+# Kind of true endings that are given poses and touch, but no image.
+POSES: Final = "poses"
 Figures = dict[str, float | int]
 
 
@@ -280,7 +282,7 @@ def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
         figures[f"num_held_out_successes_{task}"] = int(success.sum())
         figures[f"num_held_out_failures_{task}"] = int((~success).sum())
         for kind, (others, outcomes) in {
-            "poses": _with_poses_only(episodes, task),
+            "poses": final_endings(episodes, task, POSES),
             "imagined": final_endings(episodes, task, IMAGINED),
         }.items():
             if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
@@ -315,32 +317,25 @@ def _figures(
 def final_endings(
     episodes: Sequence[EndingEpisode], task: str, kind: str
 ) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
-    mine = [e for e in _seen(episodes, task) if e.imagined == (kind == IMAGINED)]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [_as_seen(e.final) for e in mine], success
+    """Final endings of a task as a probe gets them, and their outcomes.
+
+    `kind` is true or imagined, or true ones with poses and touch but no image.
+    """
+    if kind == POSES:
+        known = [e for e in episodes if e.task == task and e.final.object_poses is not None]
+        mine = [e for e in known if not e.imagined]
+        endings = [replace(e.final, images=None) for e in mine]
+    else:
+        mine = [e for e in _seen(episodes, task) if e.imagined == (kind == IMAGINED)]
+        endings = [_as_seen(e.final) for e in mine]
+    return endings, np.array([e.success for e in mine], dtype=bool)
 
 
 def _seen(episodes: Sequence[EndingEpisode], task: str) -> list[EndingEpisode]:
-    """Those of a task whose final ending a probe can be given.
-
-    True endings are seen without poses of objects, so that nothing is left of those without images.
-    """
+    """Those of a task whose ending a probe sees: true ones without poses, so they need images."""
     mine = [e for e in episodes if e.task == task]
     return [e for e in mine if e.imagined or e.final.images is not None]
 
 
 def _as_seen(ending: Ending) -> Ending:
     return ending if ending.imagined else replace(ending, object_poses=None)
-
-
-def _with_poses_only(
-    episodes: Sequence[EndingEpisode], task: str
-) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    mine = [
-        e
-        for e in episodes
-        if e.task == task and not e.imagined and e.final.object_poses is not None
-    ]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [replace(e.final, images=None) for e in mine], success

@@ -25,13 +25,13 @@ from services.evaluation.prediction_scenes import (
     Future,
     Scene,
     copied,
-    geometry_error,
+    depth_errors,
     imagine,
     other_instruction,
     other_take,
     reconstructed,
     standing_still,
-    trajectory_accuracy,
+    trajectory_accuracies,
     warped,
 )
 from services.evaluation.progress import Progress
@@ -65,11 +65,15 @@ def _of_touch(function: Callable[..., float], pairs: Pairs) -> float:
     )
 
 
-def _of_geometry(function: Callable[..., float], pairs: Pairs) -> float:
-    """Over the scenes whose true geometry is known."""
-    return function(
-        [(one.geometry, future.images) for one, future in pairs if one.geometry is not None]
-    )
+def _of_geometry(function: Callable[..., list[float]], pairs: Pairs) -> float:
+    """Mean over the scenes whose true geometry is known, and over what moves; NaN if nothing is."""
+    found = [
+        value
+        for scene, future in pairs
+        if scene.geometry is not None
+        for value in function(scene.geometry, future.images)
+    ]
+    return float(np.mean(found)) if found else float("nan")
 
 
 def _object_error(pairs: Pairs) -> float:
@@ -93,11 +97,11 @@ METRICS: Final = {metric.name: metric for metric in (
     Metric("ssim", "SSIM", "", "higher", "images", partial(_of_images, image_metrics.ssim),
            "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones"),
     Metric("trajectory_accuracy", "Trajectory Accuracy", "", "higher", "geometry",
-           partial(_of_geometry, trajectory_accuracy),
+           partial(_of_geometry, trajectory_accuracies),
            "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
            "a tolerance of 5 % of the image's width; 1 for equal trajectories"),
     Metric("geometry_error", "Geometry Error", "", "lower", "geometry",
-           partial(_of_geometry, geometry_error),
+           partial(_of_geometry, depth_errors),
            "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
            "scale"),
     Metric("tactile_psnr", "PSNR of taxels", "dB", "higher", "touch",

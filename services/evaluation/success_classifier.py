@@ -356,10 +356,6 @@ class SuccessClassifier:
             [float(one.probabilities(row[:1])[0]) for one, row in zip(found, odds, strict=True)]
         )
 
-    def probability(self, ending: Ending) -> float:
-        """Probability of success of one ending."""
-        return float(self.probabilities([ending])[0])
-
     def verdicts(self, endings: Sequence[Ending]) -> list[Verdict]:
         """Decision about each ending; raises as `log_odds`."""
         odds = self.log_odds(endings)

@@ -1,11 +1,11 @@
 """Parsers of commands that join services; importing them imports none of the work."""
 
 import argparse
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -181,16 +181,6 @@ def _named_path(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def _keywords_by_name(text: str) -> Mapping[str, Any]:
-    try:
-        found = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
-    if not isinstance(found, dict) or not all(isinstance(one, dict) for one in found.values()):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected an object of objects")
-    return found
-
-
 def _whole_fps(text: str) -> int:
     """Frames per second of a LeRobot dataset, whose format counts whole ones."""
     try:
@@ -215,11 +205,16 @@ def _moment(text: str) -> datetime:
         ) from error
 
 
-def _keywords(text: str) -> dict[str, Any]:
+def _keywords(text: str, form: type = dict[str, Any], expected: str = "a JSON object") -> Any:  # noqa: ANN401 - of the form
     try:
-        return TypeAdapter(dict[str, Any]).validate_json(text)
+        return TypeAdapter(form).validate_json(text)
     except ValidationError as error:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
+
+
+_keywords_by_name = partial(
+    _keywords, form=dict[str, dict[str, Any]], expected="an object of objects"
+)
 
 
 def training_data_parser() -> argparse.ArgumentParser:

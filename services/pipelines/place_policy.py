@@ -7,6 +7,7 @@ demonstrations suffice. It looks once: what happens later changes nothing.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,17 +17,15 @@ from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
 from dextouch.episodes import (
-    TRUE_ORIGINS,
     EpisodeGrid,
     EpisodeReader,
     EpisodeStore,
-    Split,
     data_hash,
     select_episodes,
 )
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas import CHUNK_STEPS, Observation, Origin
+from dextouch.schemas import CHUNK_STEPS, Observation
 from dextouch.serving import load_settings
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation import command_line as evaluation
@@ -303,24 +302,12 @@ def read_demonstrations(settings: TrainPolicySettings) -> list[Demonstration]:
 
     Raises NotFoundError and ConflictError as `select_episodes`.
     """
-    recorded = [EpisodeStore(url) for url in settings.episodes]
-    generated = [EpisodeStore(url) for url in settings.imagined]
-    imagined: tuple[Origin, ...] = ("imagined",)
-    no_splits: tuple[Split, ...] = ()
-    sources = ((recorded, settings.splits, TRUE_ORIGINS), (generated, no_splits, imagined))
-    return [
-        Demonstration.of(reader, settings.image_px)
-        for stores, splits, origins in sources
-        if stores
-        for reader in select_episodes(
-            stores,
-            domain="robot",
-            tasks=settings.tasks,
-            splits=splits,
-            origins=origins,
-            needs=IMITATED,
-        )
-    ]
+    chosen = partial(select_episodes, domain="robot", tasks=settings.tasks, needs=IMITATED)
+    stores = [EpisodeStore(url) for url in settings.episodes]
+    readers = list(chosen(stores, splits=settings.splits))
+    if settings.imagined:
+        readers += chosen([EpisodeStore(url) for url in settings.imagined], origins=("imagined",))
+    return [Demonstration.of(reader, settings.image_px) for reader in readers]
 
 
 def train_place_policy(

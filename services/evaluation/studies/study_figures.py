@@ -68,6 +68,9 @@ MEANINGS: Final = {
     "at a step. "
     f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
+FIGURES_SHOWN: Final = (
+    "pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error",
+)  # fmt: skip
 REPORT_FILE: Final = "report.json"
 TABLES_FILE: Final = "tables.tex"
 
@@ -293,34 +296,27 @@ def _worlds_of(
 
 def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]:
     alone = ClosedLoopReport(report.scores, (world,), report.policies, report.failures).to_report()
-    for task, found in alone["agreement"].items():
-        yield _agreed(world, task, found, tuple(alone["comments"][task]))
+    tasks = alone["agreement"]
     if alone["agreement_of_all_tasks"]:
-        counts = [found["num_policies"] for found in alone["agreement"].values()]
-        starts = [found["num_starts"] for found in alone["agreement"].values()]
-        counted = {"num_policies": max(counts), "num_starts": sum(starts)}
-        yield _agreed(world, "", alone["agreement_of_all_tasks"] | counted, ())
-
-
-def _agreed(
-    world: str, task: str, found: dict[str, Any], comments: tuple[str, ...]
-) -> StudyAgreement:
-    names = ("pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error")
-    figures = {name: found[name] for name in names}
-    intervals = {name: found.get(f"{name}_interval", UNDEFINED) for name in names}
-    chance = found.get("pearson_chance", UNDEFINED)
-    return StudyAgreement(
-        world=world,
-        task=task,
-        figures={name: None if isinstance(v, str) else v for name, v in figures.items()},
-        intervals={n: None if v == UNDEFINED else tuple(v) for n, v in intervals.items()},
-        is_vague=intervals["pearson"] != UNDEFINED and intervals["pearson"][0] < VAGUE_R,
-        undefined=undefined_by(found["num_policies"]),
-        chance=None if isinstance(chance, str) else chance,
-        num_policies=found["num_policies"],
-        num_starts=found["num_starts"],
-        comments=comments,
-    )
+        num_policies = max(found["num_policies"] for found in tasks.values())
+        num_starts = sum(found["num_starts"] for found in tasks.values())
+        counted = {"num_policies": num_policies, "num_starts": num_starts}
+        tasks = tasks | {"": alone["agreement_of_all_tasks"] | counted}
+    for task, found in tasks.items():
+        known = {name: None if isinstance(v, str) else v for name, v in found.items()}
+        intervals = {name: known.get(f"{name}_interval") for name in FIGURES_SHOWN}
+        yield StudyAgreement(
+            world=world,
+            task=task,
+            figures={name: known[name] for name in FIGURES_SHOWN},
+            intervals={name: one and tuple(one) for name, one in intervals.items()},
+            is_vague=bool(intervals["pearson"]) and intervals["pearson"][0] < VAGUE_R,
+            undefined=undefined_by(found["num_policies"]),
+            chance=known.get("pearson_chance"),
+            num_policies=found["num_policies"],
+            num_starts=found["num_starts"],
+            comments=tuple(alone["comments"].get(task, ())),
+        )
 
 
 def kept_pairs(
