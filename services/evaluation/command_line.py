@@ -14,9 +14,8 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
 from services.evaluation.bundled_policies import bundled_policy, training_starts_of
-from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate, film
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
-from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
 from services.evaluation.policies.outside import load_policies

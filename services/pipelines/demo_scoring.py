@@ -9,9 +9,8 @@ from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.evaluation.bundled_policies import DEFAULT_POLICY
-from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, evaluate, film
 from services.evaluation.command_line import run_train_judge, run_train_policy
-from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.reporting import PredictionPicture

@@ -13,7 +13,7 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.filmed_pairs import example_pairs, title_of
+from services.evaluation.closed_loop import example_pairs, title_of
 from services.evaluation.reporting import (
     MAX_MOVING,
     PredictionPicture,
