@@ -5,9 +5,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -26,6 +25,7 @@ from services.twin.names import (
 )
 from services.world_model.shipped_checkpoints import default_checkpoint
 
+Form = TypeVar("Form")
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
 # Options of `dextouch export` and `dextouch import` that other formats would ignore.
@@ -205,16 +205,19 @@ def _moment(text: str) -> datetime:
         ) from error
 
 
-def _keywords(text: str, form: type = dict[str, Any], expected: str = "a JSON object") -> Any:  # noqa: ANN401 - of the form
+def _keywords(text: str) -> dict[str, Any]:
+    return _parsed(text, TypeAdapter(dict[str, Any]), "a JSON object")
+
+
+def _keywords_by_name(text: str) -> dict[str, dict[str, Any]]:
+    return _parsed(text, TypeAdapter(dict[str, dict[str, Any]]), "an object of objects")
+
+
+def _parsed(text: str, form: TypeAdapter[Form], expected: str) -> Form:
     try:
-        return TypeAdapter(form).validate_json(text)
+        return form.validate_json(text)
     except ValidationError as error:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
-
-
-_keywords_by_name = partial(
-    _keywords, form=dict[str, dict[str, Any]], expected="an object of objects"
-)
 
 
 def training_data_parser() -> argparse.ArgumentParser:

@@ -25,7 +25,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas import CHUNK_STEPS, Observation
+from dextouch.schemas import CHUNK_STEPS, Observation, Origin
 from dextouch.serving import load_settings
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation import command_line as evaluation
@@ -46,6 +46,7 @@ from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.trees import stacked
 
 KIND: Final = "place-policy"
+_IMAGINED: Final[tuple[Origin, ...]] = ("imagined",)
 _READER, _MOTION = "reader.", "motion."
 # Demonstrations of a task below which its regression is refused.
 LEAST_DEMONSTRATIONS: Final = 5
@@ -306,7 +307,7 @@ def read_demonstrations(settings: TrainPolicySettings) -> list[Demonstration]:
     stores = [EpisodeStore(url) for url in settings.episodes]
     readers = list(chosen(stores, splits=settings.splits))
     if settings.imagined:
-        readers += chosen([EpisodeStore(url) for url in settings.imagined], origins=("imagined",))
+        readers += chosen([EpisodeStore(url) for url in settings.imagined], origins=_IMAGINED)
     return [Demonstration.of(reader, settings.image_px) for reader in readers]
 
 

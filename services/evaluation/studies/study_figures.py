@@ -304,7 +304,7 @@ def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]
         tasks = tasks | {"": alone["agreement_of_all_tasks"] | counted}
     for task, found in tasks.items():
         known = {name: None if isinstance(v, str) else v for name, v in found.items()}
-        intervals = {name: known.get(f"{name}_interval") for name in FIGURES_SHOWN}
+        intervals: dict[str, Any] = {n: known.get(f"{n}_interval") for n in FIGURES_SHOWN}
         yield StudyAgreement(
             world=world,
             task=task,
