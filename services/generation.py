@@ -134,10 +134,7 @@ def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[i
 
 
 def imagined_id(episode_id: str, world_digest: str) -> str:
-    """Id of an imagined episode, from its source and an abbreviated world digest.
-
-    A source's id that is too long to be a part of it is cut, and distinguished by its digest.
-    """
+    """Id of an imagined episode, from world digest and source; a long id is cut and digested."""
     name = f"imagined-{world_digest[:8]}-{episode_id}"
     if len(name) <= _MAX_ID_LENGTH:
         return name

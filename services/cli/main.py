@@ -270,11 +270,10 @@ def _show_help(flags: str, arguments: list[str]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run one command and return its exit status.
 
-    Returns:
-        Its exit status; 1 if standard output cannot be written, 2 for an unknown command, 3 for a
-        refusal with its reason on stderr, 141 if nobody reads the output any more (`| head`).
+    It is 1 if standard output cannot be written, 2 for an unknown command, 3 for a refusal with its
+    reason on stderr, 141 if nobody reads the output any more (`| head`).
     """
     words = list(sys.argv[1:] if argv is None else argv)
     streams = StandardStreams()

@@ -1,9 +1,4 @@
-"""Calibration of a success classifier, and its metrics on endings that it was not trained on.
-
-Temperature and bias for each task and kind of ending map log odds to probabilities that match
-frequencies; they are fitted together with the band of probabilities in which the classifier should
-abstain.
-"""
+"""Calibration of a success classifier, and its metrics on endings that it was not trained on."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,9 +44,8 @@ Figures = dict[str, float | int]
 def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -> float:
     """Mean distance of predicted and true success rates over bins of equal width (Guo et al. 2017).
 
-    Bins are weighted by their number of endings. Even a perfectly calibrated classifier has an
-    error of about √(p(1−p)/n) in a bin of n. Raises InvalidInputError without endings, or for
-    arrays of different lengths.
+    Bins are weighted by their number of endings; even a perfectly calibrated classifier has an
+    error of about √(p(1−p)/n) in a bin of n.
     """
     predicted, outcomes = _pair(probabilities, success)
     bins = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
@@ -60,10 +54,7 @@ def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -
 
 
 def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
-    """Mean squared difference of probability and outcome (Brier 1950).
-
-    Raises InvalidInputError without endings, or for arrays of different lengths.
-    """
+    """Mean squared difference of probability and outcome (Brier 1950)."""
     predicted, outcomes = _pair(probabilities, success)
     return float(np.mean((predicted - outcomes) ** 2))
 
@@ -110,9 +101,7 @@ def fit_combination(
     decided, twice the risk is allowed; where no band keeps that, nothing is decided.
 
     `probe` [n] are calibrated probabilities of the classifier, `world` [n] the world's own, and
-    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings, and
-    `margin` that of `Combination`. Raises InvalidInputError without endings, or for arrays of
-    different lengths.
+    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings.
     """
     of_probe, outcomes = _pair(probe, success)
     estimated, _ = _pair(world, success)

@@ -249,11 +249,9 @@ def read_ending_episodes(
     splits: Collection[Split] = (),
     image_px: int = USUAL_IMAGE_PX,
 ) -> list[EndingEpisode]:
-    """Read the robot episodes of some stores that can be judged, with their endings.
+    """Read true and imagined robot episodes of some stores that can be judged, with their endings.
 
-    True and imagined episodes may be mixed. `tasks` and `splits` of scenes are empty for all; the
-    middle square of larger images is scaled to `image_px`. Raises NotFoundError and ConflictError
-    as `select_episodes`.
+    Raises as `select_episodes` and `read_ending_episode`.
     """
     readers = select_episodes(
         stores, domain="robot", tasks=tasks, splits=splits, origins=(), needs=JUDGED

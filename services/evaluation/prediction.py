@@ -1,8 +1,4 @@
-"""Prediction errors of a world on held-out episodes, beside simple baselines.
-
-Only the `World` interface is used, so that all kinds of world models are measured in the same way:
-over windows of one chunk, or over whole open-loop rollouts.
-"""
+"""Prediction errors of any world on held-out episodes, beside simple baselines."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

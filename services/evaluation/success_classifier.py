@@ -64,8 +64,7 @@ class ClassifierShape(FrozenModel):
 class ClassifierBatch:
     """Inputs of the network: last images as bytes, touch, features of object poses, task index.
 
-    Missing inputs are zero and marked in `has_image` and `has_objects`. `imagined` is used in
-    training only; the network does not see it.
+    Missing ones are zero and marked. The network does not see `imagined`, which training uses.
     """
 
     images: UInt8[torch.Tensor, "n 3 h w"]

@@ -26,11 +26,7 @@ _METADATA_KEY, _PREFIX = "dextouch", "network."
 
 
 class CheckpointMetadata(FrozenModel):
-    """Provenance of a network.
-
-    Evaluations must not contain any of `training_episodes` and `training_starts` (digests of first
-    observations).
-    """
+    """Provenance of a network; no evaluation may begin from its starts (digests)."""
 
     kind: str
     format_version: int = FORMAT_VERSION
@@ -104,11 +100,7 @@ def optimized(
     title: str,
     max_gradient_norm: float | None = 1.0,
 ) -> Iterator[Budget]:
-    """Train a network; yields the used budget after each step.
-
-    `loss` is that of a batch drawn with the generator. Gradients are clipped to
-    `max_gradient_norm`, unless it is None.
-    """
+    """Train a network by losses of drawn batches; yields the used budget after each step."""
     generator = torch.Generator().manual_seed(settings.seed)
     budget = Budget(settings.max_cpu_s, settings.num_training_steps)
     options = OptimizerOptions(

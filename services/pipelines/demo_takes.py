@@ -179,11 +179,7 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
 
 
 def align_truly(take: MockTake, store: EpisodeStore, options: AlignmentOptions) -> EpisodeReader:
-    """Align a take as if its gloves and path delays had been calibrated without error.
-
-    The take is still in its spool; the store gets the recording with its true calibration, and the
-    episode.
-    """
+    """Align a take of the spool as if its calibration had no error; a store gets both."""
     attributes = SpoolReader(take.spool_path).attributes
     calibration = {**attributes.calibration, **take.true_calibration}
     commit_spool(store, take.spool_path, attributes.model_copy(update={"calibration": calibration}))

@@ -61,6 +61,7 @@ SESSION_SEEDS: Final = 20
 # As in docs/twin_closure.md: with wrists as tracked, the robot's hand touches something else.
 ALIGNMENT: Final = AlignmentOptions(wrist="touch")
 LABELS: Final = "object_poses"
+_warm_up_once = lru_cache(maxsize=1)(warm_up)
 # What training reads, beside images.
 _TRAINED: Final = ("action", "action_commanded", "tactile_left", "tactile_right", LABELS)
 
@@ -239,7 +240,7 @@ def _aligned(
     about = truth.attributes
     if about.seed is None:
         raise InvalidInputError(f"device takes: {episode_id} has no seed; expected a twin's take")
-    _warm_up()
+    _warm_up_once()
     session = about.seed // SESSION_SEEDS
     plan = TakePlan(
         _played(truth.streams),
@@ -283,11 +284,6 @@ def _write(
         for one in written:
             to.add_stream(one.descriptor)
             to.append(one.descriptor.name, values=one.values, t_ref_ns=one.t_ref_ns)
-
-
-@lru_cache(maxsize=1)
-def _warm_up() -> None:
-    warm_up()
 
 
 @lru_cache(maxsize=4)

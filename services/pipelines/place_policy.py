@@ -1,8 +1,6 @@
 """Policy of places: it sees where objects stand, and moves as in demonstrations of such places.
 
-The start readers of a state model find the objects in the first image. The commanded motion of a
-whole take is a regression on these places and on those of the hands, so that some dozens of
-demonstrations suffice. It looks once: what happens later changes nothing.
+It looks once, by the start readers of a state model, and regresses the motion of a whole take.
 """
 
 from collections.abc import Sequence
@@ -93,8 +91,8 @@ def read_places(
 ) -> Places:
     """Find the objects in the first step of an observation.
 
-    Raises UnknownNameError without a head camera or for a task that the readers do not know, and
-    InvalidInputError for an image of another size.
+    Raises UnknownNameError without head camera or for an unknown task, InvalidInputError for an
+    image of another size.
     """
     if task not in config.tasks:
         raise UnknownNameError("task of the place policy", task, list(config.tasks))

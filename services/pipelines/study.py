@@ -273,10 +273,9 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
 
 
 def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
-    """Refuse starts whose task and seed a state model was trained on.
+    """Raise ConflictError for starts whose task and seed a state model was trained on.
 
-    Content digests miss them where image size or simulator changed since. Raises ConflictError if a
-    start was trained on.
+    Content digests miss them where image size or simulator changed since.
     """
     metadata = read_state_checkpoint(checkpoint).metadata
     for task in tasks:

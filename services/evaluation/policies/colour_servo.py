@@ -38,10 +38,9 @@ _CLOSING_RAD: Final = np.array(
 
 @dataclass(frozen=True)
 class Thing:
-    """Object to reach for.
+    """Object to reach for: its colour, the height of its centre above the table, and the grip.
 
-    Its colour as red, green and blue, the height of its centre above the table, and the point of
-    the right hand that goes there, in the wrist frame.
+    The grip is the point of the right hand that goes there, in the wrist frame.
     """
 
     colour: tuple[float, float, float]

@@ -25,11 +25,7 @@ _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<fact
 
 
 def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
-    """Call a function of a policy.
-
-    Raises InvalidInputError if it raised; `details["traceback"]` is its own traceback, without
-    frames of the caller.
-    """
+    """Call a function of a policy; InvalidInputError, with its own traceback, if it raised."""
     try:
         return call(*arguments, **keywords)
     except (Exception, SystemExit) as error:  # a policy may raise anything

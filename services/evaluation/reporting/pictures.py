@@ -343,18 +343,6 @@ class NamedChart:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class PolicyPanel:
-    """Policies, agreement, comments and chart of one task."""
-
-    task: str
-    rows: list[Mapping[str, Any]]
-    agreement: Mapping[str, Any]
-    comments: list[str]
-    chart: Markup | None
-    rubric: Mapping[str, Any]
-
-
 def clock_chart(pictures: ReportPictures) -> NamedChart | None:
     """Residuals of every fitted clock over time."""
     residuals = pictures.clock_residuals_ms
@@ -404,11 +392,10 @@ def _lines(
     ]
 
 
-def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
+def policy_panels(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Scores of the policies and agreement of the worlds, one panel per task."""
     entries = report.get("policies", [])
-    agreement, comments = report.get("agreement", {}), report.get("comments", {})
-    panels = []
+    panels = list[dict[str, Any]]()
     for task in dict.fromkeys(str(e["task"]) for e in entries):
         rows = [e for e in entries if e["task"] == task]
         pairs = {
@@ -422,9 +409,17 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
         drawn = policy_picture(pairs, title, "svg").decode() if pairs else ""
         # Names are escaped, the rest are numbers; within a page a picture needs no namespace.
         chart = Markup(drawn.replace(f" {NAMESPACE}", "")) if drawn else None  # noqa: S704
-        figures = agreement.get(task, {})
-        rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
-        panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
+        world = report.get("imagined_world")
+        panels.append(
+            {
+                "task": task,
+                "rows": rows,
+                "agreement": report.get("agreement", {}).get(task, {}),
+                "comments": report.get("comments", {}).get(task, []),
+                "chart": chart,
+                "rubric": report.get("rubrics", {}).get(world, {}).get(task, {}),
+            }
+        )
     return panels
 
 

@@ -92,10 +92,9 @@ def run_rollouts(
     parts: StudyParts,
     keep: Callable[[Outcome], None],
 ) -> None:
-    """Run some rollouts of a study; `keep` is called with each outcome as soon as it is known.
+    """Run some rollouts of a study, or of a part of it; raises as `run_study`.
 
-    `definition` is the study's or a part of it, with the tasks and seeds of the rollouts; `header`
-    is that of the whole study. Raises as `run_study`.
+    `keep` is called with each outcome as soon as it is known; the header is the whole study's.
     """
     if missing:
         with ExitStack() as connections:

@@ -1,8 +1,4 @@
-"""Service that sends commands to robot hands, which follow tracked hands live.
-
-Each hand has one WebSocket, and one controller at a time (docs/teleoperation.md). Commands come
-from a loop of their own, whether samples come or not.
-"""
+"""Service that commands robot hands, which follow tracked ones live (docs/teleoperation.md)."""
 
 import asyncio
 import time
