@@ -7,14 +7,14 @@ success is reported by the real world, imagined success is the probe's decision 
 import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients import Policy, Rollout
+from dextouch.clients import Policy, PolicyStart, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, StorageError
 from dextouch.schemas import (
     MAX_SEED,
@@ -145,11 +145,6 @@ class PlayedRollout:
     milestones: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def ending(self) -> Observation:
-        """The observation of the last chunk."""
-        return self.observations[-1]
-
-    @property
     def uncertainty(self) -> RolloutUncertainty:
         """The world's uncertainty of the whole rollout."""
         return rollout_uncertainty(self.observations)
@@ -188,8 +183,9 @@ class RolloutRunner:
         try:
             with in_trace():
                 played = self._play(start, actor, policy, world, repeat)
+            last = played.observations[-1]
             ending = Ending.of(
-                played.ending, start.task, imagined=world != REAL, uncertainty=played.uncertainty
+                last, start.task, imagined=world != REAL, uncertainty=played.uncertainty
             )
             verdict = self.own_probes.get(world, self.probe).verdict(ending)
         except DexTouchError as error:
@@ -241,7 +237,8 @@ class RolloutRunner:
             commanded = [rollout.observation.action_reached[-1:]]
             milestones: dict[str, float] = {}
             # The world's images may be smaller than that of the start.
-            given = replace(start.for_policy(), K_head=rollout.K_head)
+            K_head = rollout.K_head
+            given = PolicyStart(start.task, start.instruction, start.seed, start.anchor, K_head)
             ask(actor.reset, given, where=f"{where}: reset")
             while (left := self.num_steps - rollout.info.last_step) > 0:
                 acting = f"{where}, chunk {rollout.info.next_chunk}: act"

@@ -61,7 +61,7 @@ def run_train_policy(arguments: list[str]) -> int:
         early_at=settings.early_at,
     )
     if early is not None:
-        keep(early, settings.early_output(), None)
+        keep(early, settings.output.with_stem(f"{settings.output.stem}_early"), None)
     return keep(finished, settings.output, settings.json_path)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients import PolicyStart, RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, Observation, WorldDescription
@@ -183,10 +183,6 @@ class MatchedStart:
     def digest(self) -> str:
         """Digest of image and touch."""
         return first_digest(self.observation)
-
-    def for_policy(self) -> PolicyStart:
-        """Information given to a policy before it acts."""
-        return PolicyStart(self.task, self.instruction, self.seed, self.anchor, self.K_head)
 
 
 @dataclass(frozen=True)
