@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -26,7 +26,6 @@ from services.twin.names import (
 )
 from services.world_model.shipped_checkpoints import default_checkpoint
 
-Form = TypeVar("Form")
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
 # Options of `dextouch export` and `dextouch import` that other formats would ignore.
@@ -94,16 +93,16 @@ def _moment(text: str) -> datetime:
 
 
 def _keywords(text: str) -> dict[str, Any]:
-    return _parsed(text, TypeAdapter(dict[str, Any]), "a JSON object")
+    return _parsed(text, dict[str, Any], "a JSON object")
 
 
 def _keywords_by_name(text: str) -> dict[str, dict[str, Any]]:
-    return _parsed(text, TypeAdapter(dict[str, dict[str, Any]]), "an object of objects")
+    return _parsed(text, dict[str, dict[str, Any]], "an object of objects")
 
 
-def _parsed(text: str, form: TypeAdapter[Form], expected: str) -> Form:
+def _parsed(text: str, form: Any, expected: str) -> Any:  # noqa: ANN401 - of this form
     try:
-        return form.validate_json(text)
+        return TypeAdapter(form).validate_json(text)
     except ValidationError as error:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
 
