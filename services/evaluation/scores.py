@@ -151,40 +151,39 @@ class ClosedLoopReport:
                 for name, world in zip(
                     (REAL, "imagined"), (REAL, *self.imagined_worlds), strict=False
                 ):
-                    row |= self._cell(name, world, task, policy)
+                    row |= self._prefixed(name, world, task, policy)
                 row["other_worlds"] = {
-                    world: self._cell("success", world, task, policy)
+                    world: self._prefixed("success", world, task, policy)
                     for world in self.imagined_worlds[1:]
                 }
                 rows.append(row)
         return rows
 
-    def _cell(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
+    def _prefixed(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
+        figures = self.figures(world, task, policy)
+        return {name: figures.pop("rate")} | {f"{name}_{k}": one for k, one in figures.items()}
+
+    def figures(self, world: str, task: str, policy: str) -> dict[str, Any]:
+        """Success rate of a policy with its Wilson interval, and what it is of."""
         mine = [s for s in self._of(world, task) if s.policy == policy]
         num_failed = sum(f.policy == policy for f in self._failed(world, task))
-        counts: dict[str, Any] = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
+        found: dict[str, Any] = {"rate": UNDEFINED, "rollouts": len(mine), "failed": num_failed}
         if not mine:
-            return {name: UNDEFINED, f"{name}_probability": UNDEFINED, **counts}
-        counts |= {
-            f"{name}_probability": float(np.mean([s.probability for s in mine])),
-            f"{name}_undecided": len(mine) - len(_decided(mine)),
-            f"{name}_comparable": self._is_comparable(world, task, policy),
-        }
+            return found | {"probability": UNDEFINED}
+        found["probability"] = float(np.mean([s.probability for s in mine]))
+        found["undecided"] = len(mine) - len(_decided(mine))
+        found["comparable"] = self._is_comparable(world, task, policy)
+        if math.isfinite(rubric := self._rubric(world, task, policy)):
+            found["rubric"] = rubric
         # Repeats of one start are one observation of the policy.
         starts: dict[int, list[RolloutScore]] = {}
-        if math.isfinite(rubric := self._rubric(world, task, policy)):
-            counts[f"{name}_rubric"] = rubric
         for score in _decided(mine):
             starts.setdefault(score.seed, []).append(score)
-        if not starts:
-            return {name: UNDEFINED, **counts}
-        successes = sum(map(_success_share, starts.values()))
-        interval = wilson_interval(successes, len(starts))
-        return {
-            name: successes / len(starts),
-            f"{name}_interval": [interval.low, interval.high],
-            **counts,
-        }
+        if starts:
+            successes = sum(map(_success_share, starts.values()))
+            interval = wilson_interval(successes, len(starts))
+            found |= {"rate": successes / len(starts), "interval": [interval.low, interval.high]}
+        return found
 
     def _is_comparable(self, world: str, task: str, policy: str) -> bool:
         mine = [s for s in self._of(world, task) if s.policy == policy]

@@ -1,5 +1,7 @@
 """What a study's page and its papers show: rates, agreement, single rollouts, and pictures."""
 
+import itertools
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -49,24 +51,10 @@ logger = structlog.get_logger(__name__)
 # From this difference of success on, two worlds disagree about a start.
 DISAGREEMENT: Final = 0.5
 MEANINGS: Final = {
-    "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
-    "In an imagined world success is what the success classifier decides from images, touch and "
-    "object poses and from the world's own estimate; rollouts that it cannot tell count in no "
-    "rate.",
-    "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
-    "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
-    "three policies: two points always lie on a line.",
-    "mmrv": "Mean maximum rank violation: for each policy the largest real difference to a policy "
-    "that the world ranks the other way, averaged over the policies; 0 if it never does.",
-    "mean_absolute_error": "Mean absolute difference of the world's success rates from the real "
-    "ones.",
-    "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
-    "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
-    "policies or starts they are wide.",
-    "unreliable": "The success classifier cannot tell: its probability is too close to 0.5, it and "
-    "the world's own estimate contradict each other, or the world called its prediction unreliable "
-    "at a step. "
-    f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
+    name: text.replace("{share}", f"{LEAST_DECIDED:.0%}")
+    for name, text in tomllib.loads(
+        Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8")
+    ).items()
 }
 FIGURES_SHOWN: Final = (
     "pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error",
@@ -260,38 +248,26 @@ def _rates(report: ClosedLoopReport, rollouts: tuple[StudyRollout, ...]) -> Iter
             reasons.setdefault(place, {})[one.unreliable] = None
         if one.real_success is not None:
             unlike.setdefault(place, {}).setdefault(one.seed, []).append(one.disagrees)
-    for row in report.policy_rows():
-        for world, name, fields in _worlds_of(row, report.imagined_worlds):
-            place = (world, row["task"], row["policy"])
-            rate, interval = fields[name], fields.get(f"{name}_interval")
-            yield StudyRate(
-                world=world,
-                task=row["task"],
-                policy=row["policy"],
-                rate=None if rate == UNDEFINED else rate,
-                interval=None if interval is None else (interval[0], interval[1]),
-                num_finished=fields[f"{name}_rollouts"],
-                num_failed=fields[f"{name}_failed"] - missing[place],
-                num_missing=missing[place],
-                num_unreliable=fields.get(f"{name}_undecided", 0),
-                is_comparable=fields.get(f"{name}_comparable", True),
-                reasons=tuple(reasons.get(place, ())),
-                num_disagreements=sum(
-                    sum(repeats) >= DISAGREEMENT * len(repeats)
-                    for repeats in unlike.get(place, {}).values()
-                ),
-            )
-
-
-def _worlds_of(
-    row: dict[str, Any], imagined: tuple[str, ...]
-) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """World, name of its entries, and where they are, in a row of `policy_rows`."""
-    yield REAL, REAL, row
-    if imagined:
-        yield imagined[0], "imagined", row
-    for world, fields in row["other_worlds"].items():
-        yield world, "success", fields
+    worlds = (REAL, *report.imagined_worlds)
+    for task, policy, world in itertools.product(report.tasks, report.policies, worlds):
+        place, figures = (world, task, policy), report.figures(world, task, policy)
+        yield StudyRate(
+            world=world,
+            task=task,
+            policy=policy,
+            rate=None if figures["rate"] == UNDEFINED else figures["rate"],
+            interval=figures.get("interval"),
+            num_finished=figures["rollouts"],
+            num_failed=figures["failed"] - missing[place],
+            num_missing=missing[place],
+            num_unreliable=figures.get("undecided", 0),
+            is_comparable=figures.get("comparable", True),
+            reasons=tuple(reasons.get(place, ())),
+            num_disagreements=sum(
+                sum(repeats) >= DISAGREEMENT * len(repeats)
+                for repeats in unlike.get(place, {}).values()
+            ),
+        )
 
 
 def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]:
