@@ -35,8 +35,8 @@ from services.evaluation.matched_starts import (
 )
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
-from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
-from services.evaluation.statistics import area_under_roc, central_interval, wilson_interval
+from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
+from services.evaluation.statistics import area_under_roc, central_interval
 from services.evaluation.success_classifier import SuccessClassifier
 from services.evaluation.templates import rendered
 from services.networks.training_settings import USUAL_IMAGE_PX
@@ -149,19 +149,12 @@ class RecordedScores:
 
     def policy_row(self, policy: str, task: str) -> dict[str, Any]:
         """Imagined success of a policy among its decided rollouts, with its Wilson interval."""
-        scores = self.scores(policy, task)
-        decided = [one for one in scores if one.cannot_tell is None]
-        row: dict[str, Any] = {
-            "policy": policy,
-            "task": task,
-            "rollouts": len(scores),
-            "decided": len(decided),
-        }
-        if decided:
-            successes = sum(one.success for one in decided)
-            interval = wilson_interval(successes, len(decided))
-            row["imagined"] = successes / len(decided)
-            row["imagined_interval"] = [interval.low, interval.high]
+        scores = tuple(self.scores(policy, task))
+        found = ClosedLoopReport(scores, (IMAGINED,), (policy,)).figures(IMAGINED, task, policy)
+        num_decided = len(scores) - found.get("undecided", 0)
+        row = {"policy": policy, "task": task, "rollouts": len(scores), "decided": num_decided}
+        if num_decided:
+            row |= {"imagined": found["rate"], "imagined_interval": found["interval"]}
         return row
 
     def to_report(self) -> dict[str, Any]:

@@ -142,7 +142,7 @@ class ClosedLoopReport:
     def policy_rows(self) -> list[dict[str, Any]]:
         """One row per policy and task: real and imagined success rate with Wilson intervals.
 
-        Shown by `report.html.j2`, `print_scores`, `latex_tables` and `study_figures`.
+        Shown by pages, tables and texts of templates, and by `policy_panels`.
         """
         rows = []
         for task in self.tasks:

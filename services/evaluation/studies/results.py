@@ -353,15 +353,7 @@ def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLo
 
 def _not_run(planned: PlannedRollout) -> RolloutFailure:
     message = "no result yet; `dextouch study run` continues the study"
-    return RolloutFailure(
-        planned.world,
-        planned.policy,
-        planned.task,
-        planned.seed,
-        "NotRunYet",
-        message,
-        repeat=planned.repeat,
-    )
+    return RolloutFailure(**planned._asdict(), error="NotRunYet", message=message)
 
 
 def rollout_episode_id(header: StudyHeader, planned: PlannedRollout) -> str:

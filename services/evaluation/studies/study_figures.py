@@ -4,6 +4,7 @@ import itertools
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -271,7 +272,7 @@ def _rates(report: ClosedLoopReport, rollouts: tuple[StudyRollout, ...]) -> Iter
 
 
 def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]:
-    alone = ClosedLoopReport(report.scores, (world,), report.policies, report.failures).to_report()
+    alone = replace(report, imagined_worlds=(world,)).to_report()
     tasks = alone["agreement"]
     if alone["agreement_of_all_tasks"]:
         num_policies = max(found["num_policies"] for found in tasks.values())
@@ -325,9 +326,7 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
         write_result(path, figures, allow_nan=False)
     for world in definition.imagined:
         others = tuple(name for name in definition.imagined if name != world)
-        page = ClosedLoopReport(
-            report.scores, (world, *others), report.policies, report.failures
-        ).to_report()
+        page = replace(report, imagined_worlds=(world, *others)).to_report()
         title = f"{definition.name}: {world} and the real world"
         pictures = ReportPictures(moving=kept_pairs(report, world, results))
         write_report(page | {"title": title}, pictures, folder / f"report {world}.html")
