@@ -41,7 +41,7 @@ from services.evaluation.matched_starts import (
 from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.progress import Progress
 from services.evaluation.rating.marks import Rubric, read_rubrics
-from services.evaluation.reporting import PredictionPicture
+from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier
 

@@ -20,7 +20,8 @@ from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
 from services.evaluation.policies.outside import load_policies
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import failure_rows, undecided_note
 from services.evaluation.settings import (
     DEFAULT_PROBE,

@@ -31,7 +31,7 @@ from services.evaluation.prediction_scenes import (
     warped,
 )
 from services.evaluation.progress import Progress
-from services.evaluation.reporting import PredictionPicture
+from services.evaluation.reporting.pictures import PredictionPicture
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"

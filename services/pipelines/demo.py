@@ -28,12 +28,12 @@ from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
 from services.evaluation.prediction import ALL_TASKS, all_metrics, described, measure_prediction
 from services.evaluation.prediction_scenes import read_rollout
-from services.evaluation.reporting import (
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     PredictionPicture,
     ReportPictures,
     action_picture,
     episode_picture,
-    write_report,
 )
 from services.evaluation.reporting.sections import comparison_bars, error_rows
 from services.evaluation.templates import figure

@@ -13,7 +13,7 @@ from services.evaluation.closed_loop import EvaluationPlan, evaluate, film
 from services.evaluation.command_line import run_train_judge, run_train_policy
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.reporting import PredictionPicture
+from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier

@@ -19,12 +19,12 @@ from dextouch.serving import configure_logging
 from dextouch.worlds import World, WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
-from services.evaluation.reporting import (
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
-    write_report,
 )
 from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import generate_parser, imagined_parser

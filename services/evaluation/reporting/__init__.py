@@ -18,15 +18,9 @@ from dextouch.free_text import printable
 from services.evaluation.reporting.pictures import (
     FULL_SCALE_KPA,
     MAX_MOVING,
-    ActionPicture,
-    EpisodePicture,
-    PredictionPicture,
     ReportPictures,
     action_charts,
-    action_picture,
     clock_chart,
-    episode_pair,
-    episode_picture,
     moments,
     moving_picture,
     policy_panels,
@@ -43,18 +37,6 @@ from services.evaluation.reporting.sections import (
     undecided_note,
 )
 from services.evaluation.templates import environment
-
-__all__ = [
-    "MAX_MOVING",
-    "ActionPicture",
-    "EpisodePicture",
-    "PredictionPicture",
-    "ReportPictures",
-    "action_picture",
-    "episode_pair",
-    "episode_picture",
-    "write_report",
-]
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:

@@ -17,12 +17,12 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.closed_loop import example_pairs, title_of
-from services.evaluation.reporting import (
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
-    write_report,
 )
 from services.evaluation.reporting.policy_picture import Format, Rate, policy_picture
 from services.evaluation.reporting.sections import latex_tables

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 from dextouch import __version__
-from services.evaluation.reporting import (
+from services.evaluation.reporting import pictures, write_report
+from services.evaluation.reporting.pictures import (
     ActionPicture,
     EpisodePicture,
+    Line,
     PredictionPicture,
     ReportPictures,
-    pictures,
-    write_report,
-)
-from services.evaluation.reporting.pictures import (
-    Line,
     data_address,
     hands_image,
     line_chart,
