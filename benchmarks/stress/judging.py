@@ -73,14 +73,14 @@ def _non_finite(check: Check) -> None:
         poses[..., 3], poses[1, 0, 2] = 1.0, bad
         check.true("an object somewhere unknown is absent", not known_objects(poses)[0])
         check.finite("features", object_features(poses))
-    probability = _probe().probabilities([_ending(1e-40)])[0]
+    probability = float(_probe().probabilities([_ending(1e-40)])[0])
     check.true("probability of 1e-40 kPa in 0 … 1", 0 <= probability <= 1)
 
 
 @STAGE.cell("touch", "every taxel at 0, 650 and 99 999 kPa, and below zero")
 def _touch(check: Check) -> None:
     for pressure_kpa in (0.0, -5.0, 650.0, 99_999.0):
-        probability = _probe().probabilities([_ending(pressure_kpa)])[0]
+        probability = float(_probe().probabilities([_ending(pressure_kpa)])[0])
         check.true("probabilities in 0 … 1", 0 <= probability <= 1)
         touch = np.full_like(_seen().tactile_kpa, pressure_kpa)
         _command_is_bounded(check, _act(replace(_seen(), tactile_kpa=touch)))
