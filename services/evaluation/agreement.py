@@ -97,14 +97,8 @@ def task_agreement(
 
     Scores are those of the named policies, at least two, from at least two starts.
     """
-    real, imagined = (known_mean(side, axis=1) for side in (scores.real, scores.imagined))
     draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
-    without = {
-        name: policy.pearson(real=np.delete(real, row), imagined=np.delete(imagined, row))
-        for row, name in enumerate(policies)
-    }
-    chance = chance_of_correlation([real], [imagined], generator)
-    return Agreement(_figures(real[None], imagined[None], draws), without, chance), draws
+    return pooled_agreement(policies, [scores], [draws], generator), draws
 
 
 def pooled_agreement(
@@ -123,7 +117,13 @@ def pooled_agreement(
     real = np.array([known_mean(scores.real, axis=1) for scores in tasks])
     imagined = np.array([known_mean(scores.imagined, axis=1) for scores in tasks])
     joined = Draws(
-        _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
+        *(
+            ScoreDraws(
+                np.concatenate([one.real for one in kind], axis=1),
+                np.concatenate([one.imagined for one in kind], axis=1),
+            )
+            for kind in ([one.posterior for one in draws], [one.bootstrap for one in draws])
+        )
     )
     without = {
         name: _value("pearson", np.delete(real, row, axis=1), np.delete(imagined, row, axis=1))
@@ -131,13 +131,6 @@ def pooled_agreement(
     }
     chance = chance_of_correlation(list(real), list(imagined), generator)
     return Agreement(_figures(real, imagined, joined), without, chance)
-
-
-def _joined(draws: Sequence[ScoreDraws]) -> ScoreDraws:
-    return ScoreDraws(
-        np.concatenate([one.real for one in draws], axis=1),
-        np.concatenate([one.imagined for one in draws], axis=1),
-    )
 
 
 def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
