@@ -1,13 +1,15 @@
-"""Commands `wrist`, `profile` and `latency` of `dextouch station calibrate`, each from one take.
+"""Commands `camera`, `robot-base`, `wrist`, `profile` and `latency` of `station calibrate`.
 
-The latency of a tracker is relative to a glove, or the other way round: a hand taps a table.
+Intrinsics come from photos of a board, a robot's base from pairs of poses, the others from a take.
 """
 
 import argparse
 
 import numpy as np
 
+from dextouch.clients import HttpLink
 from dextouch.errors import InvalidInputError
+from services.alignment.calibration.hand_eye import solve_robot_base
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.calibration.time_offset import TimeOffset, estimate_tap_offset
 from services.alignment.retargeting.hand_retargeter import profile_name
@@ -17,15 +19,74 @@ from services.alignment.retargeting.wrist_frame import (
     calibration_record,
     hand_axes_check,
 )
+from services.alignment.station_calibration.camera_views import (
+    Session,
+    calibrate_photos,
+    folder_arrivals,
+    station_arrivals,
+)
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
     TakeStream,
     read_matrices,
+    read_pairs,
     read_stream,
     write_entry,
+    write_pose,
 )
 
+PAIRS_HELP = "JSON: [[T_world_tracker, T_base_effector], …], each 4x4, both of the same moment"
+BASE_NAME = "T_world_base"
+# Of a pose, in which a hand comes down on a table.
+HEIGHT = 2
 FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+
+def calibrate(options: argparse.Namespace) -> dict[str, object]:
+    """Calibrate from the photos of a folder; coverage and advice are written in any case.
+
+    With `--url` or `--watch` photos are collected first, until coverage is sufficient or Ctrl-C.
+    """
+    if options.watch and options.url is not None:
+        raise InvalidInputError("got --watch and --url, expected one of the two")
+    if not options.watch and options.url is None:
+        return calibrate_photos(options)
+    session = Session(options, None if options.url is None else options.photos)
+    print("Ctrl-C ends the collection and calibrates with the photos so far")
+    try:
+        if options.url is None:
+            session.collect(folder_arrivals(options.photos))
+        else:
+            link = HttpLink(options.url, api_key=options.key)
+            session.collect(station_arrivals(link, options.camera))
+    except KeyboardInterrupt:
+        print(f"stopped with {len(session.views)} views")
+    return calibrate_photos(options)
+
+
+def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
+    """Estimate a robot's base from pairs of poses of a tracker on the effector and the effector."""
+    pairs = read_pairs(options.poses, PAIRS_HELP)
+    mount = np.eye(4) if options.same_frame else None
+    result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
+    left_out = list(result.left_out_views)
+    for index in left_out:
+        print(f"  pair {index} is far off: left out; did the robot stand still?")
+    rms_deg, rms_mm = np.rad2deg(result.rotation_rms_rad), result.translation_rms_m * 1e3
+    facts: dict[str, object] = {
+        "num_pairs": len(pairs) - len(left_out),
+        "residual_rms_deg": float(rms_deg),
+        "residual_rms_mm": rms_mm,
+        "left_out": left_out,
+        "T_effector_tracker": result.T_effector_tracker.tolist(),
+    }
+    sigma = (result.sigma_rotation_rad, result.sigma_translation_m)
+    known = write_pose(options.to, BASE_NAME, result.T_world_base, sigma, facts)
+    print(
+        f"{known} from {facts['num_pairs']} pairs; they scatter by {rms_deg:.3f}° and "
+        f"{rms_mm:.2f} mm RMS"
+    )
+    return facts
 
 
 def measure_wrist(options: argparse.Namespace) -> dict[str, object]:
@@ -86,17 +147,8 @@ def _keypoints(options: argparse.Namespace) -> TakeStream:
     return taken
 
 
-# Of a pose, in which a hand comes down on a table.
-HEIGHT = 2
-
-
 def measure_latency(options: argparse.Namespace) -> dict[str, object]:
-    """Measure the delay between a glove and a tracker, in addition to calibrated latencies.
-
-    Raises:
-        DegenerateMotionError: no taps.
-        InvalidInputError: not a glove and a tracker.
-    """
+    """Measure the delay between a glove and a tracker, in addition to calibrated latencies."""
     stream = read_stream(options.take, options.stream, options.store)
     reference = read_stream(options.take, options.reference, options.store)
     kinds = (reference.descriptor.kind, stream.descriptor.kind)
