@@ -16,7 +16,7 @@ from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
-from services.world_model.training.episode_split import check_disjoint
+from services.world_model.training.episode_sets import check_disjoint
 from services.world_model.training.objective import LossOptions, losses
 from services.world_model.training.trainer import TrainingRun
 

@@ -13,7 +13,7 @@ from services.world_model.checkpoints import Checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.shipped_checkpoints import paper_form_checkpoint
+from services.world_model.settings import paper_form_checkpoint
 from services.world_model.world import ModelWorld
 
 STAGE = StageCells("world-model")

@@ -34,12 +34,12 @@ from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.network.configuration import (
     GloveNetworkConfig,
     NetworkConfig,
+    RendererConfig,
     TokenizerName,
 )
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.renderer import RendererNetwork
 
 METADATA_KEY = "dextouch_world_model"
 _STATE_KEY = "dextouch_state_model"
@@ -130,11 +130,7 @@ def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> t
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
-    """Write the file atomically and return its digest.
-
-    The full size keeps the precision of its weights, and comes with the text features of its
-    instructions, so that the text encoder is not needed to serve them.
-    """
+    """Write the file atomically and return its digest; the full size with its text features."""
     if model.text_features is None:
         return write_weights(path, half_weights(model), metadata, METADATA_KEY)
     known = model.text_features.known
@@ -211,10 +207,7 @@ class StateBounds(FrozenModel):
 
     @property
     def latent_distance(self) -> float:
-        """Largest distance at which a latent step is not flagged.
-
-        No step exceeds a bound on the mean over an episode times the number of steps.
-        """
+        """Largest distance at which a latent step is not flagged, from the mean over an episode."""
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
 
@@ -340,12 +333,7 @@ class Reconstruction(FrozenModel):
 
 
 class TokenizerMetadata(FrozenModel):
-    """Provenance and measured accuracy of a tokenizer.
-
-    `train_scenes` are the scenes of the episodes trained on (`dextouch.episodes.scene_of`). `curve`
-    begins with the untrained network and ends with the stored one. `layout` is that of the taxels,
-    None of `dextouch_v1`.
-    """
+    """Provenance and accuracy of a tokenizer; `curve` is from the untrained to the stored one."""
 
     format_version: int = 1
     tokenizer: TokenizerName

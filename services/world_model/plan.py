@@ -1,12 +1,9 @@
 """Memory and FLOPs of a joint model, computed from its configuration without any weights.
 
-The network runs on torch's meta device, which has shapes but no numbers, so that the full size can
-be planned on a laptop. FLOPs are those of matrix products, convolutions and attention (two per
-multiplication and addition); memory is the largest sum of tensors that are alive at one time.
-Attention counts its whole matrix, which fused kernels do not store; working memory of convolutions,
-which depends on the library, is not counted. Both are planned from a few layers, since they grow
-with their number linearly. In training activations count in float32, also where products are
-bfloat16.
+The network runs on torch's meta device. FLOPs are two per multiplication and addition of matrix
+products, convolutions and attention; memory is the largest sum of tensors alive at one time, with
+the whole matrix of attention and without working memory of libraries. Deep models are planned from
+a few layers. In training activations count in float32.
 """
 
 import weakref
@@ -25,10 +22,9 @@ from services.networks.optimizer import learned_weights
 from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
-from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
+from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs, kept_bytes
 from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
-from services.world_model.network.past import kept_bytes
 from services.world_model.paper_settings import LoraSettings, TrainSettings
 from services.world_model.pretrained_video import freeze_pretrained
 
@@ -67,10 +63,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Plan:
-    """What one action chunk of one rollout needs.
-
-    `kept_bytes` is what the sampler's steps share: keys and values of clean tokens, and conditions.
-    """
+    """What a chunk of one rollout needs; `kept_bytes` is what the sampler's steps share."""
 
     num_steps: int
     num_video_tokens: int

@@ -13,8 +13,11 @@ from dextouch.serving import CommandSettings, service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
+    AdamWSettings,
     AverageDecay,
     Batch,
+    BudgetSettings,
+    CpuBudget,
     ImagePx,
     LearningRate,
     NonNegative,
@@ -23,23 +26,38 @@ from services.networks.training_settings import (
     Splits,
     Stores,
     Tasks,
+    WarmupSteps,
     WeightDecay,
 )
 from services.world_model.network.configuration import (
     SPATIAL_FACTOR,
     Precision,
+    RendererConfig,
     Sampler,
     WanFiles,
 )
 from services.world_model.presets import PRESETS
-from services.world_model.rendering.configuration import RendererConfig, RendererTraining
-from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
+
+# Checkpoints that ship with the package.
+PRETRAINED = Path(__file__).parent / "pretrained"
+STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
+
+
+def default_checkpoint() -> Path:
+    """Default checkpoint of the package: the state model if it is installed."""
+    state = PRETRAINED / STATE_MODEL
+    return state if state.is_file() else paper_form_checkpoint()
+
+
+def paper_form_checkpoint() -> Path:
+    """Checkpoint of the joint flow-matching model that ships with the package."""
+    return PRETRAINED / PAPER_FORM
 
 
 class DataSettings(FrozenModel):
     """Episodes of people and robots that a world model of either form is trained on.
 
-    With `human` stores, `episodes` and `heldout` give robot episodes alone, and `human` human ones.
+    With `human` stores, `episodes` and `heldout` give robot episodes alone.
     """
 
     human: tuple[str, ...] = Field(
@@ -123,6 +141,22 @@ class CoreSettings(FrozenModel):
         default=0.012, description="largest noise on true start poses"
     )
     weights: CoreLossWeights = Field(default=CoreLossWeights(), description="weights of targets")
+
+
+class RendererTraining(AdamWSettings, BudgetSettings):
+    """One training run of the renderer."""
+
+    cpu_budget_s: CpuBudget = 400.0
+    batch: Batch = 24
+    warmup_steps: WarmupSteps = 50
+    weight_decay: WeightDecay = 0.01
+    gradient_weight: NonNegative = Field(default=0.5, description="image gradient loss")
+    sharpness_weight: NonNegative = Field(
+        default=0.3, description="edge strength loss (7 px windows)"
+    )
+    shaken_fraction: Share = Field(default=0.5, description="share of pairs with pose noise")
+    shake_m: NonNegative = Field(default=0.003, description="position noise per axis")
+    uses_bfloat16: bool = Field(default=True, description="convolve in bfloat16 if that is faster")
 
 
 # What is trained of an initial state model: all but its codec; readers and the estimate of success;
@@ -331,10 +365,7 @@ class WorldModelSettings(WorldServiceSettings):
 def recorded_command(
     settings: FrozenModel, command: str, places: Sequence[str], left_out: set[str]
 ) -> str:
-    """Command that repeats a run: every setting that differs from its default, but for `left_out`.
-
-    Of `places`, stores and files, the last path component is given: folders differ by machine.
-    """
+    """Command that repeats a run, with `places` by their last path components alone."""
 
     def last_name(url: str) -> str:
         return url.rstrip("/").rsplit("/", 1)[-1]

@@ -42,11 +42,7 @@ LAST_HORIZONS = 4
 
 @dataclass(frozen=True)
 class ObservedStart:
-    """The step that a rollout begins with; its arrays are copies.
-
-    Touch is clipped at zero; `reached` is relative to the poses of step 0, so its poses are the
-    identity.
-    """
+    """The step that a rollout begins with, in copies; `reached` poses are the identity."""
 
     image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: Float32[np.ndarray, "2 taxels"]

@@ -67,8 +67,7 @@ _SAME_INSTRUCTION = 0.999
 class StateRollout:
     """State of a rollout: its start and the memory of its scene.
 
-    `first_reached` and `reached` are relative to `anchor`, the poses of step 0; `num_moving` counts
-    the latent steps in which hands moved.
+    `first_reached` is relative to `anchor`; `num_moving` counts latent steps in which hands moved.
     """
 
     task: str
@@ -83,9 +82,7 @@ class StateRollout:
 
 
 class StateWorld(BatchWorld[StateRollout]):
-    """A state model as a world.
-
-    Deterministic: the seeds of chunks have no effect.
+    """A state model, in float32, as a deterministic world: seeds of chunks have no effect.
 
     Raises:
         InvalidInputError: weights that are not float32.

@@ -35,11 +35,17 @@ from services.world_model.network.configuration import (
     NetworkConfig,
     Precision,
 )
-from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
+from services.world_model.network.inputs import (
+    ACTION_KINDS,
+    MAX_KEPT,
+    PastImages,
+    PastRule,
+    PredictionRequest,
+    build_inputs,
+    kept_bytes,
+)
 from services.world_model.network.model import Sampling, stack_noise
-from services.world_model.network.past import MAX_KEPT, PastImages, PastRule, kept_bytes
-from services.world_model.settings import Placement
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import Placement, default_checkpoint
 from services.world_model.state_world import StateWorld
 
 MAX_SNAPSHOT_BYTES = 4 * 2**20
@@ -53,10 +59,7 @@ _NUM_WATCHED_POINTS = NUM_POINTS + len(_CAMERA_POINTS_M)
 
 @dataclass(frozen=True)
 class KeptImages:
-    """Images that a rollout remembers, the oldest first: steps, poses then, and latents.
-
-    Latents are half as precise as those of the network, so that a snapshot has all of them.
-    """
+    """Images that a rollout remembers, the oldest first: steps, poses then, and latents."""
 
     steps: tuple[int, ...]
     reached: Float64[np.ndarray, "kept 67"]
@@ -99,9 +102,8 @@ class KeptImages:
 class ModelState(starts.ObservedStart):
     """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0.
 
-    `still_m` are points of hands and camera when they last moved, `num_still` the latent steps
-    since then, and `num_moving` all those with motion. `further` has the last image of each further
-    view that the start had, and `kept` the images that are remembered.
+    `still_m` are points of hands and camera when they last moved, `num_still` latent steps ago;
+    `num_moving` counts those with motion. `further` has the last images of further views.
     """
 
     instruction: str
@@ -118,11 +120,10 @@ class ModelState(starts.ObservedStart):
 class ModelWorld(BatchWorld[ModelState]):
     """A flow-matching model as a world.
 
-    Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
-    products; codecs are float32. With contact geometry, `reader` finds objects at a chunk's start.
-
-    A scene is at rest in chunks without motion that follow two seconds without motion, or a start
-    at which the hands touch nothing: it stays as it is, bit for bit, without the network.
+    `precision` is that of the experts' matrix products. With contact geometry, `reader` finds
+    objects at a chunk's start. A scene is at rest, bit for bit and without the network, in chunks
+    without motion that follow two seconds without motion, or a start at which the hands touch
+    nothing.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks and of the
@@ -220,9 +221,6 @@ class ModelWorld(BatchWorld[ModelState]):
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[ModelState]]:
         """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
-
-        The last image is always decoded, since the next chunk starts from it; the others only on
-        request, which at full size may change the last one by rounding.
 
         Raises:
             ShapeError: a chunk of another length.
@@ -397,12 +395,8 @@ def open_world(
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
-    Args:
-        path: safetensors file; None for the one that ships with the package.
-        sampling: of a flow-matching model; a state model predicts without.
-        objects: state model that reads objects for contact geometry; None for the package's own.
-        needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
-        placement: device and precision of a flow-matching model.
+    `objects` is the state model that reads objects for contact geometry; `sampling` and `placement`
+    are of flow-matching models. With `needs_touch`, models that do not predict touch are refused.
 
     Raises:
         InvalidInputError: options of sampling for a state model, guidance for a model that was
@@ -551,10 +545,7 @@ def _advance(
     imagined: tuple[dict[str, np.ndarray], np.ndarray],
     selector: ReturnSelector,
 ) -> SteppedRollout[ModelState]:
-    """New state and requested outputs, from predicted images by view (maybe the last) and touch.
-
-    The model predicts no poses: the next chunk starts from the last commanded action.
-    """
+    """New state and requested outputs; the next chunk starts from the last commanded action."""
     images, tactile_kpa = imagined
     first = 0 if selector.steps == "all" else len(chunk) - 1
     observation = Observation(

@@ -1,4 +1,4 @@
-"""Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
+"""Shapes of the joint model, of the Wan2.2 networks and of the renderer, stored in checkpoints."""
 
 from functools import cached_property
 from operator import not_
@@ -15,13 +15,12 @@ if TYPE_CHECKING:
     import torch
 
     from dextouch.tactile.layout import TactileLayout
-
-
 Sampler = Literal["euler", "unipc"]
 Precision = Literal["float32", "bfloat16"]
 TokenizerName = Literal["principal_axes", "split_hands", "grid"]
 FurtherView = Literal["camera_wrist_left", "camera_wrist_right"]
 PastChoice = Literal["nearest", "recent"]
+Interpolation = Literal["bilinear", "bicubic"]
 FRAMES_PER_LATENT = 4
 RASTER_CELLS_PER_TOKEN = 4
 # Fixed by the published autoencoder: it maps 1 + 4k images to 1 + k latents at a sixteenth of the
@@ -358,3 +357,24 @@ class GloveNetworkConfig(NetworkConfig):
         from dextouch.tactile.layout import TactileLayout  # not for a parser
 
         return TactileLayout.model_validate(self.layout.model_dump())
+
+
+class RendererConfig(FrozenModel):
+    """Shape of the renderer's network; image sides must be divisible by 2^(number of widths)."""
+
+    widths: tuple[int, ...] = Field(
+        default=(32, 64, 96), min_length=1, max_length=4, description="channels at 1/2, 1/4, …"
+    )
+    depths: tuple[int, ...] = Field(
+        default=(1, 1, 2), min_length=1, max_length=4, description="residual blocks per level"
+    )
+    stem_px: int = Field(default=1, ge=1, le=5, description="kernel size of the first convolution")
+    interpolation: Interpolation = Field(default="bicubic", description="of the warped start image")
+    redraws_table: bool = Field(
+        default=True, description="redraw the whole image when only the camera moves"
+    )
+
+    @property
+    def pixel_multiple(self) -> int:
+        """Sides of images must be multiples of this."""
+        return 2 ** len(self.widths)

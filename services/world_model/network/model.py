@@ -37,9 +37,7 @@ from services.world_model.network.configuration import (
 )
 from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.instruction import TextFeatures
-from services.world_model.network.kept import LastUsed
-from services.world_model.network.low_rank import add_adapters, merge_adapters
+from services.world_model.network.instruction import LastUsed, TextFeatures
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
@@ -47,7 +45,9 @@ from services.world_model.network.video import (
     WanBlock,
     WanVideoCondition,
     WanVideoExpert,
+    add_adapters,
     empty_transformer,
+    merge_adapters,
 )
 
 _EXACT_PARTS = (
@@ -74,11 +74,9 @@ class FirstLatents:
 
 @dataclass(frozen=True)
 class Context:
-    """What the predictions of a chunk at all flow times have in common.
+    """What the predictions of a chunk at all flow times share; conditions without the time.
 
-    `video` (of the type of the video side) and `tactile` are the conditions without the time.
-    `past` are latents of past images, before those of the window. With `clean`, clean tokens are
-    not computed again for every time.
+    `past` are latents of past images. With `clean`, clean tokens are not computed again.
     """
 
     first: FirstLatents
@@ -119,10 +117,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future after the first step; images of all its steps, or of the last ones only.
-
-    `further` has the images of the further views, and `first` the latents of the first images.
-    """
+    """Future after the first step, also of further views; `first` are latents of first images."""
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
@@ -190,10 +185,10 @@ class JointWorldModel(nn.Module):
         self._observed: LastUsed[Observed] | None = None
 
     def keep_contexts(self, count: int) -> None:
-        """Keep what depends on the instruction and on the first step alone for later chunks.
+        """Keep up to `count` results of instruction and first step alone for later chunks.
 
-        At most `count` of each; weights must not change from now on. Clean tokens see the actions
-        of a chunk by the scene encoder, with which only texts are kept.
+        Weights must not change from now on. With the scene encoder, which sees actions, only texts
+        are kept.
         """
         if not self.config.use_scene_encoder:
             self._observed = LastUsed(count)
@@ -253,11 +248,7 @@ class JointWorldModel(nn.Module):
         tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
         further: UInt8[Tensor, "batch further time px px 3"] | None = None,
     ) -> JointLatents:
-        """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
-
-        Residuals from the first latents, or the latents themselves, as the configuration says.
-        `further` are the images of the further views, if there are any.
-        """
+        """Clean latents of recorded windows, or residuals, in units of their deviation."""
         shown = images[:, None] if further is None else torch.cat([images[:, None], further], dim=1)
         video = from_first(self._encoded(shown), self.config.video_target)
         return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
@@ -276,10 +267,7 @@ class JointWorldModel(nn.Module):
         noisy: JointLatents,
         t: Float32[Tensor, " batch"],
     ) -> JointLatents:
-        """Predict clean latents, or velocities, from noisy ones at time t (the first are clean).
-
-        Without touch the tactile latents are returned as they came.
-        """
+        """Predict clean latents, or velocities, from noisy ones at time t (first ones clean)."""
         return self.denoise(self.context(inputs, first), noisy, t)
 
     def context(self, inputs: ModelInputs, first: FirstLatents) -> Context:
@@ -369,10 +357,7 @@ class JointWorldModel(nn.Module):
         )
 
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
-        """Mask by which clean tokens attend to each other only.
-
-        They are those of past images, of the first latent frame, and of the first touch.
-        """
+        """Mask by which past and first images and first touch attend to each other only."""
         per_frame, num_clean = self.config.tokens_per_frame, self.config.num_clean_frames
         num_frames = num_clean - 1 + num_latents(num_steps)
         is_clean = torch.arange(num_frames * per_frame) < num_clean * per_frame
@@ -402,11 +387,9 @@ class JointWorldModel(nn.Module):
         all_images: bool = True,
         precision: Precision = "float32",
     ) -> Prediction:
-        """Sample a future for every request.
+        """Sample a future for every request, with its `noise`; of the images all, or the last ones.
 
-        There is one `noise` per request; like the inputs it may be on any device. Of the images,
-        all are decoded or only the last ones. `precision` is that of the experts' matrix
-        products (autocast); codecs always use float32.
+        `precision` is that of the experts' matrix products (autocast); codecs always use float32.
         """
         inputs, sampling = self.with_past(inputs.to(self.device)), sampling or Sampling()
         noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
@@ -510,10 +493,7 @@ class JointWorldModel(nn.Module):
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step; of the images maybe the last ones only.
-
-        Without touch all pressures are zero.
-        """
+        """Images, maybe the last only, and pressures after the first step (0 without touch)."""
         clean = self.with_clean_first(clean, first)
         video = self.video_residual_std * clean.video
         if self.config.video_target == "residual":

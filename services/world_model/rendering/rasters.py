@@ -1,9 +1,6 @@
 """Scene states, and rasters of their objects and hands in an image.
 
-Objects are bounding boxes found by casting rays; the nearest box wins. A hit takes its colour from
-where its object's point was in the start image. Hands are coloured bones, by splatting points of
-the kinematic chains: each bone is a ribbon of points that faces the camera, coloured by the start
-image. A soft depth test resolves occlusion.
+Objects are boxes, by casting rays; hands are ribbons of coloured points along their bones.
 """
 
 from collections.abc import Sequence
@@ -40,10 +37,7 @@ _KNUCKLES = (5, 9, 13, 17)
 
 @dataclass(frozen=True)
 class SceneStates:
-    """Scenes at several steps; poses are x y z (m), then the quaternion w x y z, in the world.
-
-    Slots of absent objects hold arbitrary finite numbers.
-    """
+    """Scenes at several steps; poses are x y z (m), q_wxyz in the world, finite where absent."""
 
     Ts_world_camera: Float64[np.ndarray, "n 4 4"]
     Ts_world_wrist: Float64[np.ndarray, "n 2 4 4"]
@@ -105,10 +99,9 @@ def joined(parts: Sequence[Arrays]) -> Arrays:
 
 @dataclass(frozen=True)
 class BoxHits:
-    """Pixels that see a box, each with its nearest one.
+    """Pixels that see a box, each with its nearest one; `place` is flat over all images.
 
-    `place` is the flat pixel index over all images, row by row; `local` is the entry point in units
-    of the half sizes, `thickness_m` the difference in depth between entry and exit.
+    `local` is the entry point in half sizes, `thickness_m` the depth from entry to exit.
     """
 
     place: Int64[np.ndarray, " hits"]
@@ -144,10 +137,7 @@ def cast_boxes(
     K: Float64[np.ndarray, "n 3 3"],
     shape_px: tuple[int, int],
 ) -> BoxHits:
-    """Intersect the rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986).
-
-    Only pixels in the bounding rectangle of a box are tested; of one behind the camera, all.
-    """
+    """Intersect rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986)."""
     half_m = np.maximum(half_m, MIN_HALF_M)[present]
     Ts_box_camera = invert(Ts_camera_box[present])
     images, slots = np.nonzero(present)
@@ -206,10 +196,7 @@ def positions_at_start(
     half_m: Float64[np.ndarray, "n k 3"],
     K: Float64[np.ndarray, "n 3 3"],
 ) -> Float64[np.ndarray, "hits 2"]:
-    """Start image pixels of the hit points; far outside for points behind the start camera.
-
-    `Ts_start_box` are the boxes' poses at the start in the start camera, and `K` its intrinsics.
-    """
+    """Start image pixels of the hit points, of boxes in the start camera; far outside behind it."""
     x, y, z = hits.local.T
     scaled = (K[:, None] @ Ts_start_box[..., :3, :]).transpose(2, 3, 0, 1)
     scaled[:, :3] *= np.maximum(half_m, MIN_HALF_M).transpose(2, 0, 1)
@@ -312,10 +299,7 @@ def project_hands(
     *,
     middle_only: bool = False,
 ) -> HandPoints:
-    """Project all points of both hands into a camera.
-
-    With `middle_only`, every point is put on the centre line of its bone.
-    """
+    """Project all points of both hands into a camera, with `middle_only` all on their bones."""
     ribbons = _ribbons()
     base = apply(invert(T_world_camera)[:, None], base_world)
     # Vectors are [3, n, 2, points]: one block of numbers per axis is much faster to compute with.

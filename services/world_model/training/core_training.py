@@ -45,9 +45,8 @@ _MEASURED_SHARE = 0.15
 class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
-    Cores start from true poses with noise of known size. `readings` are a reader's by start step,
-    which episodes start from whose objects are not labelled or not known there, or all if
-    `starts_read`; empty if none does.
+    Cores start from true poses with noise, but from `readings` of their start step where objects
+    are not labelled or not known, or everywhere if `starts_read`.
     """
 
     table: SceneTable
@@ -74,11 +73,7 @@ def train_core(
     on_step: OnStep | None = None,
     initial: RecurrentCore | None = None,
 ) -> RecurrentCore:
-    """Train a core to predict scenes from any start step to the end.
-
-    Weights of `initial` that require gradients are changed. `on_step` is called with each step and
-    its loss.
-    """
+    """Train a core, or what of `initial` requires gradients, on scenes from any start step."""
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -97,10 +92,7 @@ def train_core(
 
 @torch.no_grad()
 def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) -> None:
-    """Set a core's objects of every task, and the range of the hands' motion.
-
-    With `widens`, the range that the core already has is kept, and widened.
-    """
+    """Set a core's objects of every task, and the range of hands, or with `widens` widen it."""
     # Tasks without episodes keep what the core knows of them.
     seen = torch.bincount(table.task, minlength=len(core.boxes_m)) > 0
     core.boxes_m[seen] = table.boxes_m[seen]
@@ -122,10 +114,7 @@ def start_steps(table: SceneTable) -> list[int]:
 
 
 def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:
-    """Random start, with a probability proportional to the root of the remaining length.
-
-    Starts near the end teach little about persistence. Those of few episodes are as much rarer.
-    """
+    """Random start, rarer near the end, which teaches little, and where few episodes have one."""
     remaining = np.sqrt([table.num_steps - 1 - step for step in later])
     weight = remaining * [len(table.starts_at(step)) for step in later]
     return int(rng.choice(later, p=weight / weight.sum()))
@@ -180,7 +169,6 @@ def _read_start(
 ) -> Reading:
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
-    The noise of each object has its own standard deviation; that of clicks is in the poses already.
     Poses from touch are those of takes that succeeded: where a task has some, all of its episodes
     start from what the reader sees, or starts would tell the outcome.
     """
@@ -220,8 +208,8 @@ def core_loss(
 ) -> Float32[Tensor, ""]:
     """Weighted sum of the errors in objects, touch, contact and final success.
 
-    Where hands are held still without contact, the targets are no motion and no change of touch. A
-    change of it needs a new `CORE_VERSION` (`state_trainer`).
+    Of hands held still without contact, the targets are no motion and the same touch. A change of
+    it needs a new `CORE_VERSION` (`state_trainer`).
     """
     commands, start = batch.commands, batch.start
     table, rows = data.table, batch.rows

@@ -49,22 +49,14 @@ def evaluate_prediction(
     stride: int = 8,
     action_kind: ActionKind = "commanded",
 ) -> dict[str, float]:
-    """Errors over every window that starts at a multiple of `stride`.
+    """Errors over every window of held-out episodes that starts at a multiple of `stride`.
 
-    Episodes are held out; those without actions of this kind give their measured ones.
-
-    Returns:
-        psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
-        named by the suffix, and num_windows; psnr alone for a model without touch.
-
-        - _copy repeats the first step; tactile_mse_zero predicts no touch.
-        - _codec encodes and decodes the ground truth: the upper bound for the model.
-        - _other_take is the model given the actions of another held-out episode of the same task
-          at the same time (absent where no task has two episodes).
-        - _hold is the model given actions in which nothing moves; in _hands_still only the head
-          moves.
-
-        A model that is no better with its own actions than with these does not use them.
+    Returns psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the
+    baselines named by the suffix, and num_windows; psnr alone without touch. _copy repeats the
+    first step, tactile_mse_zero predicts no touch, _codec encodes and decodes the truth. The model
+    is given the actions of another held-out take of the task at the same time for _other_take, such
+    in which nothing moves for _hold, and only the head for _hands_still: if it is no better with
+    its own, it does not use them.
 
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.

@@ -1,9 +1,7 @@
 """Training losses: flow matching of video and tactile latents, and self-forcing.
 
-Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment, where a chunk
-starts from the last prediction, and a sampler calls the network with latents of its own. The
-context of half the batches is predicted, and noisy latents are those that the sampler itself
-reaches; the target is always the recorded future.
+Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment: contexts of
+half the batches are predicted, and noisy latents are those that the sampler reaches.
 """
 
 from collections.abc import Iterator
@@ -78,8 +76,8 @@ class LossOptions:
 class Examples:
     """What the network is given for some windows, what it should answer, and how that counts.
 
-    `counted` weighs the errors of tactile tokens, and `num_counted` is their sum over the windows
-    of a step, per process; `share` is that of these windows in those of the process.
+    `counted` weighs errors of tactile tokens, `num_counted` is their sum over the windows of a
+    step, per process; `share` is that of these windows.
     """
 
     inputs: ModelInputs
@@ -135,10 +133,7 @@ def examples_of(
     processes: Processes = ALONE,
     num_parts: int = 1,
 ) -> Examples:
-    """Windows with random times and noise.
-
-    The batches of all `processes` together are the whole one. Images are encoded in `num_parts`.
-    """
+    """Windows of this process with random times and noise; images are encoded in `num_parts`."""
     device = model.device
     inputs = model.with_past(build_inputs(batch.requests, model.config).to(device))
     if options.text_dropout or options.action_dropout:
@@ -179,11 +174,7 @@ def examples_of(
 
 
 def errors(model: JointWorldModel, examples: Examples, precision: Precision) -> Losses:
-    """Losses of examples.
-
-    They are contributions to those of the whole batch: of parts of it, which sum to that of a
-    process, and of processes, which have the whole one's as their mean.
-    """
+    """Losses of examples, which sum over parts to those of a process, whose mean is the batch's."""
     with products_in(precision, examples.t.device.type):
         guess = model(examples.inputs, examples.first, examples.noisy, examples.t)
     target = examples.target
@@ -206,11 +197,7 @@ def contact_or_changing(
     num_tokens: int,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> Bool[Tensor, "batch time 2 tokens"]:
-    """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
-
-    In contact: at least 2 kPa; changing: by at least 0.5 kPa. With six tokens these are those of
-    the five fingertips and the palm, with one that of the whole hand.
-    """
+    """Tokens with a taxel in contact (≥ 2 kPa), now or first, or changing by at least 0.5 kPa."""
     before = torch.cat([tactile_kpa[:, :1], tactile_kpa[:, :-1]], dim=1)
     contact = tactile_kpa >= CONTACT_THRESHOLD_KPA
     taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
@@ -238,13 +225,12 @@ def _with_noise(
 def own_context(
     model: JointWorldModel, batch: WindowBatch, *, generator: torch.Generator, processes: Processes
 ) -> WindowBatch:
-    """Windows of one chunk from windows of two.
+    """Windows of one chunk from windows of two: for half of the batches the second chunks.
 
-    Half of the batches are the second chunks, each with the last image and touch that the model
-    predicts for the first chunk; the others are the first chunks.
+    They have the last image and touch that the model predicts for the first chunk.
 
     Raises:
-        InvalidInputError: a model that is conditioned on contact geometry.
+        InvalidInputError: a model with contact geometry, further views or past images.
     """
     if model.config.use_contact_geometry:
         raise InvalidInputError(

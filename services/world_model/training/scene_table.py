@@ -113,10 +113,7 @@ class SceneTable:
         return self.tactile_kpa.shape[1]
 
     def movable(self) -> Float32[Tensor, "tasks objects"]:
-        """1 for objects that move in some labelled episode of their task, 0 for fixed ones.
-
-        One that is known at single steps alone, as by clicks, counts as moving.
-        """
+        """1 for objects that move in some labelled episode or are known once, 0 for fixed ones."""
         known = self.objects_known
         position_m, far = self.objects.position_m, torch.tensor(torch.inf)
         highest = torch.where(known[..., None], position_m, -far).amax(1)
@@ -265,8 +262,7 @@ def scene_table(
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
-    `labelled` says of each whether its object poses are trained on; by default all. `human_share`
-    of what is drawn is human; None: as their number says.
+    `labelled` says of each whether its object poses are trained on; by default all.
 
     Raises:
         InvalidInputError: no image of the first step, none later that all episodes have, too short
@@ -349,10 +345,7 @@ def _touch(
 def filled_touch(
     episode: EpisodeGrid,
 ) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
-    """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
-
-    They have the pressure of the nearest one of their pad that was measured, or none.
-    """
+    """Pressures (kPa) with unmeasured taxels as the nearest of their pad, and what was sampled."""
     touch_kpa, is_sampled = episode.touch()
     measured = episode.measured_taxels
     nearest = np.stack([_nearest_measured(hand, episode.tactile_layout) for hand in measured])

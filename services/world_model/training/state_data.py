@@ -1,9 +1,4 @@
-"""Episodes that a state model is trained and evaluated on, and their provenance.
-
-Poses of their objects are those of the twin, of markers or trackers, clicked in the first image, or
-given by touch (docs/objects.md). Where others of their task have poses, episodes without teach
-touch and outcome.
-"""
+"""Episodes that a state model is trained and evaluated on, and their provenance."""
 
 import hashlib
 from collections import Counter
@@ -55,10 +50,7 @@ _NEEDED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.TOUCH, nee
 
 
 class SceneGrid(EpisodeGrid):
-    """An episode on the model grid whose objects a file may list, and people may have clicked.
-
-    `objects` are its task's in a file that lists them, `clicked` poses at the first step.
-    """
+    """An episode whose objects a file may list, and people may have clicked at the first step."""
 
     def __init__(
         self,
@@ -163,8 +155,9 @@ def load_scene_episodes(
 ) -> list[SceneGrid]:
     """Episodes of stores that a state model can learn from, store by store.
 
-    All tasks, all splits, and people and robots, unless some are named. The middle square of images
-    that are larger than `image_px` is scaled to it. Clicks in the stores are used beside `clicks`.
+    The middle square of images larger than `image_px` is scaled to it. Clicks in the stores are
+    used beside `clicks`. Where others of their task have poses, episodes without teach touch and
+    outcome.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.
@@ -229,10 +222,7 @@ def _grid(
 
 @dataclass(frozen=True)
 class StateData:
-    """Episodes of training, of robots and people, and held-out ones.
-
-    Of data of both domains, those of robots alone are held out: rollouts are of robots.
-    """
+    """Episodes of training, and held-out ones: of robots alone if there are both domains."""
 
     training: Sequence[EpisodeGrid]
     heldout: Sequence[EpisodeGrid]
@@ -249,15 +239,11 @@ class StateData:
 
 
 def load_state_data(settings: StateTrainSettings) -> StateData:
-    """Read the episodes of a run.
-
-    Robot episodes are split before a subset of them is taken, so that every subset has the same
-    held-out episodes.
+    """Read the episodes of a run; the held-out ones are the same for all subsets.
 
     Raises:
         NotFoundError: an empty store, none that can be used, or clicks on an unknown episode.
-        ConflictError: an id is in two stores, two episodes are of one recording, or model rates
-            differ.
+        ConflictError: an id in two stores, two episodes of one recording, or several model rates.
         InvalidInputError: held-out scenes that are trained on, or too few episodes.
     """
     clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
@@ -292,10 +278,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
 
 
 def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
-    """Correct poses from touch by the takes of a task that have clicks, too, for each domain.
-
-    What a grip is stated to be is off by much the same in all takes.
-    """
+    """Correct poses from touch by takes of the task and domain with clicks: grips are off alike."""
     groups: dict[tuple[str, str, tuple[str, ...]], list[SceneGrid]] = {}
     for one in episodes:
         if isinstance(one, SceneGrid):
@@ -413,11 +396,7 @@ def configured(
 def _instructions(
     episodes: Sequence[EpisodeGrid], settings: StateTrainSettings, base: Base | None
 ) -> tuple[str, ...]:
-    """The sentences that cores learn to read; none if they read no instruction.
-
-    They do if some episodes have the same objects and another sentence: elsewhere the scene says
-    what is to be done.
-    """
+    """Sentences that cores read: none if each set of objects has but one, as the scene says it."""
     sentences = {one.about.instruction for one in episodes}
     base_reads = base is not None and bool(base.checkpoint.metadata.dynamics.instructions)
     scenes = {(one.object_names, one.about.instruction) for one in episodes}
@@ -458,9 +437,7 @@ def has_poses(episode: EpisodeGrid) -> bool:
 
 
 def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
-    """Mask of episodes whose object poses are trained on.
-
-    Of a scene, these are all takes that have poses, or none.
+    """Mask of episodes whose object poses are trained on: of a scene all takes with poses, or none.
 
     Raises:
         InvalidInputError: a task has none.

@@ -29,9 +29,9 @@ _SMALLEST_DISTANCE = 1e-3
 class StateFigures:
     """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
 
-    `figures` hold errors of readers (first member) and objects (median at the end of a chunk) in
-    mm, and contact F1 and error of touch for each chunk of 16 steps, also for repeating the touch
-    before it. Names with `from_16` are of rollouts from the ground truth at step 16.
+    `figures` hold errors of readers (first member) and objects (median at a chunk's end) in mm, and
+    contact F1 and error of touch by chunks of 16 steps. Names with `from_16` are of starts at step
+    16.
     """
 
     figures: dict[str, float]
@@ -67,10 +67,7 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
 def chunk_peaks(
     latents: Float32[Tensor, "episodes latents"], within: Bool[Tensor, "episodes latents"]
 ) -> Float32[Tensor, " chunks"]:
-    """Maximum over the latent steps of each chunk of 16 steps, which rollouts compare.
-
-    Chunks that reach beyond the end of an episode are left out.
-    """
+    """Maximum of each chunk of 16 steps that lies within its episode."""
     size = CHUNK_STEPS // STEPS_PER_LATENT
     pairs = zip(torch.split(latents, size, dim=1), torch.split(within, size, dim=1), strict=True)
     return torch.cat([chunk.amax(1)[inside.all(1)] for chunk, inside in pairs])

@@ -1,8 +1,4 @@
-"""Training of a state model: trains, evaluates and writes an ensemble from episode stores.
-
-Members are trained in separate processes and stored when they are finished, so that an interrupted
-run resumes with the missing ones.
-"""
+"""Training of a state model, whose parts are trained in processes, and stored to be resumed."""
 
 import hashlib
 import time
@@ -34,7 +30,7 @@ from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
-from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
+from services.world_model.rendering.renderer import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import core_training, state_data

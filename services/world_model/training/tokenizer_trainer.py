@@ -43,10 +43,7 @@ _Side = dict[str, list[tuple[np.ndarray, str]]]
 
 @dataclass(frozen=True)
 class TactileHands:
-    """Measured touch of the hands of some scenes, at the model rate.
-
-    `data_hash` is that of their episodes.
-    """
+    """Measured touch of hands of some scenes at the model rate, with the hash of their episodes."""
 
     tactile_kpa: Float32[np.ndarray, "hands taxels"]
     scenes: tuple[str, ...]
@@ -59,8 +56,7 @@ def load_hands(
 ) -> tuple[TactileHands, TactileHands]:
     """Training and held-out hands of all people and robots; a scene is on one side only.
 
-    Hands of steps without a measurement and imagined episodes are left out; single taxels that were
-    not measured are filled.
+    Steps without a measurement are left out; single taxels that were not measured are filled.
 
     Raises:
         InvalidInputError: either side has no scene, or the episodes are of several gloves.
@@ -104,8 +100,6 @@ def train_tokenizer(
     settings: TrainTokenizerSettings, on_evaluation: OnEvaluation | None = None
 ) -> TokenizerReport:
     """Train a tokenizer, evaluate it on held-out scenes and write it.
-
-    `on_evaluation` is called with the completed share and each new point of the curve.
 
     Raises:
         InvalidInputError: no scene to train on or none held out, or no touch at all.
@@ -202,11 +196,7 @@ def reconstruction_loss(
     *,
     contact_weight: float,
 ) -> Float32[Tensor, ""]:
-    """Weighted mean squared error of root pressures (kPa).
-
-    Taxels in contact have the weight `contact_weight`, the others, which are many more, 1. Roots
-    weight light touch like strong touch.
-    """
+    """Mean squared error of root pressures (√kPa), `contact_weight` times in contact."""
     error = tokenizer.roots(tokenizer.encode(tactile_kpa)) - root_pressure(tactile_kpa)
     weights = torch.where(tactile_kpa >= CONTACT_THRESHOLD_KPA, contact_weight, 1.0)
     return (weights * error.square()).sum() / weights.sum()

@@ -23,9 +23,8 @@ from services.networks.weight_files import on_device
 from services.world_model import checkpoints
 from services.world_model.network.codecs import to_unit
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
-from services.world_model.network.inputs import build_inputs
+from services.world_model.network.inputs import PastRule, build_inputs
 from services.world_model.network.model import JointWorldModel, from_first
-from services.world_model.network.past import PastRule
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.paper_settings import TrainSettings, command_line
 from services.world_model.pretrained_video import (
@@ -36,7 +35,7 @@ from services.world_model.pretrained_video import (
 )
 from services.world_model.training import dataset, episode_sets, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.episode_split import check_disjoint, load_split
+from services.world_model.training.episode_sets import check_disjoint, load_split
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import (
     LossOptions,
@@ -65,8 +64,7 @@ OnState = Callable[["TrainingRun"], None]
 class TrainingRun:
     """One run: network, averages of its learned weights, optimizer and clock.
 
-    Windows depend on the seed only, not on whether they are cut in memory or streamed from disk.
-    Averages that would equal the weights (`ema_decay` 0) are not kept.
+    Windows depend on the seed only. Averages that would equal the weights are not kept.
     """
 
     def __init__(
@@ -129,10 +127,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
-        """Fit everything in closed form: codecs, action statistics, residual scales.
-
-        A pretrained tokenizer is taken instead of fitting one.
-        """
+        """Fit codecs, unless a tokenizer is given, action statistics and residual scales."""
         model, config = self.model, self.settings.network
         fitted = [model.tokenizer, model.normalizer, *([] if config.wan else [model.codec])]
         for part in fitted:
@@ -156,9 +151,7 @@ class TrainingRun:
             part.to(model.device)
 
     def start_from(self, checkpoint: checkpoints.Checkpoint) -> None:
-        """Take over the weights and codecs of a checkpoint.
-
-        Its adapters are merged, unless the run has as large ones.
+        """Take over the weights and codecs of a checkpoint; unequal adapters are merged.
 
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
@@ -191,10 +184,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def whole_average(self) -> JointWorldModel | None:
-        """The averaged network with whole weights; None in all processes but the first.
-
-        Weights of the run become their averages, and adapters are merged, unless they are kept.
-        """
+        """The averaged network, its adapters merged unless kept; None in other processes."""
         for name, average in self._averages.items():
             self.learned[name].copy_(average)
         model = self.model
@@ -246,11 +236,7 @@ class TrainingRun:
     def run(
         self, on_progress: OnProgress | None = None, on_step: OnState | None = None
     ) -> list[TrainingProgress]:
-        """Train until the budget or the number of steps is used up; returns the loss log.
-
-        `on_progress` is called with every entry of the log, `on_step` with the run after every
-        step.
-        """
+        """Train until a limit; returns the loss log, of which `on_progress` gets each entry."""
         budget = self.budget
         budget.start()
         self.model.train()

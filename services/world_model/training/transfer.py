@@ -31,9 +31,7 @@ class Base:
         self._path, self.checkpoint = path, read_state_checkpoint(path)
 
     def configured(self, config: DynamicsConfig, *, keeps_tasks: bool) -> DynamicsConfig:
-        """A configuration with the shape of the base's networks, for the tasks of another one.
-
-        With `keeps_tasks`, they stay the base's, of which the episodes have some.
+        """A configuration with the shape of the base's networks, for another's tasks, or its own.
 
         Raises:
             InvalidInputError: images of another size, or another glove.
@@ -129,10 +127,7 @@ class Base:
 def _with_new_inputs(
     kept: dict[str, Tensor], own: DynamicsConfig, core: RecurrentCore
 ) -> dict[str, Tensor]:
-    """Weights of a core for one that also tells people from robots, or reads an instruction.
-
-    The new inputs, the last ones, have no effect at first, and people feel as robots do.
-    """
+    """Weights for a core with new inputs (people, an instruction), without effect at first."""
     shapes = {name: value.shape for name, value in core.named_parameters()}
     known = dict(kept)
     new_sentence = core.config.instruction_size - own.instruction_size
