@@ -32,7 +32,6 @@ from services.networks.weight_files import (
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.network.configuration import (
-    GloveNetworkConfig,
     NetworkConfig,
     RendererConfig,
     TokenizerName,
@@ -88,7 +87,7 @@ class CheckpointMetadata(FrozenModel):
 
     format_version: int = 1
     name: str
-    network: GloveNetworkConfig | NetworkConfig
+    network: NetworkConfig
     tasks: tuple[str, ...]
     command: str
     seed: int
@@ -310,8 +309,7 @@ def read_state_checkpoint(path: Path) -> StateCheckpoint:
     """Load a state model strictly, in float32 and evaluation mode.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
+        The errors of `read_checkpoint`.
     """
     tensors, metadata, digest = read_weights(path, StateMetadata, _STATE_KEY)
     dynamics = DynamicsModel(metadata.dynamics, metadata.num_members)
@@ -392,8 +390,7 @@ def read_tokenizer(path: Path) -> StoredTokenizer:
     """Load a tokenizer strictly, in float32 and evaluation mode, with one token per hand.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
+        The errors of `read_checkpoint`.
     """
     tensors, metadata, digest = read_weights(path, TokenizerMetadata, _TOKENIZER_KEY)
     tokenizer = build_tokenizer(metadata.network(NetworkConfig()))

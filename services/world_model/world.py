@@ -21,19 +21,17 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.tactile.layout import described
-from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout, asked_cameras
+from dextouch.worlds import StartedRollout, SteppedRollout, asked_cameras
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints, starts
 from services.world_model.devices import claimed_device
 from services.world_model.dynamics.features import FREE_KPA, NUM_POINTS, hand_motion
-from services.world_model.dynamics.model import REST_LATENTS, Stillness, stillness
+from services.world_model.dynamics.model import REST_LATENTS, stillness
 from services.world_model.network.attention import split_axis
 from services.world_model.network.codecs import WanVideoCodec, to_uint8, to_unit
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
-    GloveNetworkConfig,
     NetworkConfig,
-    Precision,
 )
 from services.world_model.network.inputs import (
     ACTION_KINDS,
@@ -117,10 +115,10 @@ class ModelState(starts.ObservedStart):
     further: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
 
-class ModelWorld(BatchWorld[ModelState]):
+class ModelWorld(starts.PredictedWorld[ModelState]):
     """A flow-matching model as a world.
 
-    `precision` is that of the experts' matrix products. With contact geometry, `reader` finds
+    With contact geometry, `reader` finds
     objects at a chunk's start. A scene is at rest, bit for bit and without the network, in chunks
     without motion that follow two seconds without motion, or a start at which the hands touch
     nothing.
@@ -135,13 +133,11 @@ class ModelWorld(BatchWorld[ModelState]):
         checkpoint: checkpoints.Checkpoint,
         *,
         sampling: Sampling | None = None,
-        precision: Precision = "float32",
         reader: starts.SceneReader | None = None,
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
         self._sampling = sampling
-        self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._horizon_latents = metadata.horizon_latents
         self._needs_views = not metadata.view_dropout
@@ -162,15 +158,8 @@ class ModelWorld(BatchWorld[ModelState]):
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
             predicts_touch=config.use_touch,
-            tactile_layout=(
-                config.tactile_layout if isinstance(config, GloveNetworkConfig) else None
-            ),
+            tactile_layout=None if config.layout is None else config.tactile_layout,
         )
-
-    @property
-    def description(self) -> WorldDescription:
-        """Capabilities and limits of this world."""
-        return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[ModelState]:
         """Start a rollout from one observed step.
@@ -212,32 +201,26 @@ class ModelWorld(BatchWorld[ModelState]):
         observation.images.update({name: image[None] for name, image in further.items()})
         return StartedRollout(state, observation, first.anchor, first.K_head)
 
-    def step_batch(
+    def _stepped(
         self,
         states: Sequence[ModelState],
-        actions: Float64[np.ndarray, "batch steps 67"],
-        *,
+        chunks: list[np.ndarray],
         seeds: Sequence[int],
-        selectors: Sequence[ReturnSelector] | None = None,
+        requested: list[ReturnSelector],
     ) -> list[SteppedRollout[ModelState]]:
-        """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            EndedError: hands or camera have moved four times as long as any episode of training.
-            UnavailableError: the model returned NaN or infinity.
-        """
-        requested = starts.checked_selectors(states, actions, seeds, selectors)
         for state, selector in zip(states, requested, strict=True):
-            starts.refuse_ended(state.num_moving, self._horizon_latents, self._description)
             if absent := {*(selector.cameras or ())} - {HEAD_CAMERA, *state.further}:
                 raise InvalidInputError(
                     f"chunk: got a request for {', '.join(sorted(absent))}, expected views that "
                     "the rollout began with; send their images with its start"
                 )
-        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
-        still = _stillness(states, chunks)
+        pairs = zip(states, chunks, strict=True)
+        commanded_m = np.stack([_watched_points(chunk, state.anchor) for state, chunk in pairs])
+        still = stillness(
+            torch.from_numpy(np.stack([state.still_m for state in states])),
+            torch.tensor([state.num_still for state in states]),
+            split_axis(torch.from_numpy(commanded_m), 1, (-1, FRAMES_PER_LATENT)),
+        )
         rests = still.at_rest.all(dim=1).tolist()
         each = zip(states, chunks, seeds, requested, strict=True)
         futures = iter(
@@ -276,9 +259,7 @@ class ModelWorld(BatchWorld[ModelState]):
         wanted = any(
             one.steps == "all" and (one.wants(HEAD_CAMERA) or one.cameras) for one in requested
         )
-        future = self._model.predict(
-            inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
-        )
+        future = self._model.predict(inputs, noise, sampling=self._sampling, all_images=wanted)
         starts.refuse_non_finite(
             "world model",
             {"image": future.images, "touch": future.tactile_kpa, "view": future.further},
@@ -492,17 +473,6 @@ def _watched_points(
         motion = hand_motion(actions, anchor)
         camera_m = apply(motion.Ts_world_camera, _CAMERA_POINTS_M).astype(np.float32)
     return np.concatenate([motion.points_m, np.stack([camera_m, camera_m], axis=1)], axis=2)
-
-
-def _stillness(states: Sequence[ModelState], chunks: Sequence[np.ndarray]) -> Stillness:
-    """Latent steps of the chunks in which hands or camera move, and which are at rest."""
-    each = zip(states, chunks, strict=True)
-    commanded_m = np.stack([_watched_points(chunk, state.anchor) for state, chunk in each])
-    return stillness(
-        torch.from_numpy(np.stack([state.still_m for state in states])),
-        torch.tensor([state.num_still for state in states]),
-        split_axis(torch.from_numpy(commanded_m), 1, (-1, FRAMES_PER_LATENT)),
-    )
 
 
 def _kept_of(arrays: dict[str, np.ndarray], config: NetworkConfig) -> KeptImages | None:

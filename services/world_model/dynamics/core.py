@@ -406,8 +406,9 @@ def _ending_features(
     """
     z, x = axes.unbind(-2)
     R = torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
-    each = torch.cat([about, axes.flatten(3), compressed(position), _across_and_up(way)], dim=-1)
-    parts = [(each * present[..., None]).flatten(2)]
+    lengths = torch.cat([way[..., :2].norm(dim=-1, keepdim=True), way[..., 2:]], dim=-1)
+    each = [about, axes.flatten(3), compressed(position), compressed(lengths)]
+    parts = [(torch.cat(each, dim=-1) * present[..., None]).flatten(2)]
     for a, b in _PAIRS:
         apart = position[..., b, :] - position[..., a, :]
         from_a, from_b = (
@@ -419,11 +420,6 @@ def _ending_features(
         there = present[..., a, None] * present[..., b, None]
         parts.append(torch.cat([*distances, *cosines], dim=-1) * there)
     return torch.cat(parts, dim=-1)
-
-
-def _across_and_up(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 2"]:
-    across_m = offset_m[..., :2].norm(dim=-1, keepdim=True)
-    return compressed(torch.cat([across_m, offset_m[..., 2:]], dim=-1))
 
 
 def _with_length_across(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 4"]:

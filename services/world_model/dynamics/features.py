@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Shaped
+from jaxtyping import Float, Float32, Float64, Shaped
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
@@ -301,25 +301,17 @@ def poses_from_objects(objects: ObjectPoses) -> Float64[np.ndarray, "*batch obje
 
     Where x is unknown (near zero or along z), any perpendicular direction is taken.
     """
-    axes = objects.axes.double().numpy()
-    z = _unit(axes[..., 0, :], np.array([0.0, 0.0, 1.0]))
-    x = axes[..., 1, :] - z * (axes[..., 1, :] * z).sum(-1, keepdims=True)
-    helper = np.where(np.abs(z[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    fallback = helper - z * (helper * z).sum(-1, keepdims=True)
-    fallback /= np.linalg.norm(fallback, axis=-1, keepdims=True)
-    x = _unit(x, fallback)
-    R = np.stack([x, np.cross(z, x), z], axis=-1)
+    R = rotations(objects.axes.double()).numpy()
     return pose_from_transform(transform(R, objects.position_m.double().numpy()))
 
 
-def rotations(axes: Float32[Tensor, "*batch 2 3"]) -> Float32[Tensor, "*batch 3 3"]:
-    """R_world_object nearest to predicted axes, as `poses_from_objects`, for networks."""
-    z = _direction(axes[..., 0, :], torch.tensor([0.0, 0.0, 1.0]))
+def rotations(axes: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """R_world_object nearest to predicted axes, as of `poses_from_objects`."""
+    along, across, up = torch.eye(3, dtype=axes.dtype)
+    z = _direction(axes[..., 0, :], up)
     x = axes[..., 1, :]
     x = x - z * (x * z).sum(-1, keepdim=True)
-    helper = torch.where(
-        z[..., :1].abs() < 0.9, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])
-    )
+    helper = torch.where(z[..., :1].abs() < 0.9, along, across)
     x = _direction(x, functional.normalize(helper - z * (helper * z).sum(-1, keepdim=True), dim=-1))
     return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
 
@@ -327,11 +319,6 @@ def rotations(axes: Float32[Tensor, "*batch 2 3"]) -> Float32[Tensor, "*batch 3 
 def _direction(vectors: Tensor, otherwise: Tensor) -> Tensor:
     length = vectors.norm(dim=-1, keepdim=True)
     return torch.where(length > _SHORTEST, vectors / length.clamp_min(_SHORTEST), otherwise)
-
-
-def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
 
 
 def principal_axes(

@@ -111,10 +111,7 @@ class ActionTokens(nn.Module):
 
     def __init__(self, *, num_steps: int, width: int) -> None:
         super().__init__()
-        self.parts = nn.ModuleList(
-            nn.Sequential(nn.Linear(dim, width), nn.SiLU(), nn.Linear(width, width))
-            for dim in PART_DIMS
-        )
+        self.parts = nn.ModuleList(two_layers(dim, width, width) for dim in PART_DIMS)
         self.steps = nn.Parameter(0.02 * torch.randn(num_steps, 1, width))
 
     def forward(
@@ -361,6 +358,13 @@ class JointLayer(nn.Module):
 def modulated_norm(tokens: _Rows, shift: _Rows, scale: _Rows) -> _Rows:
     """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
+
+
+def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequential:
+    """Linear, SiLU, linear."""
+    return nn.Sequential(
+        nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
+    )
 
 
 def zero_linear(in_width: int, out_width: int) -> nn.Linear:

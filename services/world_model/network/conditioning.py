@@ -16,6 +16,7 @@ from services.world_model.network.attention import (
     HAND_DIM,
     ActionTokens,
     split_axis,
+    two_layers,
     zero_linear,
 )
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
@@ -267,13 +268,6 @@ class SceneEncoder(nn.Module):
         views = torch.cat([both, split_axis(ends, 0, (-1, 2))], dim=2)
         views = torch.stack([views[:, 0].flip(-1), views[:, 1]], dim=1)
         return split_axis(self.layers(views.flatten(0, 1)), 0, (-1, 2))
-
-
-def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequential:
-    """Linear, SiLU, linear."""
-    return nn.Sequential(
-        nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
-    )
 
 
 def without_dropped(

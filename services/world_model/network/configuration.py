@@ -1,6 +1,6 @@
 """Shapes of the joint model, of the Wan2.2 networks and of the renderer, stored in checkpoints."""
 
-from functools import cached_property
+from functools import cache
 from operator import not_
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -227,25 +227,17 @@ class NetworkConfig(FrozenModel):
     )
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
+    # Of another glove than `dextouch_v1`; training data say it.
+    layout: CliSuppress[LayoutDescription | None] = Field(default=None, exclude_if=not_)
 
     @property
     def tactile_layout(self) -> "TactileLayout":
         """Layout of the taxels that the network feels."""
-        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
-
-        return DEXTOUCH_V1
+        return _layout(self.layout)
 
     def with_layout(self, layout: "TactileLayout") -> "NetworkConfig":
         """The configuration of a network for the taxels of another glove."""
-        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
-
-        if layout == self.tactile_layout:
-            return self
-        known = {name: getattr(self, name) for name in NetworkConfig.model_fields}
-        if layout == DEXTOUCH_V1:
-            return NetworkConfig.model_construct(self.model_fields_set - {"layout"}, **known)
-        fields_set = self.model_fields_set | {"layout"}
-        return GloveNetworkConfig.model_construct(fields_set, **known, layout=layout)
+        return self.model_copy(update={"layout": None if layout == _layout(None) else layout})
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
@@ -335,28 +327,18 @@ class NetworkConfig(FrozenModel):
         """Channels of one visual token: four patches."""
         return 4 * self.codec_channels
 
-    @property
-    def max_latents(self) -> int:
-        """Latent frames of the longest window."""
-        return num_latents(self.max_steps)
-
 
 def num_latents(num_steps: int) -> int:
     """Latent frames of 1 + 4k steps: the first step alone, then groups of four."""
     return 1 + (num_steps - 1) // FRAMES_PER_LATENT
 
 
-class GloveNetworkConfig(NetworkConfig):
-    """Shape of a joint model of a glove other than `dextouch_v1`; training data say its layout."""
+@cache
+def _layout(description: LayoutDescription | None) -> "TactileLayout":
+    from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout  # not for a parser
 
-    layout: LayoutDescription
-
-    @cached_property
-    def tactile_layout(self) -> "TactileLayout":
-        """Layout of the taxels that the network feels."""
-        from dextouch.tactile.layout import TactileLayout  # not for a parser
-
-        return TactileLayout.model_validate(self.layout.model_dump())
+    known = None if description is None else description.model_dump()
+    return DEXTOUCH_V1 if known is None else TactileLayout.model_validate(known)
 
 
 class RendererConfig(FrozenModel):
@@ -373,8 +355,3 @@ class RendererConfig(FrozenModel):
     redraws_table: bool = Field(
         default=True, description="redraw the whole image when only the camera moves"
     )
-
-    @property
-    def pixel_multiple(self) -> int:
-        """Sides of images must be multiples of this."""
-        return 2 ** len(self.widths)

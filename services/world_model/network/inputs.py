@@ -284,16 +284,14 @@ class ModelInputs:
     def first_step_keys(self) -> list[bytes]:
         """A digest of all of each window that is known at its first step, without later actions."""
         known = (self.first_image, self.first_tactile_kpa, self.layout, self.raster[:, 0])
-        further = (self.further_images, self.missing, *self._of_past())
+        past = [one for name, one in vars(self).items() if name.startswith("past_")]
+        further = (self.further_images, self.missing, *past)
         arrays = [one.cpu().numpy() for one in (*known, self.commanded, self.words, *further)]
         digests = []
         for index, text in enumerate(self.instructions):
             parts = [text.encode(), *(array[index].tobytes() for array in arrays)]
             digests.append(hashlib.sha256(b"".join(parts)).digest())
         return digests
-
-    def _of_past(self) -> tuple[Tensor, ...]:
-        return tuple(one for name, one in vars(self).items() if name.startswith("past_"))
 
     def rows(self, indices: Sequence[int]) -> "ModelInputs":
         """Some of the windows."""

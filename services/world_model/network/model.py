@@ -251,14 +251,8 @@ class JointWorldModel(nn.Module):
         """Clean latents of recorded windows, or residuals, in units of their deviation."""
         shown = images[:, None] if further is None else torch.cat([images[:, None], further], dim=1)
         video = from_first(self._encoded(shown), self.config.video_target)
-        return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
-
-    def tactile_targets(
-        self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
-    ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
-        """Clean tactile latents; as `targets`."""
-        tactile = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
-        return tactile / self.tactile_residual_std
+        touch = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
+        return JointLatents(video / self.video_residual_std, touch / self.tactile_residual_std)
 
     def forward(
         self,
@@ -385,46 +379,37 @@ class JointWorldModel(nn.Module):
         *,
         sampling: Sampling | None = None,
         all_images: bool = True,
-        precision: Precision = "float32",
     ) -> Prediction:
-        """Sample a future for every request, with its `noise`; of the images all, or the last ones.
-
-        `precision` is that of the experts' matrix products (autocast); codecs always use float32.
-        """
+        """Sample a future for every request, with its `noise`; of the images all, or the last."""
         inputs, sampling = self.with_past(inputs.to(self.device)), sampling or Sampling()
         noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
         conditions = inputs
         if sampling.guidance != 1.0:
             everything = torch.ones(num_windows, dtype=torch.bool, device=self.device)
             conditions = inputs.joined(inputs.without(everything, everything))
-        first, kept = self._observe(conditions, noise, sampling, precision)
-        clean = self.sample(conditions, first, noise, sampling, precision=precision, kept=kept)
+        first, kept = self._observe(conditions, noise, sampling)
+        clean = self.sample(conditions, first, noise, sampling, kept=kept)
         first = mapped(first, lambda one: one[:num_windows])
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
         return replace(future, tactile_kpa=touch)
 
     def _observe(
-        self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling, precision: Precision
+        self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling
     ) -> tuple[FirstLatents, CleanTokens | None]:
         """First latents, and clean tokens where those of earlier chunks are kept."""
         if self._observed is None or not sampling.keep_context:
             return self.first_latents(inputs), None
 
         def compute(rows: list[int]) -> list[Observed]:
-            some, noisy = (
-                inputs.rows(rows),
-                mapped(noise, lambda one: one[:1].expand(len(rows), *one.shape[1:])),
-            )
+            some = inputs.rows(rows)
+            noisy = mapped(noise, lambda one: one[:1].expand(len(rows), *one.shape[1:]))
             first = self.first_latents(some)
-            with products_in(precision, self.device.type):
-                clean = self.clean_tokens(self.context(some, first), noisy)
-            whole = Observed(first, clean)
+            whole = Observed(first, self.clean_tokens(self.context(some, first), noisy))
             each = torch.split(torch.arange(len(rows), device=self.device), 1)
             return [mapped(whole, partial(torch.index_select, dim=0, index=row)) for row in each]
 
-        keys = [(precision, key) for key in inputs.first_step_keys()]
-        found = combined(self._observed.of(keys, compute), torch.cat)
+        found = combined(self._observed.of(inputs.first_step_keys(), compute), torch.cat)
         return found.first, found.clean
 
     @torch.no_grad()
@@ -435,7 +420,6 @@ class JointWorldModel(nn.Module):
         noise: JointLatents,
         sampling: Sampling,
         *,
-        precision: Precision = "float32",
         kept: CleanTokens | None = None,
     ) -> JointLatents:
         """Sample clean latents.
@@ -443,7 +427,7 @@ class JointWorldModel(nn.Module):
         With guidance, `inputs` and `first` are those of all windows, followed by the same without
         their instructions and actions. `kept` are clean tokens that are known already.
         """
-        device, is_guided = self.device, sampling.guidance != 1.0
+        is_guided = sampling.guidance != 1.0
         num_steps = sampling.num_steps or self.config.sampling_steps
 
         def all_of(latents: Tensor) -> Tensor:
@@ -451,20 +435,18 @@ class JointWorldModel(nn.Module):
 
         context: Context | None = None
         if sampling.keep_context and (num_steps > 1 or kept is not None):
-            with products_in(precision, device.type):
-                context = self.context(inputs, first)
-                kept = kept or self.clean_tokens(context, mapped(noise, all_of))
-                context = replace(context, clean=kept)
+            context = self.context(inputs, first)
+            kept = kept or self.clean_tokens(context, mapped(noise, all_of))
+            context = replace(context, clean=kept)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            with products_in(precision, device.type):
-                noisy, times = JointLatents(all_of(video), all_of(tactile)), all_of(t)
-                # Weights that are sharded over processes are there in `forward` only.
-                guess = (
-                    self(inputs, first, noisy, times)
-                    if context is None
-                    else self.denoise(context, noisy, times)
-                )
+            noisy, times = JointLatents(all_of(video), all_of(tactile)), all_of(t)
+            # Weights that are sharded over processes are there in `forward` only.
+            guess = (
+                self(inputs, first, noisy, times)
+                if context is None
+                else self.denoise(context, noisy, times)
+            )
             found = guess.video.float(), guess.tactile.float()
             if is_guided:
                 (conditioned, unconditional), touch = (one.chunk(2) for one in found)

@@ -19,6 +19,7 @@ from services.world_model.network.attention import (
     modulated_norm,
     rotate,
     split_axis,
+    two_layers,
     video_positions,
     zero_linear,
 )
@@ -30,7 +31,6 @@ from services.world_model.network.conditioning import (
     Condition,
     PastCondition,
     after_first,
-    two_layers,
     without_dropped,
 )
 from services.world_model.network.configuration import (
@@ -39,6 +39,7 @@ from services.world_model.network.configuration import (
     RASTER_CELLS_PER_TOKEN,
     NetworkConfig,
     WanConfig,
+    num_latents,
 )
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import LastUsed, TextFeatures
@@ -66,7 +67,7 @@ class VideoExpert(nn.Module):
         self.embed = nn.Linear((1 + self.is_anchored) * config.video_channels, width)
         self.embed_raster = nn.Linear(raster_width, width, bias=False)
         self.places = nn.Parameter(0.02 * torch.randn(config.tokens_per_latent, width))
-        self.frames = nn.Parameter(0.02 * torch.randn(config.max_latents, 1, width))
+        self.frames = nn.Parameter(0.02 * torch.randn(num_latents(config.max_steps), 1, width))
         self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
         self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
         self.predict = zero_linear(width, config.video_channels)

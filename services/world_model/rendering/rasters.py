@@ -33,6 +33,7 @@ _OPACITY = 1.6
 _PALM_ROWS, _PALM_COLUMNS = 7, 9
 _WRIST, _FOREARM_END = 0, 21
 _KNUCKLES = (5, 9, 13, 17)
+_Mixture = Float64[np.ndarray, "points 22"]
 
 
 @dataclass(frozen=True)
@@ -229,15 +230,6 @@ def colours_at_positions(
 
 
 @dataclass(frozen=True)
-class _Ribbons:
-    """Fixed weights of a hand's points over 22 base points, and their offsets across ribbons."""
-
-    mixture: Float64[np.ndarray, "points 22"]
-    direction: Float64[np.ndarray, "points 22"]
-    lateral_m: Float64[np.ndarray, " points"]
-
-
-@dataclass(frozen=True)
 class HandPoints:
     """Points of both hands in an image: pixels, depths, and which are in front of the camera."""
 
@@ -256,7 +248,8 @@ class HandRaster:
 
 
 @cache
-def _ribbons() -> _Ribbons:
+def _ribbons() -> tuple[_Mixture, _Mixture, Float64[np.ndarray, " points"]]:
+    """Weights of a hand's points over 22 base points, and their direction and offset (m)."""
     bones = [(1 + 4 * f + j, 2 + 4 * f + j, _BONE_RADIUS_M, 5) for f in range(5) for j in range(3)]
     bones += [(_WRIST, 1, _BONE_RADIUS_M, 5), (_WRIST, _FOREARM_END, _FOREARM_RADIUS_M, 5)]
     mixture, direction, lateral = [], [], []
@@ -281,7 +274,7 @@ def _ribbons() -> _Ribbons:
             mixture.append(row)
             direction.append(np.zeros(22))
             lateral.append(0.0)
-    return _Ribbons(np.array(mixture), np.array(direction), np.array(lateral))
+    return np.array(mixture), np.array(direction), np.array(lateral)
 
 
 def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
@@ -300,16 +293,16 @@ def project_hands(
     middle_only: bool = False,
 ) -> HandPoints:
     """Project all points of both hands into a camera, with `middle_only` all on their bones."""
-    ribbons = _ribbons()
+    mixture, direction, lateral_m = _ribbons()
     base = apply(invert(T_world_camera)[:, None], base_world)
     # Vectors are [3, n, 2, points]: one block of numbers per axis is much faster to compute with.
     axes = np.ascontiguousarray(np.moveaxis(base, -1, 0))
-    points = axes @ ribbons.mixture.T
+    points = axes @ mixture.T
     if not middle_only:
-        (ax, ay, az), (x, y, z) = axes @ ribbons.direction.T, points
+        (ax, ay, az), (x, y, z) = axes @ direction.T, points
         sideways = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
         length = np.sqrt((sideways**2).sum(axis=0))
-        points = points + sideways * (ribbons.lateral_m / np.maximum(length, 1e-9))
+        points = points + sideways * (lateral_m / np.maximum(length, 1e-9))
     depth = points[2]
     pixels = np.einsum("nij,jnsp->nspi", K[:, :2], points)
     pixels /= np.maximum(depth, MIN_DEPTH_M)[..., None]

@@ -9,7 +9,6 @@ import functools
 import statistics
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -24,6 +23,7 @@ from torch.nn import functional
 
 from services.world_model.dynamics.trees import Traced, mapped
 from services.world_model.network.configuration import RendererConfig
+from services.world_model.network.instruction import LastUsed
 from services.world_model.rendering.inputs import (
     COARSE_CHANNELS,
     FINE_CHANNELS,
@@ -208,14 +208,14 @@ class Renderer:
                 weight.data = weight.data.contiguous(memory_format=torch.channels_last)
         call = self._network.__call__
         self._paint = Traced(self._network, call, lambda inputs: inputs.fine.shape)
-        # A rollout draws all its chunks from one start. Those used last are at the end.
-        self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
+        # A rollout draws all its chunks from one start.
+        self._starts = LastUsed[PreparedScenes](_KEPT_STARTS)
         self._lock = threading.Lock()
 
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
         """Draw images of any number of rollouts; together as alone, except for rounding.
 
-        Sides of start images are multiples of `pixel_multiple`. Where nothing moved, they are
+        Sides of start images are multiples of 2^(number of widths). Where nothing moved, they are
         returned.
         """
         if not drawings:
@@ -263,10 +263,4 @@ class Renderer:
         arrays += [getattr(scenes.states, field.name) for field in fields(scenes.states)]
         key = b"".join(array.tobytes() for array in arrays) + str(scenes.images.shape).encode()
         with self._lock:
-            prepared = self._starts.get(key)
-            if prepared is None:
-                prepared = self._starts[key] = PreparedScenes.of(copy.deepcopy(scenes))
-            self._starts.move_to_end(key)
-            if len(self._starts) > _KEPT_STARTS:
-                self._starts.popitem(last=False)
-        return prepared
+            return self._starts.of([key], lambda _: [PreparedScenes.of(copy.deepcopy(scenes))])[0]

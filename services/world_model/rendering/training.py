@@ -90,7 +90,7 @@ class RendererRun:
         rng: np.random.Generator,
     ) -> None:
         sizes = {clip.images.shape[1:3] for clip in clips}
-        multiple = config.pixel_multiple
+        multiple = 2 ** len(config.widths)
         if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):
             raise InvalidInputError(
                 f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, "

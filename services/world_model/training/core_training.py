@@ -177,10 +177,14 @@ def _read_start(
     shift = torch.randn(true.position_m.shape, generator=generator) * sd_m[..., None]
     shift[..., 2] *= 0.3
     turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
+    # Sizes have the noise of a reader, too.
+    size, normal = data.table.size[rows], torch.randn
+    size_sd = _SIZE_SD * torch.rand((len(rows), 1, 1), generator=generator)
+    size = size * (size_sd * normal(size.shape, generator=generator)).exp()
     noisy = Reading(
         ObjectPoses(true.position_m + shift, true.axes + turn, true.present),
         torch.hypot(sd_m, data.table.placed_sd_m[rows]),
-        _read_size(data.table.size[rows], generator),
+        size,
     )
     known = data.table.labelled[rows] & data.table.knows_all(start_step)[rows]
     known &= ~data.table.touched[rows] & (not data.starts_read)
@@ -188,14 +192,6 @@ def _read_start(
         return noisy
     read: Reading = mapped(data.readings[start_step], lambda values: values[rows])
     return chosen(known, noisy, read)
-
-
-def _read_size(
-    true: Float32[Tensor, "batch objects 2"], generator: torch.Generator
-) -> Float32[Tensor, "batch objects 2"]:
-    """Sizes with the noise of a reader, whose standard deviation is up to `_SIZE_SD`."""
-    sd = _SIZE_SD * torch.rand((len(true), 1, 1), generator=generator)
-    return true * (sd * torch.randn(true.shape, generator=generator)).exp()
 
 
 def _held_still(part: Part, held: Bool[Tensor, " batch"]) -> Part:
@@ -223,7 +219,7 @@ def core_loss(
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
     counted = table.measured_within(rows, batch.start_step)
-    latents = table.latent_steps(batch.start_step)
+    latents = torch.arange(batch.start_step, table.num_steps, STEPS_PER_LATENT)
     true = mapped(table.objects, lambda values: values[rows][:, latents])
     true = replace(_held_still(true, batch.is_held), present=true.present)
     known = start.objects.present[:, None] * table.labelled[rows, None, None]

@@ -272,7 +272,9 @@ def read_episode(
         scene=grid.scene,
         images=grid.images(range(len(grid))),
         further=tuple(
-            grid.images(range(len(grid)), view) if has_view(reader, view) else None
+            grid.images(range(len(grid)), view)
+            if view in reader.streams and reader.has_every_image(view)
+            else None
             for view in further_views
         ),
         tactile_kpa=tactile_kpa,
@@ -289,11 +291,6 @@ def read_episode(
         measured_taxels=grid.measured_taxels,
         tactile_layout=grid.tactile_layout,
     )
-
-
-def has_view(reader: EpisodeReader, camera: str) -> bool:
-    """Whether an episode has images of a further view at nearly every step."""
-    return camera in reader.streams and reader.has_every_image(camera)
 
 
 @lru_cache(maxsize=MAX_OPEN_READERS)
@@ -409,15 +406,11 @@ class WindowSampler:
         """The windows at these places."""
         return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
 
-    def _episode_index(self) -> int:
-        if self._human_share is None:
-            return int(self._rng.integers(len(self._episodes)))
-        is_human = self._rng.random() < self._human_share
-        chosen = self._human if is_human else self._robot
-        return chosen[int(self._rng.integers(len(chosen)))]
-
     def _place(self, num_steps: int) -> WindowPosition:
-        index = self._episode_index()
+        able: Sequence[int] = range(len(self._episodes))
+        if self._human_share is not None:
+            able = self._human if self._rng.random() < self._human_share else self._robot
+        index = able[int(self._rng.integers(len(able)))]
         episode = self._episodes[index]
         starts = window_starts(episode, num_steps)
         start = int(starts[self._rng.integers(len(starts))])

@@ -18,14 +18,7 @@ from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from services.world_model.network.codecs import to_uint8, to_unit
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.training.dataset import (
-    EpisodeArrays,
-    TrainingEpisode,
-    Window,
-    WindowPosition,
-    stack_windows,
-    window_starts,
-)
+from services.world_model.training import dataset
 
 BATCH = 24
 Item = TypeVar("Item")
@@ -43,7 +36,7 @@ class Futures:
 
 def evaluate_prediction(
     model: JointWorldModel,
-    episodes: Sequence[EpisodeArrays],
+    episodes: Sequence[dataset.EpisodeArrays],
     *,
     train_fingerprints: Sequence[str],
     stride: int = 8,
@@ -65,7 +58,7 @@ def evaluate_prediction(
     places = [
         (episode, start)
         for episode in episodes
-        for start in window_starts(episode, model.config.max_steps).tolist()
+        for start in dataset.window_starts(episode, model.config.max_steps).tolist()
         if start % stride == 0
     ]
     if not places:
@@ -103,7 +96,12 @@ def evaluate_prediction(
         right = Futures(truth.images[kept], truth.tactile_kpa[kept], measured, truth.layout)
         figures |= _figures(wrong, right, "_other_take")
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
-        still = [_standing_still(request, head_moves=head_moves) for request in requests]
+        still = []
+        for request in requests:
+            actions = np.repeat(request.actions[:1], steps, axis=0)
+            if head_moves:
+                actions[:, CAMERA_HEAD] = request.actions[:, CAMERA_HEAD]
+            still.append(replace(request, actions=actions))
         figures |= _figures(predict_all(model, still), truth, suffix)
     if not model.config.use_touch:
         figures = {name: value for name, value in figures.items() if name.startswith("psnr")}
@@ -111,7 +109,7 @@ def evaluate_prediction(
 
 
 def refuse_trained(
-    episodes: Sequence[TrainingEpisode], train_fingerprints: Collection[str], model: str
+    episodes: Sequence[dataset.TrainingEpisode], train_fingerprints: Collection[str], model: str
 ) -> None:
     """Raise if a model was trained on any of the episodes, by the hash of their content."""
     trained = set(train_fingerprints)
@@ -152,14 +150,16 @@ def _in_batches(
     )
 
 
-def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
+def _cut(
+    episode: dataset.EpisodeArrays, start: int, num_steps: int, kind: ActionKind
+) -> dataset.Window:
     available: ActionKind = kind if kind in episode.actions else "measured"
-    return episode.cut(WindowPosition(0, start, num_steps, available))
+    return episode.cut(dataset.WindowPosition(0, start, num_steps, available))
 
 
-def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
-    def decoded(part: Sequence[Window], _: int) -> tuple[Tensor, Tensor]:
-        batch = stack_windows(part)
+def _through_codec(model: JointWorldModel, windows: Sequence[dataset.Window]) -> Futures:
+    def decoded(part: Sequence[dataset.Window], _: int) -> tuple[Tensor, Tensor]:
+        batch = dataset.stack_windows(part)
         shown, felt = batch.images.to(model.device), batch.tactile_kpa.to(model.device)
         images: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
         touch = model.tokenizer.decode(model.tokenizer.encode(felt))
@@ -169,12 +169,12 @@ def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures
 
 
 def _actions_of_other_takes(
-    places: Sequence[tuple[EpisodeArrays, int]],
+    places: Sequence[tuple[dataset.EpisodeArrays, int]],
     requests: Sequence[PredictionRequest],
     kind: ActionKind,
 ) -> list[tuple[int, PredictionRequest]]:
     """Each request with the actions of the next episode of its task at the same time."""
-    by_task: dict[str, list[EpisodeArrays]] = {}
+    by_task: dict[str, list[dataset.EpisodeArrays]] = {}
     for episode, _ in places:
         if all(episode is not known for known in by_task.setdefault(episode.task, [])):
             by_task[episode.task].append(episode)
@@ -189,14 +189,6 @@ def _actions_of_other_takes(
             swapped = replace(request, actions=taken.actions, action_kind=taken.action_kind)
             others.append((index, swapped))
     return others
-
-
-def _standing_still(request: PredictionRequest, *, head_moves: bool) -> PredictionRequest:
-    """The request with its first action repeated, optionally except for the head."""
-    actions = np.repeat(request.actions[:1], len(request.actions), axis=0)
-    if head_moves:
-        actions[:, CAMERA_HEAD] = request.actions[:, CAMERA_HEAD]
-    return replace(request, actions=actions)
 
 
 def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:

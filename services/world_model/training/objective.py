@@ -6,7 +6,8 @@ half the batches are predicted, and noisy latents are those that the sampler rea
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from functools import partial
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float32
@@ -38,7 +39,6 @@ from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
 
 TouchLoss = Literal["all", "contact_or_changing"]
-_Part = TypeVar("_Part")
 # A taxel that differs by this much from the step before is changing.
 CHANGE_KPA = 0.5
 OWN_CONTEXT_SHARE = 0.5
@@ -93,35 +93,13 @@ class Examples:
         """The windows in equal parts, whose losses sum to that of all."""
         size = len(self.t) // count
         for start in range(0, len(self.t), size):
-            yield self._rows(range(start, start + size), self.share / count)
-
-    def _rows(self, rows: range, share: float) -> "Examples":
-        def own(part: _Part) -> _Part:
-            return mapped(part, lambda tensor: tensor[rows.start : rows.stop])
-
-        return Examples(
-            self.inputs.rows(rows),
-            own(self.first),
-            own(self.noisy),
-            own(self.t),
-            own(self.target),
-            own(self.counted),
-            self.num_counted,
-            share,
-        )
-
-
-def losses(
-    model: JointWorldModel,
-    batch: WindowBatch,
-    *,
-    generator: torch.Generator,
-    options: LossOptions = LossOptions(),
-    processes: Processes = ALONE,
-) -> Losses:
-    """Errors of the prediction at random times; see `examples_of` and `errors`."""
-    examples = examples_of(model, batch, generator=generator, options=options, processes=processes)
-    return errors(model, examples, options.precision)
+            rows = torch.arange(start, start + size, device=self.t.device)
+            own: dict[str, Any] = {
+                name: mapped(getattr(self, name), partial(torch.index_select, dim=0, index=rows))
+                for name in ("first", "noisy", "t", "target", "counted")
+            }
+            inputs, share = self.inputs.rows(rows.tolist()), self.share / count
+            yield replace(self, **own, inputs=inputs, share=share)
 
 
 def examples_of(

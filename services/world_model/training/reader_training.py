@@ -64,7 +64,10 @@ def train_reader(
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
-    is_known = _knows_some(table, config)
+    # Steps at which the pose of an object is known; all of tasks without objects.
+    counts = torch.tensor(config.num_objects)[table.task]
+    is_slot = torch.arange(MAX_OBJECTS) < counts[:, None]
+    is_known = (table.objects_known & is_slot[:, None]).any(-1) | (counts == 0)[:, None]
     # Later steps of each episode, in their order; of further ones nothing is known, they have no
     # image or lie behind its end.
     places = [table.image_steps.index(step) for step in later]
@@ -91,13 +94,6 @@ def train_reader(
         return _error(reading, *about) + _GUESS_WEIGHT * _error(guess, *about)
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
-
-
-def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "episodes steps"]:
-    """Steps at which the pose of an object is known; all of tasks without objects."""
-    count = torch.tensor(config.num_objects)[table.task]
-    is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
-    return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:

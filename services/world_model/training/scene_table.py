@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, Shaped, UInt8
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
@@ -177,10 +176,6 @@ class SceneTable:
         """Those `within` without an interpolated step, which losses count."""
         given = self.interpolated[rows][:, self.steps_after(start)].any(-1)
         return self.within(rows, start) & ~given
-
-    def latent_steps(self, start: int) -> Int64[Tensor, " latents"]:
-        """The start and every latent step after it."""
-        return torch.arange(start, self.num_steps, STEPS_PER_LATENT)
 
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
@@ -362,9 +357,9 @@ def _nearest_measured(
         return nearest
     for pad in [pad for stack in layout.split(nearest) for pad in stack]:
         if measured[pad].any():
-            away = ~measured[pad]
-            places = distance_transform_edt(away, return_distances=False, return_indices=True)
-            nearest[pad] = pad[tuple(places)]
+            cells, known = np.argwhere(np.ones(pad.shape)), np.argwhere(measured[pad])
+            away = np.square(cells[:, None] - known).sum(axis=-1)
+            nearest[pad.ravel()] = pad[tuple(known[away.argmin(axis=1)].T)]
     return nearest
 
 

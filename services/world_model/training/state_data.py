@@ -232,11 +232,6 @@ class StateData:
         """All of them."""
         return [*self.training, *self.heldout]
 
-    @property
-    def has_both_domains(self) -> bool:
-        """Whether people and robots act in the episodes of training."""
-        return len({episode.domain for episode in self.training}) > 1
-
 
 def load_state_data(settings: StateTrainSettings) -> StateData:
     """Read the episodes of a run; the held-out ones are the same for all subsets.
@@ -249,7 +244,10 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
     heldout_urls = () if settings.heldout is None else (settings.heldout,)
     urls = (*settings.episodes, *settings.human, *heldout_urls)
-    _check_clicked(clicks, urls)
+    stores = [EpisodeStore(url) for url in urls]
+    for name in () if clicks is None else clicks.episodes:
+        if not any(store.exists(name) for store in stores):
+            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
     load = partial(
         load_scene_episodes, tasks=settings.tasks, image_px=settings.image_px, clicks=clicks
     )
@@ -262,7 +260,11 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     training = subset_by_hash(training, settings.robot_episodes, what="robot")
     if settings.human and settings.human_episodes != 0:
         people = load(*settings.human, splits=settings.splits, domain="human")
-        people = _elsewhere(people, heldout)
+        scenes, num_people = {episode.scene for episode in heldout}, len(people)
+        people = [episode for episode in people if episode.scene not in scenes]
+        if len(people) < num_people:
+            reason = "people in scenes that are held out of the robots'"
+            logger.warning("skipped_episodes", reason=reason, count=num_people - len(people))
         training += subset_by_hash(people, settings.human_episodes, what="human")
     if len({episode.domain for episode in training}) > 1:
         heldout = [episode for episode in heldout if episode.domain == "robot"]
@@ -305,15 +307,6 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
             one.correct_grips(corrections)
 
 
-def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:
-    scenes = {episode.scene for episode in heldout}
-    kept = [episode for episode in people if episode.scene not in scenes]
-    if len(kept) < len(people):
-        reason = "people in scenes that are held out of the robots'"
-        logger.warning("skipped_episodes", reason=reason, count=len(people) - len(kept))
-    return kept
-
-
 def _check_together(data: StateData, urls: Sequence[str]) -> None:
     """Check what holds for all stores of a run; each is read for itself."""
     both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
@@ -350,13 +343,6 @@ def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) 
         )
 
 
-def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
-    stores = [EpisodeStore(url) for url in urls]
-    for name in () if clicks is None else clicks.episodes:
-        if not any(store.exists(name) for store in stores):
-            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
-
-
 def configured(
     data: StateData, settings: StateTrainSettings, base: Base | None = None
 ) -> DynamicsConfig:
@@ -368,6 +354,7 @@ def configured(
     """
     episodes = data.episodes
     tasks, num_objects = vocabulary(episodes)
+    domains = {episode.domain for episode in data.training}
     untrained = set(tasks) - {episode.task for episode in data.training}
     if untrained:
         raise InvalidInputError(
@@ -386,7 +373,7 @@ def configured(
         num_objects=num_objects,
         image_px=sides.pop(),
         width=settings.width,
-        domains=("robot", "human") if data.has_both_domains else ("robot",),
+        domains=("robot", "human") if len(domains) > 1 else ("robot",),
         instructions=_instructions(episodes, settings, base),
         touch_channels=min(usual, layout.num_taxels),
         layout=None if layout == DEXTOUCH_V1 else layout,

@@ -376,7 +376,12 @@ def _train_core(work: _Work, member: int) -> None:
     table, codec = _table(work)
     started_s = time.process_time()
     if work.reads_starts or work.keeps_readers:
-        reader = _finished_reader(work, member)
+        if work.base is not None and work.keeps_readers:
+            reader = work.base.checkpoint.dynamics.readers()[member]
+        else:
+            reader = StartReader(work.config)
+            _load(reader, work.reader_file(member))
+        reader.eval()
         readings = {
             step: read_step(reader, table, step) for step in core_training.start_steps(table)
         }
@@ -393,14 +398,6 @@ def _train_core(work: _Work, member: int) -> None:
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)
-
-
-def _finished_reader(work: _Work, member: int) -> StartReader:
-    if work.base is not None and work.keeps_readers:
-        return work.base.checkpoint.dynamics.readers()[member].eval()
-    reader = StartReader(work.config)
-    _load(reader, work.reader_file(member))
-    return reader.eval()
 
 
 def _on_step(member: int, part: str) -> OnStep:

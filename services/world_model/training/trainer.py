@@ -310,20 +310,18 @@ class TrainingRun:
 
     def places(self) -> Iterator[list[dataset.WindowPosition]]:
         """Endless iterator over the places of the windows of each step."""
+        longest, rng = self.settings.network.max_steps, self._rng
         while True:
-            num_steps = self._window_steps(self._num_steps())
-            yield self._sampler.places(self.settings.optimizer.batch, num_steps)
+            num_steps = longest
+            # Sometimes 5, 9, … steps, since short chunks are served, too.
+            if rng.random() < self.settings.windows.short_fraction:
+                num_steps = int(rng.choice(np.arange(5, longest + 1, 4)))
+            batch = self.settings.optimizer.batch
+            yield self._sampler.places(batch, self._window_steps(num_steps))
 
     def _window_steps(self, num_steps: int) -> int:
         """Steps of a window of one chunk, or of two for self-forcing."""
         return 2 * num_steps - 1 if self.settings.self_forcing else num_steps
-
-    def _num_steps(self) -> int:
-        """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served, too."""
-        longest = self.settings.network.max_steps
-        if self._rng.random() >= self.settings.windows.short_fraction:
-            return longest
-        return int(self._rng.choice(np.arange(5, longest + 1, 4)))
 
 
 def _all_views(batch: dataset.WindowBatch) -> UInt8[Tensor, "n time px px 3"]:
@@ -374,9 +372,13 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     settings, tokenizer = tokenizer_trainer.with_tokenizer(settings)
-    settings = _with_layout(settings.with_adapters(), (*trained, *heldout), tokenizer)
+    settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
+    layout = common_layout(layouts, what="training episodes")
     if tokenizer is not None:
+        known = settings.network.tactile_layout
+        common_layout([known, layout], what="--tokenizer and the training episodes")
         tokenizer_trainer.check_unseen(heldout, tokenizer)
+    settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
@@ -469,24 +471,6 @@ def _metadata(
         action_dropout=dropped[1],
         view_dropout=windows.view_dropout if network.further_views else 0.0,
     )
-
-
-def _with_layout(
-    settings: TrainSettings,
-    episodes: Sequence[dataset.TrainingEpisode],
-    tokenizer: checkpoints.StoredTokenizer | None,
-) -> TrainSettings:
-    """The settings with a network for the taxels of all episodes.
-
-    Raises:
-        InvalidInputError: episodes of several gloves, or a tokenizer of another one.
-    """
-    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
-    if tokenizer is not None:
-        known = settings.network.tactile_layout
-        common_layout([known, layout], what="--tokenizer and the training episodes")
-    network = settings.network.with_layout(layout)
-    return settings.model_copy(update={"network": network})
 
 
 def _data_hash(

@@ -177,4 +177,4 @@ def test_starts_of_several_rollouts_are_remembered_up_to_a_limit(small, image, s
     # The start that was not used for longest has been dropped.
     draw_level(1)
     assert len(prepared) == 66
-    assert len(renderer._starts) == 64
+    assert len(renderer._starts._values) == 64
