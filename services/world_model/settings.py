@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic_settings import CliImplicitFlag
@@ -54,6 +54,16 @@ def paper_form_checkpoint() -> Path:
     return PRETRAINED / PAPER_FORM
 
 
+Output = Annotated[Path, Field(description="checkpoint to write")]
+DisjointTasks = Annotated[
+    CliImplicitFlag[bool], Field(description="refuse human episodes of tasks that robots have, too")
+]
+NewTasks = Annotated[
+    CliImplicitFlag[bool],
+    Field(description="refuse tasks that the initial checkpoint was trained on"),
+]
+
+
 class DataSettings(FrozenModel):
     """Episodes of people and robots that a world model of either form is trained on.
 
@@ -70,12 +80,8 @@ class DataSettings(FrozenModel):
     human_episodes: int | None = Field(
         default=None, ge=0, description="number of human episodes, in the same way"
     )
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse tasks that the initial checkpoint was trained on"
-    )
+    disjoint_tasks: DisjointTasks = True
+    new_tasks: NewTasks = False
     splits: Splits = ()
     heldout: str | None = Field(
         default=None, description="store to evaluate on; default: a share of `episodes`, by hash"
@@ -90,16 +96,10 @@ class DataSettings(FrozenModel):
 class AdaptationSettings(FrozenModel):
     """What adaptations of either form to new tasks have in common."""
 
-    output: Path = Field(
-        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/adapted.safetensors")
     name: str = Field(default="adapted", description="model name in the checkpoint")
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse tasks that the initial checkpoint was trained on"
-    )
+    disjoint_tasks: DisjointTasks = False
+    new_tasks: NewTasks = True
 
 
 class ReaderSettings(FrozenModel):
@@ -173,9 +173,7 @@ class StateTrainSettings(DataSettings):
         default=None,
         description="JSON file of objects: how hands touch them, and clicks (docs/objects.md)",
     )
-    output: Path = Field(
-        default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/state.safetensors")
     name: str = Field(default="state", description="model name in the checkpoint")
     init: Path | None = Field(
         default=None, description="state model to start from; --learn says what is trained of it"

@@ -139,12 +139,7 @@ class JointWorldModel(nn.Module):
         wan = config.wan
         transformer: Any = None
         if wan is not None:
-            transformer = empty_transformer(
-                wan,
-                num_layers=config.num_layers,
-                num_heads=config.num_heads,
-                head_width=config.head_width,
-            )
+            transformer = empty_transformer(config, wan)
         self.codec: VisualCodec | WanVideoCodec = (
             VisualCodec(config) if wan is None else WanVideoCodec(wan)
         )

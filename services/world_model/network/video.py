@@ -330,20 +330,18 @@ class WanVideoExpert(nn.Module):
         return predicted
 
 
-def empty_transformer(
-    config: WanConfig, *, num_layers: int, num_heads: int, head_width: int
-) -> "WanTransformer3DModel":
+def empty_transformer(config: NetworkConfig, wan: WanConfig) -> "WanTransformer3DModel":
     """Transformer on the meta device, in the precision of the configuration."""
     from diffusers import WanTransformer3DModel
 
-    sizes = config.transformer_sizes(
-        num_layers=num_layers, num_heads=num_heads, head_width=head_width
+    sizes = wan.transformer_sizes(
+        num_layers=config.num_layers, num_heads=config.num_heads, head_width=config.head_width
     )
     with torch.device("meta"):
         transformer = WanTransformer3DModel(**sizes)
     for name, parameter in transformer.named_parameters():
         is_exact = any(part in name for part in FLOAT32_PARTS)
-        parameter.data = parameter.data.to(torch.float32 if is_exact else config.dtype)
+        parameter.data = parameter.data.to(torch.float32 if is_exact else wan.dtype)
     return transformer.eval()
 
 

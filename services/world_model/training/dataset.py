@@ -414,18 +414,19 @@ class WindowSampler:
         episode = self._episodes[index]
         starts = window_starts(episode, num_steps)
         start = int(starts[self._rng.integers(len(starts))])
-        is_commanded = self._rng.random() < _COMMANDED_SHARE
+        is_commanded = bool(self._rng.random() < _COMMANDED_SHARE)
         is_chained = bool(self._rng.random() < _CHAINED_SHARE)
+        is_commanded &= "commanded" in episode.action_kinds
         past, hidden = self._past, frozenset[int]()
         if past is not None and self._rng.random() < self._past_dropout:
             past = replace(past, kept=0)
         if num_views := len(episode.missing):
             rows = np.flatnonzero(self._rng.random(num_views) < self._view_dropout)
             hidden = frozenset(rows.tolist())
-        if not is_commanded or "commanded" not in episode.action_kinds:
-            return WindowPosition(index, start, num_steps, past=past, hidden=hidden)
+        kind: ActionKind = "commanded" if is_commanded else "measured"
+        is_chained &= is_commanded
         return WindowPosition(
-            index, start, num_steps, "commanded", from_command=is_chained, past=past, hidden=hidden
+            index, start, num_steps, kind, from_command=is_chained, past=past, hidden=hidden
         )
 
 
