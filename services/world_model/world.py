@@ -247,19 +247,19 @@ class ModelWorld(starts.PredictedWorld[ModelState]):
         return stepped
 
     def _futures(
-        self, asked: Sequence[tuple[ModelState, np.ndarray, int, ReturnSelector]]
+        self, batch: Sequence[tuple[ModelState, np.ndarray, int, ReturnSelector]]
     ) -> list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
         """Predicted images by view, maybe the last only, touch, and latents of the first images."""
-        if not asked:
+        if not batch:
             return []
-        states, chunks, seeds, requested = zip(*asked, strict=True)
+        states, chunks, seeds, requested = zip(*batch, strict=True)
         inputs = build_inputs(self._requests(states, chunks), self._model.config)
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         noise = stack_noise([self._model.noise(inputs.num_steps, each) for each in generators])
-        wanted = any(
+        needs_all = any(
             one.steps == "all" and (one.wants(HEAD_CAMERA) or one.cameras) for one in requested
         )
-        future = self._model.predict(inputs, noise, sampling=self._sampling, all_images=wanted)
+        future = self._model.predict(inputs, noise, sampling=self._sampling, all_images=needs_all)
         starts.refuse_non_finite(
             "world model",
             {"image": future.images, "touch": future.tactile_kpa, "view": future.further},

@@ -410,13 +410,13 @@ def _ending_features(
     each = [about, axes.flatten(3), compressed(position), compressed(lengths)]
     parts = [(torch.cat(each, dim=-1) * present[..., None]).flatten(2)]
     for a, b in _PAIRS:
-        apart = position[..., b, :] - position[..., a, :]
+        a_to_b = position[..., b, :] - position[..., a, :]
         from_a, from_b = (
             torch.einsum("bli,blij->blj", offset, R[..., index, :, :])
-            for offset, index in ((apart, a), (-apart, b))
+            for offset, index in ((a_to_b, a), (-a_to_b, b))
         )
         cosines = [(one[..., a, :] * one[..., b, :]).sum(-1, keepdim=True) for one in (z, x)]
-        distances = [_with_length_across(apart), _with_length_across(from_a), compressed(from_b)]
+        distances = [_with_length_across(a_to_b), _with_length_across(from_a), compressed(from_b)]
         there = present[..., a, None] * present[..., b, None]
         parts.append(torch.cat([*distances, *cosines], dim=-1) * there)
     return torch.cat(parts, dim=-1)

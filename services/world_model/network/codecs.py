@@ -272,8 +272,7 @@ class _LastFrames:
 def _statistics(
     like: Float[Tensor, "batch channels latents rows columns"],
 ) -> tuple[Float[Tensor, "channels 1 1 1"], Float[Tensor, "channels 1 1 1"]]:
-    values = (like.new_tensor(constant).view(-1, 1, 1, 1) for constant in (LATENT_MEAN, LATENT_STD))
-    mean, std = values
+    mean, std = like.new_tensor((LATENT_MEAN, LATENT_STD)).view(2, -1, 1, 1, 1)
     return mean, std
 
 

@@ -109,8 +109,8 @@ def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) ->
 def start_steps(table: SceneTable) -> list[int]:
     """Steps with an image from which cores are trained, up to the last possible latent step."""
     last = table.num_steps - 1 - STEPS_PER_LATENT
-    wanted = {*range(0, last, _START_STRIDE), last}
-    return [step for step in table.image_steps if step in wanted]
+    starts = {*range(0, last, _START_STRIDE), last}
+    return [step for step in table.image_steps if step in starts]
 
 
 def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:

@@ -387,10 +387,8 @@ class WindowSampler:
             )
         self._episodes = list(episodes)
         self._rng = rng
-        of: dict[Domain, list[int]] = {"human": [], "robot": []}
-        for index, episode in enumerate(episodes):
-            of[episode.domain].append(index)
-        self._human, self._robot = of["human"], of["robot"]
+        self._human = [i for i, episode in enumerate(episodes) if episode.domain == "human"]
+        self._robot = [i for i, episode in enumerate(episodes) if episode.domain == "robot"]
         self._human_share = human_share if self._human and self._robot else None
         self._past, (self._past_dropout, self._view_dropout) = past, dropout
 

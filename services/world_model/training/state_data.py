@@ -293,8 +293,8 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
             own = Ts[known[:, index], index]
             R, shift_m = own[:, :3, :3], np.median(own[:, :3, 3], axis=0)
             # The turn that is nearest to all others; a mean of turns far apart is none of them.
-            apart_rad = rotation_angle(np.swapaxes(R, 1, 2)[:, None] @ R)
-            turn = R[apart_rad.sum(axis=1).argmin()]
+            distances_rad = rotation_angle(np.swapaxes(R, 1, 2)[:, None] @ R)
+            turn = R[distances_rad.sum(axis=1).argmin()]
             corrections[index] = transform(turn, shift_m)
             shift_mm = 1e3 * float(np.linalg.norm(shift_m))
             turn_deg = float(np.rad2deg(rotation_angle(turn)))

@@ -84,10 +84,10 @@ def _chunk_figures(
         whole = table.length > end
         if not whole.any():
             break
-        steps, said = (slice(k, k + CHUNK_STEPS) for k in (first + 1, first - start))
+        steps, predicted = (slice(k, k + CHUNK_STEPS) for k in (first + 1, first - start))
         true = table.tactile_kpa[whole, steps].float().numpy()
         measured = table.felt[whole, steps, :, None] & table.measured_taxels[whole, None]
-        guesses = {"": imagined.tactile_kpa[whole, said].numpy()}
+        guesses = {"": imagined.tactile_kpa[whole, predicted].numpy()}
         if start == 0:
             before = table.tactile_kpa[whole, first : first + 1].float().numpy()
             guesses["_of_copy"] = np.broadcast_to(before, true.shape)
