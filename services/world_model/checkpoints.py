@@ -178,11 +178,7 @@ def _default_limit(path: Path) -> int:
 
 
 def read_metadata(path: Path) -> CheckpointMetadata:
-    """Metadata of a checkpoint, without reading its weights.
-
-    Raises:
-        NotFoundError, CorruptDataError, InvalidInputError: as `read_weights`.
-    """
+    """Metadata of a checkpoint without its weights; raises as `read_history`."""
     return read_history(path, CheckpointMetadata, METADATA_KEY)
 
 
@@ -192,11 +188,10 @@ def list_checkpoints(folder: Path) -> dict[Path, str]:
 
 
 class StateBounds(FrozenModel):
-    """Limits beyond which a rollout is flagged as uncertain.
+    """Limits beyond which a rollout is flagged as uncertain, high quantiles over held-out episodes.
 
-    `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
-    the length of training episodes. Bounds `of_chunks` apply to the worst latent step of any 16
-    steps; those of older checkpoints to an episode's worst disagreement and mean distance.
+    Bounds `of_chunks` apply to the worst latent step of any 16 steps; those of older checkpoints to
+    an episode's worst disagreement and mean distance.
     """
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)

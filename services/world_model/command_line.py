@@ -99,10 +99,7 @@ def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path |
 
 
 def run_serve(arguments: list[str]) -> int:
-    """Serve one checkpoint until SIGINT or SIGTERM.
-
-    Rollouts that began in another checkpoint continue in it while it is in the same folder.
-    """
+    """Serve a checkpoint until SIGINT or SIGTERM; rollouts of others in its folder continue."""
     load = partial(load_settings, WorldModelSettings, arguments)
     settings = load()
     serve_worlds(

@@ -185,7 +185,7 @@ class TrainSettings(RunSettings):
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
 
     def with_adapters(self) -> "TrainSettings":
-        """The settings with a network that has the adapters of `lora`.
+        """The settings with the adapters of `lora`.
 
         Raises:
             InvalidInputError: a network without a pretrained video expert to adapt or to freeze.

@@ -83,14 +83,11 @@ class Plan:
 class TrainingPlan:
     """Memory of a training's process while it takes a step, in bytes.
 
-    Attributes:
-        weights: all weights, of which codec and tokenizer are `whole` in every process.
-        learned: those with gradients; each has a gradient, two moments of AdamW (`copies` without
-            the gradient), and an average where one is kept.
-        layer: weights of a layer; `outer` those of neither layers nor codec and tokenizer.
-        step: most that forward and backward take beside the weights; of a training of one process
-            with gradients as they come, which at the end of a step are all there.
-        encoding: what the codec takes for the latents of a step's images, with gradients there.
+    Of all `weights`, codec and tokenizer are `whole` in every process; the `learned` have
+    gradients, two moments and maybe an average (`copies` without gradients). `layer` are weights of
+    a layer, `outer` those beside layers and whole parts. `step` is the most that forward and
+    backward take, with all gradients if there is one process, and `encoding` what the codec takes
+    for the latents.
     """
 
     weights: int
@@ -107,8 +104,7 @@ class TrainingPlan:
     def peak_bytes(self) -> int:
         """The most memory, beside the library's own.
 
-        Sharded (FSDP2), a process has its share of weights, gradients and copies. Gathered are the
-        outer weights, and two layers with the gradient of one.
+        Sharded (FSDP2), outer weights and two layers with one gradient are gathered.
         """
         copies = self.copies * self.learned
         if self.shards == 1:
@@ -287,11 +283,7 @@ def _choices(settings: TrainSettings) -> dict[str, TrainSettings]:
 
 
 def training_plan(settings: TrainSettings, num_processes: int = 1) -> TrainingPlan:
-    """Plan of a training step with windows of the greatest length, in one process of several.
-
-    Raises:
-        InvalidInputError: as `TrainSettings.with_adapters`.
-    """
+    """Plan of a step with the longest windows, in one process of several; as `with_adapters`."""
     settings = settings.with_adapters()
     return _of_depth(settings.network.num_layers, partial(_training_plan, settings, num_processes))
 

@@ -44,8 +44,7 @@ def initial_model(
 ) -> JointWorldModel:
     """A new model; that of the full size begins with the pretrained weights of its files.
 
-    With `filled_later`, a checkpoint replaces all weights, so that files are not needed. `prepare`
-    is called before the pretrained weights have memory, such as to shard them.
+    With `filled_later`, a checkpoint replaces them. `prepare` is called before weights have memory.
 
     Raises:
         InvalidInputError: the full size without a folder.

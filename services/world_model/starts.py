@@ -117,11 +117,10 @@ def observed_start(
 
 
 def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> None:
-    """Reject poses far from the world's origin and implausible intrinsics.
+    """Reject anchors farther than 5 m and implausible focal lengths or principal points.
 
     Raises:
-        InvalidInputError: an anchor farther than 5 m, or an implausible focal length or principal
-            point.
+        InvalidInputError: these.
         NonFiniteError: NaN or infinity.
     """
     Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
@@ -218,11 +217,7 @@ class PredictedWorld(BatchWorld[State]):
 def opened_snapshot(
     data: bytes, digest: str, *, max_bytes: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Fields and arrays of a snapshot of the world with this digest.
-
-    Raises:
-        InvalidInputError: not a snapshot of this world.
-    """
+    """Fields and arrays of a snapshot; raises InvalidInputError for one of another digest."""
     fields, arrays = unpack(data, max_bytes=max_bytes)
     if fields.get("digest") != digest:
         raise InvalidInputError(
@@ -264,11 +259,7 @@ class SceneReader:
     def objects(
         self, requests: Sequence[PredictionRequest], tasks: Sequence[str]
     ) -> list[ObjectsAtStart]:
-        """Objects at the first step of every request.
-
-        Raises:
-            UnknownNameError: a task that the state model was not trained on.
-        """
+        """Objects at first steps; raises UnknownNameError for a task that is not known."""
         unknown = sorted(set(tasks) - set(self.tasks))
         if unknown:
             raise UnknownNameError("task of the start readers", unknown[0], list(self.tasks))

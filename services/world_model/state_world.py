@@ -63,11 +63,7 @@ class StateRollout:
 
 
 class StateWorld(starts.PredictedWorld[StateRollout]):
-    """A state model, in float32, as a deterministic world: seeds of chunks have no effect.
-
-    Raises:
-        InvalidInputError: weights that are not float32.
-    """
+    """A deterministic world of a state model; raises InvalidInputError unless it is in float32."""
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
         others = {weight.dtype for weight in checkpoint.dynamics.parameters()} - {torch.float32}
@@ -103,12 +99,7 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
 
     @torch.inference_mode()
     def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
-        """Find the objects of one observed step and start a rollout.
-
-        Raises:
-            UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: missing or invalid observation, anchor or K_head.
-        """
+        """Find the objects of an observed step; raises as `observed_start`, `build_inputs`."""
         first = starts.observed_start(
             start,
             tasks=self._description.tasks,
@@ -320,12 +311,7 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
         return pack(fields, {**arrays, **model.memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:
-        """Restore the state of a snapshot; validates untrusted bytes.
-
-        Raises:
-            InvalidInputError: not a snapshot of this checkpoint.
-            NonFiniteError: NaN or infinity.
-        """
+        """Restore a snapshot; raises InvalidInputError or NonFiniteError for another's."""
         fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")

@@ -162,13 +162,7 @@ class ModelWorld(starts.PredictedWorld[ModelState]):
         )
 
     def reset(self, start: RolloutStart) -> StartedRollout[ModelState]:
-        """Start a rollout from one observed step.
-
-        Raises:
-            UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: missing or invalid observation, anchor or K_head; an instruction that
-                the full size neither knows nor can encode.
-        """
+        """Start a rollout; raises as `observed_start`, `build_inputs` and `TextFeatures.of`."""
         first = starts.observed_start(
             start, tasks=self._description.tasks, layout=self._model.config.tactile_layout
         )
@@ -313,11 +307,7 @@ class ModelWorld(starts.PredictedWorld[ModelState]):
         return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> ModelState:
-        """Restore the state of a snapshot.
-
-        Raises:
-            InvalidInputError: not a snapshot of this checkpoint.
-        """
+        """Restore a snapshot; raises InvalidInputError for one of another checkpoint."""
         config = self._model.config
         max_bytes = config.num_views * MAX_SNAPSHOT_BYTES + kept_bytes(config)
         fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=max_bytes)

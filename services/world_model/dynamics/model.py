@@ -229,10 +229,9 @@ class DynamicsModel(nn.Module):
 
     @torch.no_grad()
     def advance(self, memory: SceneMemory, commands: Commands) -> tuple[SceneMemory, ImaginedSteps]:
-        """Predict the steps that follow from commands.
+        """Predict the steps that follow from commands, however they are split over calls.
 
-        Entries whose hands have stood still for two seconds, and still do, are at rest: poses and
-        touch stay constant. Splitting commands over several calls does not change the result.
+        Poses and touch stay constant where hands have stood still for two seconds, and still do.
         """
         still = stillness(memory.points_m, memory.num_still, commands.points_m)
         parts: list[_Run] = []
@@ -389,8 +388,7 @@ def memory_from_arrays(
     """Inverse of `memory_arrays`; validates untrusted arrays.
 
     Raises:
-        InvalidInputError: missing arrays, wrong shapes or dtypes, or a task that the model does
-            not have.
+        InvalidInputError: missing arrays, wrong shapes or dtypes, or an unknown task.
         NonFiniteError: NaN or infinity.
     """
     memory = named(

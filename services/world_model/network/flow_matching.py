@@ -130,9 +130,9 @@ def sample(
     sampler: Sampler = "euler",
     stop_after: int | None = None,
 ) -> tuple[Latents, Latents]:
-    """Integrate from noise to data, for both streams at once; `denoise` predicts the clean ones.
+    """Integrate from noise to data, at least one step, for both streams at once.
 
-    After `stop_after` of `num_steps` calls the latents are noisy ones on the way.
+    `denoise` predicts clean latents. After `stop_after` of `num_steps` calls they are still noisy.
 
     Raises:
         InvalidInputError: less than one step.

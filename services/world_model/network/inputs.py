@@ -220,12 +220,11 @@ def pose_raster(
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """One window to predict.
+    """One window to predict, of T = 1 + 4k actions.
 
-    `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; the poses in row 0
-    are the anchor by definition and are ignored. `objects` are those of row 0, where they are
-    known. `further_images` are those of the network's further views, None where one is missing;
-    `past` are the images that it remembers, which only one with `past_images` takes.
+    They are relative to `anchor`, which is row 0 by definition: its poses are ignored. `objects`
+    are those of row 0, `further_images` those of the network's further views, None where one is
+    missing; `past` is for networks with `past_images`.
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]

@@ -81,11 +81,7 @@ class SubwordEncoder(nn.Module):
 
 
 class TextEncoder:
-    """UMT5 encoder and its tokenizer from a local folder in diffusers' layout.
-
-    Raises:
-        NotFoundError: the folder lacks one of the two.
-    """
+    """UMT5 encoder and tokenizer in a folder in diffusers' layout; NotFoundError if one lacks."""
 
     def __init__(self, folder: Path, config: WanConfig) -> None:
         from transformers import AutoTokenizer, UMT5EncoderModel
@@ -131,11 +127,7 @@ class TextFeatures:
         self._folder, self._cache, self._encoder = folder, cache, None
 
     def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
-        """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
-
-        Raises:
-            InvalidInputError: an unknown text and no encoder.
-        """
+        """Features of several texts, padded with zeros to `text_tokens`; raises as `of`."""
         padded = torch.zeros(
             len(texts), self._config.text_tokens, self._config.text_width, dtype=self._config.dtype
         )
@@ -168,11 +160,7 @@ class TextFeatures:
         return self._known
 
     def learn(self, known: Mapping[str, Tensor]) -> None:
-        """Add features, such as those of a checkpoint.
-
-        Raises:
-            CorruptDataError: features of another width.
-        """
+        """Add features; raises CorruptDataError for those of another width."""
         for key, features in known.items():
             self._known[key] = self._checked(features, f"text features {key}")
 

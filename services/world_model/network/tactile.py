@@ -356,11 +356,7 @@ class PrincipalAxesTokenizer(TactileTokenizer):
 
 
 def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
-    """The tokenizer that the configuration names, with initial weights.
-
-    Raises:
-        InvalidInputError: tokens per pad with another tokenizer than Split-Hands.
-    """
+    """The tokenizer of a configuration; raises InvalidInputError for pads that it does not have."""
     if config.tactile_tokens == "pad" and config.tokenizer != "split_hands":
         raise InvalidInputError(
             f"network: got tactile_tokens pad with tokenizer {config.tokenizer}, expected hand; "

@@ -213,11 +213,7 @@ class Renderer:
         self._lock = threading.Lock()
 
     def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
-        """Draw images of any number of rollouts; together as alone, except for rounding.
-
-        Sides of start images are multiples of 2^(number of widths). Where nothing moved, they are
-        returned.
-        """
+        """Draw images of any number of rollouts; together as alone, except for rounding."""
         if not drawings:
             return []
         starts = [self._prepared(drawing) for drawing in drawings]

@@ -150,11 +150,7 @@ class RendererRun:
 def drawing_loss(
     drawn: Float32[Tensor, "n 3 h w"], true: Float32[Tensor, "n 3 h w"], settings: RendererTraining
 ) -> Float32[Tensor, ""]:
-    """Mean absolute error of colours (0 … 1), of image gradients and of edge strength.
-
-    Colours alone blur images, since an edge a pixel off costs twice and a missing one once; the
-    mean strength of edges in a window does not depend on where exactly they are.
-    """
+    """Mean absolute error of colours (0 … 1), which alone blur, of gradients and edges."""
     error = drawn - true
     across = (error[..., 1:] - error[..., :-1]).abs().mean()
     down = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()

@@ -115,12 +115,10 @@ class _Episode(ABC):
         """Cut the window at a place in this episode, and re-anchor its actions to its first step.
 
         Commanded actions `from_command` are anchored as those of a served rollout after its first
-        chunk, since it measures no pose. Of an episode on disk, the window's span alone is read.
+        chunk, since it measures no pose.
 
         Raises:
-            InvalidInputError: steps outside an episode on disk.
-            UnknownNameError: an action kind that it does not have.
-            CorruptDataError: damaged bytes.
+            InvalidInputError, UnknownNameError, CorruptDataError: as `EpisodeReader.window`.
         """
         span, steps = self._span(place), np.arange(place.start, place.start + place.num_steps)
         known = span.actions[place.action_kind]
@@ -436,11 +434,7 @@ def load_episodes(
     image_px: int | None = None,
     further_views: Sequence[str] = (),
 ) -> list[EpisodeArrays]:
-    """Episodes of a store in memory, as `read_episode` gives them, of some splits and a domain.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
-    """
+    """Episodes of a store in memory; raises as `select_episodes` and `read_episode`."""
     readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
     return [read_episode(one, image_px=image_px, further_views=further_views) for one in readers]
 

@@ -21,11 +21,7 @@ D = TypeVar("D", bound=DomainEpisode)
 
 
 def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> list[D]:
-    """Episodes chosen by content, in their order, more contain fewer; None for all.
-
-    Raises:
-        InvalidInputError: there are fewer; `what` names them.
-    """
+    """Episodes by content, in their order, more contain fewer; None: all. `what` is for errors."""
     if count is None:
         return list(episodes)
     if count > len(episodes):
@@ -117,10 +113,9 @@ def training_sets(
 def load_split(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[dataset.EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores; held-out ones are in memory.
+    """Training and held-out episodes; the latter, in memory, are the same for every subset.
 
-    Robot episodes are split before a subset of them is taken, so that every subset has the same
-    held-out episodes. These are never human if human stores are given.
+    They are never human if human stores are given.
     """
     px, views = settings.network.image_px, settings.network.further_views
     how = dataset.index_episodes if settings.streaming else dataset.load_episodes

@@ -56,12 +56,10 @@ class Losses:
 class LossOptions:
     """Options of the losses.
 
-    `context_noise` is the relative deviation of noise on the first latents, for starts from own
-    output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
-    learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
+    `context_noise` is the relative deviation of noise on the first latents. Of tactile tokens count
+    `touch_loss`: all, or those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
-    `text_dropout` and `action_dropout` are the shares of windows without instruction, and
-    without actions, for guidance; the smaller share is without both.
+    `text_dropout` and `action_dropout` are shares of windows; the smaller one is without both.
     """
 
     context_noise: float = 0.0
@@ -203,9 +201,7 @@ def _with_noise(
 def own_context(
     model: JointWorldModel, batch: WindowBatch, *, generator: torch.Generator, processes: Processes
 ) -> WindowBatch:
-    """Windows of one chunk from windows of two: for half of the batches the second chunks.
-
-    They have the last image and touch that the model predicts for the first chunk.
+    """Windows of one chunk from windows of two: of half the batches the second ones.
 
     Raises:
         InvalidInputError: a model with contact geometry, further views or past images.

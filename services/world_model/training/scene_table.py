@@ -224,7 +224,7 @@ class SceneTable:
 
 
 def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Tasks in alphabetical order with the number of objects of each.
+    """Tasks in alphabetical order with the number of objects of each, the same in all episodes.
 
     Raises:
         InvalidInputError: no episodes, or a task whose episodes differ in their objects.

@@ -320,11 +320,7 @@ def _check_together(data: StateData, urls: Sequence[str]) -> None:
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
-    """Check tasks by domain, and that the initial checkpoint has not seen what is held out.
-
-    Raises:
-        InvalidInputError: it has, or as `check_tasks`.
-    """
+    """Check tasks as `check_tasks`; what is held out, the initial checkpoint has not seen."""
     if base is None:
         check_tasks(data.episodes, settings)
         return
@@ -349,8 +345,7 @@ def configured(
     """The configuration of a model of some episodes, which may start from another model.
 
     Raises:
-        InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or
-            that no episode of training has.
+        InvalidInputError: several image sizes or lists of objects, or tasks that are not trained.
     """
     episodes = data.episodes
     tasks, num_objects = vocabulary(episodes)
@@ -402,11 +397,7 @@ def drawn_episodes(data: StateData) -> Sequence[EpisodeGrid]:
 
 
 def check_drawable(episodes: Sequence[EpisodeGrid]) -> None:
-    """Refuse what no renderer can be trained on, before hours of training other parts.
-
-    Raises:
-        InvalidInputError: no episode shows its objects at two known poses.
-    """
+    """Raise InvalidInputError, hours early, if no episode shows its objects at two known poses."""
     for one in episodes:
         if one.objects is not None and one.objects.known[one.image_steps].all(axis=1).sum() > 1:
             return

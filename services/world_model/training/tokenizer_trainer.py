@@ -56,8 +56,6 @@ def load_hands(
 ) -> tuple[TactileHands, TactileHands]:
     """Training and held-out hands of all people and robots; a scene is on one side only.
 
-    Steps without a measurement are left out; single taxels that were not measured are filled.
-
     Raises:
         InvalidInputError: either side has no scene, or the episodes are of several gloves.
         NotFoundError, ConflictError: as `select_episodes`.
@@ -244,8 +242,7 @@ def with_tokenizer(
     """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
 
     Raises:
-        InvalidInputError: a learned tokenizer without a file or an initial checkpoint that holds
-            it, both of these, or a tokenizer for a network without touch.
+        InvalidInputError: a learned tokenizer of no file, or --tokenizer with --init or no touch.
         ConflictError: the network settings name another tokenizer than the file.
     """
     if settings.tokenizer is None:
@@ -272,11 +269,7 @@ def with_tokenizer(
 def split_unseen(
     episodes: Sequence[E], stored: checkpoints.StoredTokenizer, *, heldout_percent: int
 ) -> tuple[list[E], list[E]]:
-    """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
-
-    Raises:
-        InvalidInputError: either side would be empty.
-    """
+    """Training and held-out episodes, of scenes that the tokenizer has not seen; none empty."""
     sizes = Counter(episode.scene for episode in episodes)
     heldout: set[str] = set()
     for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=scene_fraction):

@@ -351,9 +351,7 @@ class TrainingReport:
 def train(
     settings: TrainSettings, on_progress: OnProgress | None = None, processes: Processes = ALONE
 ) -> TrainingReport | None:
-    """Load episodes, train, write and evaluate the checkpoint.
-
-    Only the first of several processes writes, evaluates and reports; the others return None.
+    """Load episodes, train, write and evaluate the checkpoint; None but in the first process.
 
     Raises:
         InvalidInputError: no episodes, too short ones, or held-out ones among those trained on.

@@ -76,11 +76,7 @@ class StateFiles:
         self._is_sharded = processes.mesh is not None
 
     def exists(self) -> bool:
-        """Whether there is a state to resume.
-
-        Raises:
-            ConflictError: there is only one of a run that was started otherwise.
-        """
+        """Whether there is a state to resume; ConflictError if only of a run started otherwise."""
         single, sharded = self._file.is_file(), (self._folder / FACTS).is_file()
         own, other = (sharded, single) if self._is_sharded else (single, sharded)
         if other and not own:
@@ -92,10 +88,7 @@ class StateFiles:
         return own
 
     def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
-        """Read the state of a run with these settings and data.
-
-        `own` has a tensor of the same name, shape and sharding for every tensor of the state. Of a
-        sharded state, those of the model are loaded in place.
+        """Read the state of a run, with tensors as of `own`; sharded weights are loaded in place.
 
         Raises:
             ConflictError: the state has other settings or data; they are named.

@@ -21,11 +21,7 @@ _SUCCESS = "success."
 
 
 class Base:
-    """A trained state model that another one starts from.
-
-    Raises:
-        NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
-    """
+    """A state model that another one starts from; raises as `read_state_checkpoint`."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.checkpoint = path, read_state_checkpoint(path)
@@ -91,10 +87,9 @@ class Base:
     def core(
         self, config: DynamicsConfig, member: int, *, seed: int, learns_all: bool
     ) -> RecurrentCore:
-        """A member's core, in which only fresh weights that predict success can be trained, or all.
+        """A member's core, in which all can be trained, or only fresh weights that predict success.
 
-        Of new tasks, they see distances, heights and angles of predicted poses alone: a few takes
-        do not suffice to find which directions, or which units of the hidden state, do not matter.
+        Of new tasks, these see distances, heights and angles alone, for want of takes.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
