@@ -35,6 +35,7 @@ from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import core_training, state_data
 from services.world_model.training.episode_sets import training_sets
+from services.world_model.training.evaluation import evaluate_dynamics
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
@@ -42,7 +43,6 @@ from services.world_model.training.scene_table import (
     scene_table,
     usual_boxes_m,
 )
-from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.

@@ -41,6 +41,7 @@ from services.world_model.training.core_training import (
     touch_latents,
     train_core,
 )
+from services.world_model.training.evaluation import evaluate_dynamics
 from services.world_model.training.reader_training import read_step, reader_errors, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
@@ -49,7 +50,6 @@ from services.world_model.training.scene_table import (
     vocabulary,
 )
 from services.world_model.training.state_data import labelled_episodes
-from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.state_trainer import _command
 from tests.unit.world_model.toy_grid import ToyGrid, changed
 
