@@ -76,9 +76,13 @@ Steps: TypeAlias = Int64[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class _Span:
-    """What a window takes from an episode beside images; actions relative to `anchor` at step 0."""
+    """What a window takes from an episode beside images.
+
+    `actions` from the step `first` on are relative to `anchor`, the measured poses of that step.
+    """
 
     instruction: str
+    first: int
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
@@ -105,7 +109,8 @@ class _Episode(ABC):
         """Which further views the episode lacks."""
 
     @abstractmethod
-    def _span(self, place: WindowPosition) -> _Span: ...
+    def _span(self, place: WindowPosition, first: int) -> _Span:
+        """What the window takes, with actions from a step on, or from an earlier one."""
 
     @abstractmethod
     def _images_at(self, steps: Steps, view: int) -> UInt8[np.ndarray, "n h w 3"] | None:
@@ -120,11 +125,13 @@ class _Episode(ABC):
         Raises:
             InvalidInputError, UnknownNameError, CorruptDataError: as `EpisodeReader.window`.
         """
-        span, steps = self._span(place), np.arange(place.start, place.start + place.num_steps)
+        steps = np.arange(place.start, place.start + place.num_steps)
+        kept = steps[:0] if place.past is None else place.past.steps(place.start)
+        span = self._span(place, int(min([*kept[:1], place.start])))
         known = span.actions[place.action_kind]
         origin_kind = place.action_kind if place.from_command else "measured"
-        origin = span.actions[origin_kind][place.start]
-        actions = reanchor(known[steps], 0, anchor_action=origin)
+        origin = span.actions[origin_kind][place.start - span.first]
+        actions = reanchor(known[steps - span.first], 0, anchor_action=origin)
 
         def views_at(chosen: Steps) -> list[np.ndarray | None]:
             views = range(len(self.missing))
@@ -132,9 +139,8 @@ class _Episode(ABC):
             return [self._images_at(chosen, 0), *shown]
 
         past = None
-        kept = np.zeros(0, dtype=np.int64) if place.past is None else place.past.steps(place.start)
         if place.past is not None and len(kept):
-            poses = reanchor(known[kept], 0, anchor_action=origin)
+            poses = reanchor(known[kept - span.first], 0, anchor_action=origin)
             rows = place.past.chosen(poses, actions)
             images = np.stack(_filled(views_at(kept[rows])), axis=1)
             past = PastImages(poses[rows], place.start - kept[rows], images)
@@ -215,11 +221,11 @@ class EpisodeArrays(_Episode):
         images = (self.images, *self.further)[view]
         return None if images is None else images[steps]
 
-    def _span(self, place: WindowPosition) -> _Span:
+    def _span(self, place: WindowPosition, _: int) -> _Span:
         steps = slice(place.start, place.start + place.num_steps)
         touch = self.tactile_kpa[steps], self.tactile_valid[steps], self.measured_taxels
         objects = self.objects_at(place.start)
-        return _Span(self.instruction, self.anchor, self.K_head, self.actions, touch, objects)
+        return _Span(self.instruction, 0, self.anchor, self.K_head, self.actions, touch, objects)
 
 
 @dataclass(frozen=True)
@@ -330,17 +336,18 @@ class StoredEpisode(_Episode):
         names = HEAD_CAMERA, *self.further_views
         return None if (False, *self.missing)[view] else self._grid().images(steps, names[view])
 
-    def _span(self, place: WindowPosition) -> _Span:
+    def _span(self, place: WindowPosition, first: int) -> _Span:
         grid, kind = self._grid(), place.action_kind
         tactile_kpa, valid = grid.reader.touch(place.start, place.num_steps)
-        stop = place.start + place.num_steps
+        count = place.start + place.num_steps - first
         kinds: set[ActionKind] = {"measured", kind}
-        actions = {one: grid.reader.actions(0, stop, kind=one) for one in kinds}
+        actions = {one: grid.reader.actions(first, count, kind=one) for one in kinds}
         objects, now_ns = None, grid.t_ref_ns[place.start : place.start + 1]
         if known := grid.boxed_objects(now_ns):
             objects = ObjectsAtStart(known[0][0].astype(np.float64), known[1])
         touch = tactile_kpa, valid, grid.measured_taxels
-        return _Span(grid.about.instruction, grid.anchor, grid.K_head, actions, touch, objects)
+        about, anchor = grid.about.instruction, grid.reader.anchor(first)
+        return _Span(about, first, anchor, grid.K_head, actions, touch, objects)
 
 
 # An episode that windows are cut from.

@@ -274,7 +274,14 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
                 "--heldout store, or a larger --heldout-share"
             )
     data = StateData(training, heldout)
-    _check_together(data, urls)
+    both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
+    if both:
+        raise InvalidInputError(
+            f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
+            "ones; use another --heldout store"
+        )
+    ids = [episode.episode_id for episode in data.episodes]
+    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
     _correct_grips(data.episodes)
     return data
 
@@ -305,18 +312,6 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
             )  # fmt: skip
         for one in of_both:
             one.correct_grips(corrections)
-
-
-def _check_together(data: StateData, urls: Sequence[str]) -> None:
-    """Check what holds for all stores of a run; each is read for itself."""
-    both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
-    if both:
-        raise InvalidInputError(
-            f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
-            "ones; use another --heldout store"
-        )
-    ids = [episode.episode_id for episode in data.episodes]
-    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
