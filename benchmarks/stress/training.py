@@ -175,7 +175,6 @@ STAGE.does_not_apply(
 )
 
 
-@cache
 def _losses(
     model: JointWorldModel,
     batch: WindowBatch,
@@ -187,6 +186,7 @@ def _losses(
     return errors(model, examples, options.precision)
 
 
+@cache
 def _episode() -> EpisodeArrays:
     """A static scene of the twin with a moving hand and some touch."""
     take = demonstration(_PX)
