@@ -24,7 +24,7 @@ from services.twin.names import (
     TAKE_PATHS,
     TASK_SETS,
 )
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
