@@ -31,7 +31,7 @@ from dextouch.errors import (
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import Matrix, first_problems, matrix_rows
 from dextouch.streams import SampleBatch, StreamDescriptor
-from services.alignment.synchronization.stream_clock import time_stream
+from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"
@@ -173,23 +173,32 @@ class PhotoPose(BaseModel):
         return np.array([self.x_m, self.y_m, self.z_m, self.qw, self.qx, self.qy, self.qz])
 
 
+def number_of(calibration: Mapping[str, Matrix], name: str, default: float = 0.0) -> float:
+    """Value of a 1 × 1 matrix of a calibration, or the default."""
+    return float(calibration[name][0][0]) if name in calibration else default
+
+
 @dataclass(frozen=True)
 class TakeStream:
-    """All samples of one stream of a take, with the take's calibration."""
+    """All samples of one stream of a take, which `where` names, with the take's calibration."""
 
-    take: str
+    where: str
     descriptor: StreamDescriptor
     batch: SampleBatch
     calibration: Mapping[str, Matrix]
 
     def number(self, name: str) -> float:
         """Value of a 1 × 1 matrix of the calibration; 0 if missing."""
-        return float(self.calibration.get(name, ((0.0,),))[0][0])
+        return number_of(self.calibration, name)
+
+    def timing(self) -> TimedStream:
+        """Times on the host's clock without the calibrated latency."""
+        latency_ns = round(self.number(f"{self.descriptor.name}_latency_ns"))
+        return time_stream(self.batch, self.descriptor, latency_ns=latency_ns)
 
     def timed(self) -> tuple[Int64[np.ndarray, " n"], Shaped[np.ndarray, "n ..."]]:
-        """Times on the host's clock without the calibrated latency, and the values at them."""
-        latency_ns = round(self.number(f"{self.descriptor.name}_latency_ns"))
-        timing = time_stream(self.batch, self.descriptor, latency_ns=latency_ns)
+        """The times, and the values at them."""
+        timing = self.timing()
         return timing.t_host_ns, self.batch.values[timing.kept]
 
     def poses(self) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
@@ -203,38 +212,36 @@ class TakeStream:
         seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
         if np.count_nonzero(seen) < 2:
             raise InvalidInputError(
-                f"take {self.take!r}: {self.descriptor.name} has {np.count_nonzero(seen)} valid "
+                f"{self.where}: {self.descriptor.name} has {np.count_nonzero(seen)} valid "
                 "poses, expected two seconds of them; was the tracker visible?"
             )
         return t_ns[seen], poses[seen]
 
 
-def read_stream(take: str, name: str, store: str | None) -> TakeStream:
-    """Read one stream of a spool folder, or of a recording in a store.
+def open_take(take: str, store: str | None) -> SpoolReader | RecordingReader:
+    """Open a take by the path of its spool folder, or a recording of a store by its id.
 
-    Args:
-        take: path of a spool folder, or id of a recording.
-        name: name of the stream.
-        store: URL of the store that has the recording; None for folders only.
-
-    Raises:
-        NotFoundError: no such take, or none with this stream.
+    Raises NotFoundError for no such take.
     """
-    reader: SpoolReader | RecordingReader
     if Path(take).is_dir():
-        reader = SpoolReader(Path(take))
-    elif store:
-        reader = EpisodeStore(store).recording(take)
-    else:
-        raise NotFoundError(
-            f"take {take!r}: no such folder; name a take of the station's spool, or add --store "
-            "URL for the id of a recording"
-        )
+        return SpoolReader(Path(take))
+    if store:
+        return EpisodeStore(store).recording(take)
+    raise NotFoundError(
+        f"take {take!r}: no such folder; name a take of the station's spool, or add --store URL "
+        "for the id of a recording"
+    )
+
+
+def read_stream(take: str, name: str, store: str | None) -> TakeStream:
+    """Read one stream of a take (`open_take`); raises NotFoundError for a take without it."""
+    reader = open_take(take, store)
     if name not in reader.streams:
         raise NotFoundError(
             f"take {take!r}: has no {name!r}, only {', '.join(sorted(reader.streams))}"
         )
-    return TakeStream(take, reader.streams[name], reader.read(name), reader.attributes.calibration)
+    where = f"take {take!r}"
+    return TakeStream(where, reader.streams[name], reader.read(name), reader.attributes.calibration)
 
 
 def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row]:

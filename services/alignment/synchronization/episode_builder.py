@@ -8,9 +8,8 @@ from jaxtyping import Bool
 
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import NUM_DISTORTION
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
-from dextouch.streams import StreamDescriptor, check_camera_matrix
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
@@ -33,6 +32,7 @@ from services.alignment.synchronization.recorded_streams import (
     DatedStream,
     EpisodeStream,
     LoadedStream,
+    check_lens,
     cut_stream,
     date_stream,
     marker_streams,
@@ -280,6 +280,7 @@ def check_complete(recording: RecordingReader) -> None:
     Raises:
         InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
+    where = f"recording {recording.attributes.recording_id!r}"
     _check_hands(recording, recording.streams)
     # One window holds both hands.
     common_layout(
@@ -288,9 +289,10 @@ def check_complete(recording: RecordingReader) -> None:
             for name, stream in recording.streams.items()
             if name in TOUCH_STREAMS
         ],
-        what=f"recording {recording.attributes.recording_id!r}",
+        what=where,
     )
-    _check_lenses(recording)
+    for stream in recording.streams.values():
+        check_lens(stream, recording.attributes.calibration, where=where)
 
 
 def _check_hands(recording: RecordingReader, streams: Collection[str]) -> None:
@@ -304,39 +306,6 @@ def _check_hands(recording: RecordingReader, streams: Collection[str]) -> None:
             f"one of them at least; it has {sorted(recording.streams)}",
             missing=of_hands,
         )
-
-
-def _check_lenses(recording: RecordingReader) -> None:
-    """Refuse a camera matrix that was measured on images of another size than were recorded.
-
-    Matrices that are absent are not asked for. Images are never undistorted here: the episode
-    carries `distortion_<camera>` beside `K_<camera>`.
-    """
-    calibration = recording.attributes.calibration
-    where = f"recording {recording.attributes.recording_id!r}"
-    for name, stream in recording.streams.items():
-        camera = name.removeprefix("camera_")
-        if stream.kind != "image" or camera == name:
-            continue
-        shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, NUM_DISTORTION)}
-        for matrix, shape in (shapes | {f"image_size_{camera}_px": (1, 2)}).items():
-            found = np.shape(calibration[matrix]) if matrix in calibration else shape
-            if found != shape:
-                raise InvalidInputError(
-                    f"{where}: calibration {matrix!r} is {found}, expected {shape}"
-                )
-        size_px = calibration.get(f"image_size_{camera}_px")
-        recorded = (stream.shape[1], stream.shape[0])
-        if size_px is not None and tuple(size_px[0]) != recorded:
-            raise InvalidInputError(
-                f"{where}: K_{camera} was measured on images of {size_px[0][0]:g} by "
-                f"{size_px[0][1]:g} px, but {name!r} holds {recorded[0]} by {recorded[1]}; "
-                "calibrate the camera in the mode that is recorded"
-            )
-        if f"K_{camera}" in calibration:
-            check_camera_matrix(
-                np.array(calibration[f"K_{camera}"]), recorded, where=f"{where}: K_{camera}"
-            )
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:

@@ -17,7 +17,13 @@ from jaxtyping import Bool, Float64, Int64, Shaped
 
 from dextouch.episodes import GOP_IMAGES, RecordingReader
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import distortion_of, pose_from_transform, transform, transform_from_pose
+from dextouch.geometry import (
+    NUM_DISTORTION,
+    distortion_of,
+    pose_from_transform,
+    transform,
+    transform_from_pose,
+)
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
 from dextouch.streams import (
@@ -27,6 +33,7 @@ from dextouch.streams import (
     MOUNTS,
     Implausible,
     StreamDescriptor,
+    check_camera_matrix,
     encoded_values,
 )
 from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration
@@ -207,6 +214,33 @@ def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStre
         source = _image_blocks(stream, first, stop, quality)
     blocks = (Block(block.t_ns - origin_ns, block.values) for block in source)
     return EpisodeStream(stream.descriptor, blocks, quality)
+
+
+def check_lens(stream: StreamDescriptor, calibration: Mapping[str, Matrix], *, where: str) -> None:
+    """Refuse matrices of a camera that are none, or measured on images of another size.
+
+    Matrices that are absent are not asked for. Images are never undistorted here: the episode
+    carries `distortion_<camera>` beside `K_<camera>`.
+    """
+    camera = stream.name.removeprefix("camera_")
+    if stream.kind != "image" or camera == stream.name:
+        return
+    shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, NUM_DISTORTION)}
+    for name, shape in (shapes | {f"image_size_{camera}_px": (1, 2)}).items():
+        found = np.shape(calibration[name]) if name in calibration else shape
+        if found != shape:
+            raise InvalidInputError(f"{where}: calibration {name!r} is {found}, expected {shape}")
+    height_px, width_px = stream.shape[:2]
+    size_px = calibration.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
+    if tuple(size_px) != (width_px, height_px):
+        raise InvalidInputError(
+            f"{where}: K_{camera} was measured on images of {size_px[0]:g} by {size_px[1]:g} px, "
+            f"but {stream.name!r} holds {width_px} by {height_px}; calibrate the camera in the "
+            "mode that is recorded"
+        )
+    if f"K_{camera}" in calibration:
+        K = np.array(calibration[f"K_{camera}"])
+        check_camera_matrix(K, (width_px, height_px), where=f"{where}: K_{camera}")
 
 
 def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
