@@ -76,10 +76,8 @@ class JobQueue:
     async def open(self, folder: Path) -> list[AlignmentJob]:
         """Load the jobs kept in a folder; returns those that were running when it was left.
 
-        Raises:
-            ConflictError: another service uses the folder.
-            CorruptDataError: the jobs on disk are damaged.
-            StorageError: they cannot be read or written.
+        Raises ConflictError: another service uses the folder; CorruptDataError: the jobs on disk
+        are damaged; StorageError: they cannot be read or written.
         """
         try:
             self._database, self._jobs = await asyncio.to_thread(_open_jobs, folder)
@@ -98,8 +96,7 @@ class JobQueue:
     def get(self, alignment_id: str) -> AlignmentJob:
         """The current state of a job.
 
-        Raises:
-            NotFoundError: never submitted, or ended long ago.
+        Raises NotFoundError: never submitted, or ended long ago.
         """
         self._require_open()
         if alignment_id not in self._jobs:
@@ -118,10 +115,8 @@ class JobQueue:
     ) -> AlignmentList:
         """Some of the jobs, or of those in one state, oldest first, from the one `after` an id on.
 
-        With `recording_ids`, only those of these recordings.
-
-        Raises:
-            NotFoundError: there is no job `after`.
+        With `recording_ids`, only those of these recordings. Raises NotFoundError: there is no job
+        `after`.
         """
         self._require_open()
         jobs = [
@@ -265,8 +260,7 @@ class JobDatabase:
     def load(self) -> dict[str, AlignmentJob]:
         """Jobs by id, in the order in which they were submitted.
 
-        Raises:
-            CorruptDataError: a row does not match its checksum or is not a job.
+        Raises CorruptDataError: a row does not match its checksum or is not a job.
         """
         select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
         with self._errors("read"), self._guard:

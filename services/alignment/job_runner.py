@@ -166,12 +166,9 @@ class JobRunner:
     async def submit(self, request: AlignmentRequest) -> tuple[AlignmentJob, ...]:
         """Submit alignments, or find those that run or are done; failed ones are submitted again.
 
-        All of them are accepted or none.
-
-        Raises:
-            NotFoundError: no such recording.
-            InvalidInputError: a recording lacks what every episode needs.
-            LimitExceededError: too many are waiting.
+        All of them are accepted or none. Raises NotFoundError: no such recording;
+        InvalidInputError: a recording lacks what every episode needs; LimitExceededError: too many
+        are waiting.
         """
         options = request.options or self._options
         if options.objects is None:
@@ -189,9 +186,7 @@ class JobRunner:
     async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
         """Keep a failed job of a recording that cannot be aligned, so that its reason is listed.
 
-        Raises:
-            NotFoundError: no such recording.
-            LimitExceededError: too many are waiting.
+        Raises NotFoundError: no such recording; LimitExceededError: too many are waiting.
         """
         recording = await asyncio.to_thread(self._store.recording, recording_id)
         alignment_id = episode_id_of(recording, self._options)
@@ -211,9 +206,7 @@ class JobRunner:
     async def cancel(self, alignment_id: str) -> AlignmentJob:
         """Cancel an alignment that waits or runs; nothing of it is written.
 
-        Raises:
-            NotFoundError: not known here.
-            ConflictError: it is done or has failed.
+        Raises NotFoundError: not known here; ConflictError: it is done or has failed.
         """
         async with self._changed:
             job = self.queue.get(alignment_id)
@@ -348,8 +341,7 @@ class NewRecordings:
     async def look(self) -> None:
         """Submit new recordings; a recording that finds no room in the queue is left for next time.
 
-        Raises:
-            StorageError: the store cannot be listed, or jobs cannot be kept.
+        Raises StorageError: the store cannot be listed, or jobs cannot be kept.
         """
         for job in self._jobs.queue.out_of_space(for_s=RETRY_S):
             again = AlignmentRequest(recording_id=job.recording_id, options=job.options)

@@ -53,14 +53,11 @@ def align_recording(
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
-    The episode's id follows from the recording's content and the options: doing it again, even
-    from two processes at once, gives the same episode and writes nothing. Progress is told in the
-    caller's thread.
-
-    Raises:
-        NotFoundError: no such recording, or it was deleted meanwhile.
-        InvalidInputError: the recording lacks data that an episode needs (the message names it).
-        CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
+    The episode's id follows from the recording's content and the options: doing it again, even from
+    two processes at once, gives the same episode and writes nothing. Progress is told in the
+    caller's thread. Raises NotFoundError: no such recording, or it was deleted meanwhile;
+    InvalidInputError: the recording lacks data that an episode needs (the message names it);
+    CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
@@ -88,9 +85,8 @@ def align_recording(
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
     """Check that a recording has the data that an episode needs; returns the id of its episode.
 
-    Raises:
-        NotFoundError: no such recording.
-        InvalidInputError: streams or calibration that every episode needs are missing.
+    Raises NotFoundError: no such recording; InvalidInputError: streams or calibration that every
+    episode needs are missing.
     """
     recording = store.recording(recording_id)
     check_complete(recording)
@@ -149,8 +145,7 @@ class AlignmentWorker:
     def start(self) -> None:
         """Start the process and wait until its solver is ready; does nothing if it runs.
 
-        Raises:
-            UnavailableError: it does not start.
+        Raises UnavailableError: it does not start.
         """
         with self._in_use:
             with self._guard:

@@ -264,10 +264,8 @@ def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate |
 def marker_sheet(objects: SceneObjects) -> str:
     """SVG with the markers of all objects on A4 pages below one another.
 
-    Every marker has a dashed line to cut along, and below it the object, its id and side.
-
-    Raises:
-        InvalidInputError: there is no marker, or one is larger than the page.
+    Every marker has a dashed line to cut along, and below it the object, its id and side. Raises
+    InvalidInputError: there is no marker, or one is larger than the page.
     """
     printed = {
         (one.name, marker.id, marker.size_m): marker

@@ -157,8 +157,7 @@ class AlignmentSettings(ServiceSettings):
     def wanted_options(self) -> AlignmentOptions:
         """The options, with the objects of the file.
 
-        Raises:
-            NotFoundError, InvalidInputError: as `load_scene_objects`.
+        Raises NotFoundError, InvalidInputError: as `load_scene_objects`.
         """
         if self.objects is None:
             return self.options

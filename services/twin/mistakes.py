@@ -53,9 +53,8 @@ class Mistake:
     def parse(cls, text: str) -> "Mistake":
         """A mistake from KIND=STRENGTH.
 
-        Raises:
-            InvalidInputError: other text, or a strength outside 0 … 1.
-            UnknownNameError: no such kind.
+        Raises InvalidInputError: other text, or a strength outside 0 … 1; UnknownNameError: no such
+        kind.
         """
         match = _FORM.fullmatch(text)
         if match is None:

@@ -39,9 +39,7 @@ def mistake_name(mistake: Mistake) -> str:
 def mistake_of(policy: str) -> Mistake | None:
     """The mistake that a policy is named by; None for other names.
 
-    Raises:
-        UnknownNameError: no such kind of mistake.
-        InvalidInputError: a strength outside 0 … 1.
+    Raises UnknownNameError: no such kind of mistake; InvalidInputError: a strength outside 0 … 1.
     """
     match = _MISTAKE.fullmatch(policy)
     return None if match is None else Mistake(match[1], float(match[2]))
@@ -50,9 +48,8 @@ def mistake_of(policy: str) -> Mistake | None:
 def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
     """Open-loop commands of a policy, steps 1 … 80, relative to the start's poses.
 
-    Raises:
-        UnknownNameError: no such policy, or no such kind of mistake.
-        InvalidInputError: a strength of a mistake outside 0 … 1.
+    Raises UnknownNameError: no such policy, or no such kind of mistake; InvalidInputError: a
+    strength of a mistake outside 0 … 1.
     """
     level, mistake = _SCRIPT.fullmatch(policy), mistake_of(policy)
     if level is None and mistake is None and policy not in FAILING:

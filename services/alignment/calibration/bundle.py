@@ -135,11 +135,8 @@ def weighted_bundle(
 
     The second series has the sources of noise `own`, and a scale of one within `scale_sigma` (one
     sigma; exactly one if 0). Its covariance holds for errors as large as those along changes from
-    place to place, where these are larger than at random.
-
-    Raises:
-        InvalidInputError: mount, target or clock changed along the views, or the steps do not
-            become small.
+    place to place, where these are larger than at random. Raises InvalidInputError: mount, target
+    or clock changed along the views, or the steps do not become small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)

@@ -114,10 +114,8 @@ def turning_of_images(
     """Angular velocity of a camera from the corners that consecutive images share, in its axes.
 
     What is far away moves by the rotation alone; what is near or moves by itself is left out as far
-    as most corners agree. Steps without enough corners (blur, a bare wall) have none.
-
-    Raises:
-        DegenerateMotionError: fewer than half of the steps show enough corners.
+    as most corners agree. Steps without enough corners (blur, a bare wall) have none. Raises
+    DegenerateMotionError: fewer than half of the steps show enough corners.
     """
     times_ns, turns = list[int](), list[np.ndarray]()
     steps_ns = np.diff(t_ns)
@@ -181,11 +179,8 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     """Offset to be added to b's times to align it with a, of streams that turn together.
 
     Offset and turn between their axes are fitted together (Gauss–Newton): where a hand circles, one
-    makes up for the other, and the offset is known the less.
-
-    Raises:
-        DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or the offset is not
-            the same throughout.
+    makes up for the other, and the offset is known the less. Raises DegenerateMotionError,
+    InvalidInputError: as `estimate_time_offset`, or the offset is not the same throughout.
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])

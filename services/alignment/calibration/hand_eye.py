@@ -265,8 +265,7 @@ def project(
 ) -> tuple[Float64[np.ndarray, "n k 2"], Float64[np.ndarray, "n k 2 6"]]:
     """Project corners [n, k, 3], with the Jacobian by twists of the board's poses.
 
-    Raises:
-        InvalidInputError: a corner lies behind the camera.
+    Raises InvalidInputError: a corner lies behind the camera.
     """
     import cv2
 

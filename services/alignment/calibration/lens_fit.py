@@ -89,10 +89,8 @@ def fit_lens(
 ) -> LensFit:
     """Fit a camera to corners [k, 3] (m) of a flat board and where photos show them [k, 2] (px).
 
-    The points are one board's, in the same coordinates in all photos.
-
-    Raises:
-        InvalidInputError: no camera shows the corners so.
+    The points are one board's, in the same coordinates in all photos. Raises InvalidInputError: no
+    camera shows the corners so.
     """
     points = [np.asarray(one, dtype=np.float64) for one in points_board]
     pixels = [np.asarray(one, dtype=np.float64) for one in pixels]

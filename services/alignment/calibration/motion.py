@@ -90,9 +90,8 @@ class Agreement(NamedTuple):
 def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "n 4 4"]]:
     """Validate series of poses: float64 [n, 4, 4], all of one length.
 
-    Raises:
-        ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
-        InvalidInputError: no rigid transforms, or fewer than four.
+    Raises ShapeError, NonFiniteError: no [n, 4, 4], or NaN; InvalidInputError: no rigid transforms,
+    or fewer than four.
     """
     arrays = {name: np.asarray(poses, dtype=np.float64) for name, poses in series.items()}
     shapes = [array.shape for array in arrays.values()]
@@ -124,8 +123,7 @@ def view_pairs(num_views: int) -> np.ndarray:
 def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
     """Refuse poses [n, 4, 4] of a body that turns about a single axis, or hardly at all.
 
-    Raises:
-        DegenerateMotionError: names the axes of the body about which it was not turned.
+    Raises DegenerateMotionError: names the axes of the body about which it was not turned.
     """
     pairs = view_pairs(len(Ts_world_body))
     A = invert(Ts_world_body[pairs[:, 1]]) @ Ts_world_body[pairs[:, 0]]
@@ -248,10 +246,8 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
     """Refuse a series that fits much better when one side is inverted.
 
     Consistency alone cannot show which side is wrong: with both turned round the views agree again,
-    on mount and target exchanged. The shorter mount is the likelier one.
-
-    Raises:
-        InvalidInputError: names the side.
+    on mount and target exchanged. The shorter mount is the likelier one. Raises InvalidInputError:
+    names the side.
     """
     body, target = series.Ts_world_body, series.Ts_mounted_target
     limit = INVERTED_SHARE * _rms(errors)
@@ -280,8 +276,7 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
 def check_scale(series: Series, errors: np.ndarray) -> None:
     """Refuse a target's series in another unit, or of a board of another size than was entered.
 
-    Raises:
-        InvalidInputError: names the series and its scale.
+    Raises InvalidInputError: names the series and its scale.
     """
     if (_rms(errors) < EXACT).all():
         return

@@ -46,8 +46,7 @@ MIN_SIDE = 3
 def place_labels(series: Series, *, min_places: int = MIN_VIEWS) -> Int64[np.ndarray, " n"]:
     """Number of the place of each view, in the order in which they were first visited.
 
-    Raises:
-        InvalidInputError: fewer than `min_places` places.
+    Raises InvalidInputError: fewer than `min_places` places.
     """
     labels = np.full(len(series.Ts_world_body), -1)
     num_places = 0

@@ -155,9 +155,8 @@ def calibrate_glove(
 ) -> GloveCalibration:
     """Gain and fault map of a glove, beside its tare; without presses the tare alone.
 
-    Raises:
-        InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is faulty or
-            was not pressed.
+    Raises InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is faulty or was
+    not pressed.
     """
     if not presses:
         return GloveCalibration(tare, None)
@@ -181,8 +180,7 @@ def filled_gain(
 ) -> Float64[np.ndarray, " taxels"]:
     """Gains in which refused taxels have the median of their pad, or of the glove.
 
-    Raises:
-        InvalidInputError: not one gain is known.
+    Raises InvalidInputError: not one gain is known.
     """
     known = gain.state == OK
     if not known.any():
@@ -205,8 +203,7 @@ def _slices(layout: TactileLayout) -> dict[str, slice]:
 def pad_taxels(names: str, layout: TactileLayout = DEXTOUCH_V1) -> Bool[np.ndarray, " taxels"]:
     """Which taxels belong to pads, named with + between them, such as `thumb+index`, or `all`.
 
-    Raises:
-        UnknownNameError: no such pad.
+    Raises UnknownNameError: no such pad.
     """
     taxels, slices = np.zeros(layout.num_taxels, dtype=np.bool_), _slices(layout)
     for name in names.split("+"):
@@ -229,12 +226,9 @@ def fit_gain(
 
     A taxel is refused, with its state, where it does not answer, saturates in all presses, bends,
     or was pressed too little for 10 % of gain; its gain is then 0 and must not be used. Several
-    pressures show a bent response.
-
-    Raises:
-        InvalidInputError: no press, no taxel that answers, counts that fall under pressure,
-            pressures that do not belong to the takes, or a glove whose response bends or drifts by
-            more than 10 %.
+    pressures show a bent response. Raises InvalidInputError: no press, no taxel that answers,
+    counts that fall under pressure, pressures that do not belong to the takes, or a glove whose
+    response bends or drifts by more than 10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")

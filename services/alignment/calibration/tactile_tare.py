@@ -148,10 +148,8 @@ def checked_counts(
 ) -> Float64[np.ndarray, "time cells"]:
     """Counts as float64.
 
-    Raises:
-        ShapeError: not [T, cells].
-        NonFiniteError: NaN or infinity.
-        InvalidInputError: too few readings.
+    Raises ShapeError: not [T, cells]; NonFiniteError: NaN or infinity; InvalidInputError: too few
+    readings.
     """
     raw = np.asarray(counts, dtype=np.float64)
     if raw.ndim != 2 or raw.shape[1] != layout.num_raw_cells:
@@ -352,8 +350,7 @@ class TactileCalibration:
     def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time taxels"]:
         """Readings [T, cells] by taxel; where there is no cell, those of any other.
 
-        Raises:
-            ShapeError: not [T, cells].
+        Raises ShapeError: not [T, cells].
         """
         raw = np.asarray(counts)
         if raw.ndim != 2 or raw.shape[1] != self.num_cells:

@@ -37,8 +37,7 @@ def taxel_faults(
 ) -> TaxelFaults:
     """What consecutive raw readings [T, cells] of a take say of its taxels.
 
-    Raises:
-        ShapeError: not [T, cells].
+    Raises ShapeError: not [T, cells].
     """
     take = TaxelFaults(
         calibration.tare_counts,

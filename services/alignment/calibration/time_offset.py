@@ -136,9 +136,8 @@ def checked_signal(
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
     """Times of a signal in seconds after a reference [1], and its values [n] or [n, k] as [n, k].
 
-    Raises:
-        InvalidInputError: fewer than two stamps, or stamps out of order.
-        ShapeError, NonFiniteError: values that do not fit or hold NaN.
+    Raises InvalidInputError: fewer than two stamps, or stamps out of order; ShapeError,
+    NonFiniteError: values that do not fit or hold NaN.
     """
     t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(signal, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values

@@ -57,8 +57,7 @@ def checked_keypoints(
 ) -> Float64[np.ndarray, "time 25 3"]:
     """The keypoints as contiguous float64.
 
-    Raises:
-        ShapeError: not [T ≥ 1, 25, 3].
+    Raises ShapeError: not [T ≥ 1, 25, 3].
     """
     keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
@@ -78,9 +77,8 @@ def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
 def seen_samples(keypoints_m: np.ndarray, *, where: str) -> Float64[np.ndarray, "time 25 3"]:
     """Up to 300 samples, evenly spread over those that show the palm; NaN where a node is not seen.
 
-    Raises:
-        ShapeError: not [T ≥ 1, 25, 3].
-        InvalidInputError: no sample shows four nodes of the palm.
+    Raises ShapeError: not [T ≥ 1, 25, 3]; InvalidInputError: no sample shows four nodes of the
+    palm.
     """
     looked_at = seen_nodes(thinned(checked_keypoints(keypoints_m, where=where), MAX_LOOKED_AT))
     num_seen = np.isfinite(looked_at[:, PALM_NODES, 0]).sum(axis=1)
@@ -154,11 +152,8 @@ def check_handedness(
 
     Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
     hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
-    is on the palm's side of the metacarpals.
-
-    Raises:
-        InvalidInputError: they are of the other hand.
-        ShapeError: not [T ≥ 1, 25, 3].
+    is on the palm's side of the metacarpals. Raises InvalidInputError: they are of the other hand;
+    ShapeError: not [T ≥ 1, 25, 3].
     """
     samples = seen_samples(keypoints_m, where=where)
     across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]

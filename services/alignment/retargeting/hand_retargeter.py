@@ -125,9 +125,7 @@ class HandProfile:
     def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":
         """From the matrix of `to_rows`.
 
-        Raises:
-            ShapeError: not [5, 9].
-            InvalidInputError: not finite, or not a valid hand.
+        Raises ShapeError: not [5, 9]; InvalidInputError: not finite, or not a valid hand.
         """
         table = np.asarray(rows, dtype=np.float64)
         if table.shape != (NUM_FINGERS, NUM_COLUMNS):
@@ -145,8 +143,7 @@ def calibrated_profile(
 ) -> HandProfile | None:
     """The hand profile of a recording's calibration; None if it has none.
 
-    Raises:
-        ShapeError, InvalidInputError: it is not a valid hand.
+    Raises ShapeError, InvalidInputError: it is not a valid hand.
     """
     rows = calibration.get(profile_name(side))
     return None if rows is None else HandProfile.from_rows(rows)
@@ -155,8 +152,7 @@ def calibrated_profile(
 def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
     """Refuse an index finger's proximal bone that is not 19.0–66.8 mm long.
 
-    Raises:
-        InvalidInputError: most likely millimetres, or nodes in another order.
+    Raises InvalidInputError: most likely millimetres, or nodes in another order.
     """
     low, high = INDEX_PROXIMAL_RANGE_M
     if not low <= index_proximal_m <= high:

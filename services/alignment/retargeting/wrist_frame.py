@@ -144,11 +144,9 @@ def calibrate_wrist(
 
     Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
 
-    One second of the flat hand is enough; keypoints as for `wrist_frame`.
-
-    Raises:
-        InvalidInputError: as `wrist_frame`, or fewer than 30 samples with straight fingers.
-        ShapeError: not [T ≥ 1, 25, 3].
+    One second of the flat hand is enough; keypoints as for `wrist_frame`. Raises InvalidInputError:
+    as `wrist_frame`, or fewer than 30 samples with straight fingers; ShapeError: not [T ≥ 1, 25,
+    3].
     """
     # Asked for its refusals only.
     seen_samples(keypoints_m, where=where)
@@ -176,10 +174,8 @@ def calibrated_transform(
 ) -> Float64[np.ndarray, "4 4"] | None:
     """A rigid transform of a recording's calibration; None if it has none of this name.
 
-    Raises:
-        ShapeError: not 4 by 4.
-        NonFiniteError: NaN or infinity.
-        InvalidInputError: its rotation is none, or mirrors, or the last row is not 0 0 0 1.
+    Raises ShapeError: not 4 by 4; NonFiniteError: NaN or infinity; InvalidInputError: its rotation
+    is none, or mirrors, or the last row is not 0 0 0 1.
     """
     if name not in calibration:
         return None

@@ -108,8 +108,7 @@ def _palm_m(wrist_m: np.ndarray, knuckles_m: np.ndarray) -> np.ndarray:
 def constant_offset_m(points: MatchedPoints) -> Float64[np.ndarray, "3"]:
     """Constant offset that matches all points of all samples best (least squares: their mean).
 
-    Raises:
-        InvalidInputError: no point was ever tracked.
+    Raises InvalidInputError: no point was ever tracked.
     """
     if not points.seen.any():
         raise InvalidInputError(

@@ -125,9 +125,7 @@ class Photos:
 def parse_board(text: str) -> Board:
     """Parse a board description (`BOARD_HELP`).
 
-    Raises:
-        InvalidInputError: invalid syntax.
-        UnknownNameError: no such kind of board or dictionary.
+    Raises InvalidInputError: invalid syntax; UnknownNameError: no such kind of board or dictionary.
     """
     kind, _, sizes = text.partition(":")
     if kind not in _SIZES:
@@ -184,11 +182,8 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
 def read_photos(paths: Sequence[Path], board: Board) -> Photos:
     """Read photos and find the board in each, with a progress bar.
 
-    The board's print is the one with most corners; others are false detections.
-
-    Raises:
-        CorruptDataError: a file that cannot be decoded.
-        InvalidInputError: photos of different sizes.
+    The board's print is the one with most corners; others are false detections. Raises
+    CorruptDataError: a file that cannot be decoded; InvalidInputError: photos of different sizes.
     """
     seen: list[BoardView] = []
     size: tuple[int, ...] = ()
@@ -224,8 +219,7 @@ def is_ambiguous(board: Board) -> bool:
 def check_unambiguous(board: Board, text: str) -> None:
     """Refuse a board, described as `text`, whose pose is ambiguous.
 
-    Raises:
-        InvalidInputError: it looks the same after half a turn.
+    Raises InvalidInputError: it looks the same after half a turn.
     """
     if is_ambiguous(board):
         raise InvalidInputError(

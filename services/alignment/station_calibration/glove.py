@@ -107,8 +107,7 @@ class PressRow(BaseModel):
     def known_to(self, relative_sigma: float) -> "PressRow":
         """The row with a sigma; without one of its own, a share of the pressure.
 
-        Raises:
-            InvalidInputError: a negative or infinite share.
+        Raises InvalidInputError: a negative or infinite share.
         """
         if not 0 <= relative_sigma < math.inf:
             raise InvalidInputError(

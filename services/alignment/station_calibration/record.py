@@ -104,9 +104,7 @@ def write_pose(
 def read_matrices(folder: Path) -> dict[str, Matrix]:
     """Read the matrices of a folder or a JSON file.
 
-    Raises:
-        NotFoundError: no calibration.
-        CorruptDataError: not a JSON file of matrices.
+    Raises NotFoundError: no calibration; CorruptDataError: not a JSON file of matrices.
     """
     path = folder / MATRICES_FILE if folder.is_dir() else folder
     if not path.is_file():
@@ -204,8 +202,7 @@ class TakeStream:
     def poses(self) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
         """Times and poses of valid tracking.
 
-        Raises:
-            InvalidInputError: fewer than two.
+        Raises InvalidInputError: fewer than two.
         """
         t_ns, values = self.timed()
         poses = values.astype(np.float64)
@@ -280,10 +277,8 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
 def read_pairs(path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
     """Pairs of 4x4 matrices from a JSON file, at least one.
 
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not JSON, or not numbers.
-        ShapeError: not pairs of 4x4.
+    Raises NotFoundError: no such file; InvalidInputError: not JSON, or not numbers; ShapeError: not
+    pairs of 4x4.
     """
     try:
         pairs = np.array(json.loads(_existing(path, expected).read_bytes()), dtype=np.float64)

@@ -97,8 +97,7 @@ class StationLocation:
     def link(self) -> HttpLink:
         """A connection to the station.
 
-        Raises:
-            InvalidInputError: no station is set.
+        Raises InvalidInputError: no station is set.
         """
         if self.url is None:
             raise InvalidInputError(
@@ -135,8 +134,7 @@ class StationLocation:
     def switch_practice(self, *, is_on: bool) -> None:
         """Start or stop the practice devices of the station.
 
-        Raises:
-            ConflictError: the station has real devices.
+        Raises ConflictError: the station has real devices.
         """
         with closing(self.link()) as link:
             link.request("POST", f"/v1/practice/{'start' if is_on else 'stop'}")
@@ -192,9 +190,8 @@ class GuidedRun:
     def answer(self, text: str) -> RunStatus:
         """Answer the question of the run.
 
-        Raises:
-            ConflictError: it asks nothing.
-            InvalidInputError: a text that is none of the answers to this question.
+        Raises ConflictError: it asks nothing; InvalidInputError: a text that is none of the answers
+        to this question.
         """
         with self._lock:
             asked = self._status
@@ -213,8 +210,7 @@ class GuidedRun:
     def order(self, order: Order) -> RunStatus:
         """Keep the present place of a mount's run as soon as it is still, or drop the last one.
 
-        Raises:
-            ConflictError: the run is of another kind, or not on.
+        Raises ConflictError: the run is of another kind, or not on.
         """
         if self._request.kind != "mount" or self._status.state != "running":
             raise ConflictError(
@@ -468,9 +464,8 @@ class CalibrationRuns:
     def start(self, request: RunRequest) -> RunStatus:
         """Begin a run.
 
-        Raises:
-            ConflictError: another one is not done.
-            InvalidInputError: no such board, subject or station.
+        Raises ConflictError: another one is not done; InvalidInputError: no such board, subject or
+        station.
         """
         subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(request.kind, tuple(TRACKERS))
         if request.subject not in subjects:
@@ -496,8 +491,7 @@ class CalibrationRuns:
     def switch_practice(self, *, is_on: bool) -> None:
         """Start or stop the practice devices of the station.
 
-        Raises:
-            ConflictError: a run is on, or the station has real devices.
+        Raises ConflictError: a run is on, or the station has real devices.
         """
         with self._lock:
             if self._run is not None and self._run.status.state not in ENDED:
@@ -514,8 +508,7 @@ class CalibrationRuns:
     def present(self) -> GuidedRun:
         """The run that is on, or the last one.
 
-        Raises:
-            NotFoundError: none was begun.
+        Raises NotFoundError: none was begun.
         """
         if self._run is None:
             raise NotFoundError("calibration run: none was begun; start one first")

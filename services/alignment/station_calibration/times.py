@@ -43,10 +43,8 @@ Say = Callable[[str], None]
 def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Measure the delays of all streams of a take that turned together, after a reference.
 
-    Raises:
-        DegenerateMotionError: too little, too slow or too regular motion, or streams that did not
-            move together.
-        InvalidInputError: fewer than two streams show how they turned.
+    Raises DegenerateMotionError: too little, too slow or too regular motion, or streams that did
+    not move together; InvalidInputError: fewer than two streams show how they turned.
     """
     where = f"take {options.take!r}"
     reader = open_take(options.take, options.store)

@@ -99,12 +99,9 @@ def build_episode(
 
     Streams that the recording lacks are omitted. Time 0 of the episode is the first moment at which
     all streams that make up the action are there. Values of other streams are read only while the
-    episode's blocks are taken.
-
-    Raises:
-        InvalidInputError: streams or calibration that every episode needs are missing, or no
-            stretch without a gap is long enough.
-        ClockFitError: a stream whose stamps fit no clock.
+    episode's blocks are taken. Raises InvalidInputError: streams or calibration that every episode
+    needs are missing, or no stretch without a gap is long enough; ClockFitError: a stream whose
+    stamps fit no clock.
     """
     check_complete(recording)
     objects = options.of_task(recording.attributes.task).objects
@@ -277,8 +274,7 @@ def _episode_attributes(
 def check_complete(recording: RecordingReader) -> None:
     """Refuse a recording from which no episode can be made: one without any hand.
 
-    Raises:
-        InvalidInputError: names the streams that are missing, or a matrix that does not fit.
+    Raises InvalidInputError: names the streams that are missing, or a matrix that does not fit.
     """
     where = f"recording {recording.attributes.recording_id!r}"
     _check_hands(recording, recording.streams)

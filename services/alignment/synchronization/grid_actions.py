@@ -225,11 +225,9 @@ def retarget_hands(
     take the line between their two neighbours, which `gridded.at` has found to be in no gap.
 
     The placement is valid at every step. `hand_profile_SIDE` of the calibration is the person's
-    hand, which is measured from the recording itself where it is absent.
-
-    Raises:
-        InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see
-            `hand_axes_check` and `HandRetargeter.retarget`.
+    hand, which is measured from the recording itself where it is absent. Raises InvalidInputError:
+    keypoints that are not a hand, of the other side or in other axes, see `hand_axes_check` and
+    `HandRetargeter.retarget`.
     """
     recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
     hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}

@@ -73,8 +73,7 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
 def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
     """Refuse a head and wrists that cannot be those of one body (`dextouch.streams`).
 
-    Raises:
-        InvalidInputError: names the stream, and how it is to be read or what is exchanged.
+    Raises InvalidInputError: names the stream, and how it is to be read or what is exchanged.
     """
     if not all(name in streams for name in BODIES):
         return

@@ -159,10 +159,8 @@ class EpisodeStream:
 def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
-    Raises:
-        ClockFitError: its stamps fit no clock.
-        InvalidInputError: calibration is missing or of the wrong shape.
-        UnknownNameError: the recording has no such stream.
+    Raises ClockFitError: its stamps fit no clock; InvalidInputError: calibration is missing or of
+    the wrong shape; UnknownNameError: the recording has no such stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
     timing = time_stream(
@@ -371,8 +369,7 @@ def with_tracked_objects(
 ) -> dict[str, DatedStream]:
     """The streams, those of trackers on objects moved to the objects.
 
-    Raises:
-        InvalidInputError: a stream that is needed is missing, or an object has two sources.
+    Raises InvalidInputError: a stream that is needed is missing, or an object has two sources.
     """
     changed = dict(streams)
     for one in _listed(objects):

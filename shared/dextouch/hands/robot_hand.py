@@ -155,11 +155,7 @@ class HandModel:
         """T_wrist_joint of every hinge after its rotation; [T, 5, 4, 4, 4] for the Wuji hand.
 
         A finger with fewer hinges than another repeats its last frame. Angles [T, J] are in the
-        order of `joint_names`.
-
-        Raises:
-            ShapeError: not [T, J].
-            NonFiniteError: NaN or infinity.
+        order of `joint_names`. Raises ShapeError: not [T, J]; NonFiniteError: NaN or infinity.
         """
         q = np.asarray(joints_rad, dtype=np.float64)
         count = len(self.joint_names)

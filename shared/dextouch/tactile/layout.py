@@ -99,8 +99,7 @@ class TactileLayout(LayoutDescription):
     def raw_indices(self, side: Side) -> Int64[np.ndarray, " taxels"]:
         """Raw cell of each taxel; read-only.
 
-        Raises:
-            UnknownNameError: unknown side.
+        Raises UnknownNameError: unknown side.
         """
         if side not in SIDES:
             raise UnknownNameError("side", side, list(SIDES))
@@ -109,8 +108,7 @@ class TactileLayout(LayoutDescription):
     def check(self, taxels: np.ndarray, *, what: str = "taxels") -> np.ndarray:
         """The array, whose last axis must be the taxels of one hand.
 
-        Raises:
-            ShapeError: it is not.
+        Raises ShapeError: it is not.
         """
         taxels = np.asarray(taxels)
         if taxels.shape[-1:] != (self.num_taxels,):
@@ -123,9 +121,7 @@ class TactileLayout(LayoutDescription):
     def select(self, raw: np.ndarray, *, side: Side) -> np.ndarray:
         """Taxels in anatomical order of raw readings [..., cells]; dtype is kept.
 
-        Raises:
-            ShapeError: another number of cells.
-            UnknownNameError: unknown side.
+        Raises ShapeError: another number of cells; UnknownNameError: unknown side.
         """
         raw = np.asarray(raw)
         if raw.shape[-1:] != (self.num_raw_cells,):
@@ -137,9 +133,7 @@ class TactileLayout(LayoutDescription):
     def expand(self, taxels: np.ndarray, *, side: Side) -> np.ndarray:
         """Raw readings [..., cells] from taxels; cells without a taxel are zero.
 
-        Raises:
-            ShapeError: another number of taxels.
-            UnknownNameError: unknown side.
+        Raises ShapeError: another number of taxels; UnknownNameError: unknown side.
         """
         taxels = self.check(taxels)
         raw = np.zeros((*taxels.shape[:-1], self.num_raw_cells), dtype=taxels.dtype)
@@ -162,8 +156,7 @@ class TactileLayout(LayoutDescription):
     def join(self, stacks: Sequence[np.ndarray]) -> np.ndarray:
         """Taxels from stacks as of `split`.
 
-        Raises:
-            ShapeError: stacks of other pads.
+        Raises ShapeError: stacks of other pads.
         """
         expected = [(count, *shape) for count, shape in self._stacks]
         if [stack.shape[-3:] for stack in stacks] != expected:
@@ -368,9 +361,7 @@ def raw_indices(*, side: Side, glove_model: str = _V1_NAME) -> Int64[np.ndarray,
 def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
 
-    Raises:
-        ShapeError: the last axis is not 360.
-        UnknownNameError: unknown side or glove model.
+    Raises ShapeError: the last axis is not 360; UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).select(raw, side=side)
 
@@ -378,9 +369,7 @@ def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -
 def expand_taxels(taxels: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
 
-    Raises:
-        ShapeError: the last axis is not 320.
-        UnknownNameError: unknown side or glove model.
+    Raises ShapeError: the last axis is not 320; UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).expand(taxels, side=side)
 
@@ -394,8 +383,7 @@ def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
     """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16].
 
-    Raises:
-        ShapeError: other shapes.
+    Raises ShapeError: other shapes.
     """
     palm = np.asarray(palm)
     if palm.shape[-2:] != PALM_SHAPE:
