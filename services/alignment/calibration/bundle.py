@@ -1,16 +1,11 @@
 """Weighted estimate of a mount and a target from two series of poses, with its uncertainty.
 
-Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the
-measured pose B of the target in the mounted frame, and a small correction D of the tracker's
-pose, whose size the tracker's noise limits. First the size of each source of noise is estimated
-from the residuals. Then all poses are found together by Gauss–Newton with analytic Jacobians; the
-corrections, six numbers a view, are eliminated by the Schur complement, so that the system to
-solve has 13 unknowns however many views there are. Hand-eye and robot-base calibration are this
-estimate with another sensor in the second series.
-
-The last unknown is the scale of the second series. A board that is s times as large as was entered
-is measured at 1/s of its distance, which would otherwise move the mount without a trace in its
-covariance.
+Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the measured
+pose B of the target in the mounted frame, and a small correction D of the tracker's pose. The size
+of each source of noise is estimated from the residuals, then all poses together by Gauss–Newton.
+The corrections are eliminated by the Schur complement, which leaves 13 unknowns; the last one is
+the scale of the second series: an error of the board's size would otherwise move the mount without
+a trace in its covariance.
 """
 
 from collections.abc import Callable
@@ -68,10 +63,8 @@ class TrackerNoise:
 class PoseEstimate:
     """How well views determine a pose.
 
-    Attributes:
-        covariance: [6, 6] of the pose's twist: turn (rad) and shift (m) along its own axes.
-        noise: estimated noise (one sigma per axis), named as in the expected one.
-        left_out_views: views that were far off and did not count.
+    `covariance` is of its twist: turn (rad) and shift (m) along its own axes; `noise` the estimated
+    one (one sigma an axis), named as the expected one; `left_out_views` were too far off to count.
     """
 
     covariance: Float64[np.ndarray, "6 6"]
@@ -114,8 +107,7 @@ class Bundle:
     """The mount X, the target's pose Z in the world, the scale, and how well they are known.
 
     `scale` is true over measured lengths of the second series. The covariance is of the twists of
-    X, then of Z (rad, m, in their own frames), then of the logarithm of the scale; rows and columns
-    of what was given are zero.
+    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given.
     """
 
     X: Float64[np.ndarray, "4 4"]
@@ -133,10 +125,10 @@ def weighted_bundle(
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
-    The second series has the sources of noise `own`, and a scale of one within `scale_sigma` (one
-    sigma; exactly one if 0). Its covariance holds for errors as large as those along changes from
-    place to place, where these are larger than at random. Raises InvalidInputError: mount, target
-    or clock changed along the views, or the steps do not become small.
+    The second series has the noise `own`, and a scale of one within `scale_sigma` (exactly one if
+    0). The covariance holds for errors as large as those along changes from place to place. Raises
+    InvalidInputError: mount, target or clock changed along the views, or the steps do not become
+    small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
@@ -185,15 +177,10 @@ def estimate_sigmas(
 ) -> Float64[np.ndarray, " k"]:
     """Standard deviation of each component (variance component estimation).
 
-    The twist left over in view i has the covariance Σ_k θ_k M_ki of components of known shape. The
-    θ that fit best are found by Fisher scoring of the restricted likelihood (Patterson and Thompson
-    1971: it counts the unknowns that were fitted to the same views), with a log-normal prior about
-    the declared sizes, as few views say little.
-
-    Args:
-        left_over: [n, 6] twists of views that are not explained, before the last linear step.
-        J: [n, 6, m] how they change with the m unknowns that are fitted.
-        components: declared sources of noise.
+    The residual twist of view i [n, 6], which changes with the m fitted unknowns by J [n, 6, m],
+    has the covariance Σ_k θ_k M_ki. The best θ are found by Fisher scoring of the restricted
+    likelihood (Patterson and Thompson 1971), with a log-normal prior about the declared sizes, as
+    few views say little.
     """
     M = np.stack([component.shapes for component in components])
     declared = np.log(np.square([component.sigma for component in components]))
@@ -305,10 +292,9 @@ def free_unknowns(*, is_mount_known: bool, is_scale_known: bool) -> np.ndarray:
 def predicted_jacobians(
     Ts: np.ndarray, X_B: np.ndarray, scale: float
 ) -> tuple[Float64[np.ndarray, "n 6 13"], Float64[np.ndarray, "n 6 6"]]:
-    """Jacobians of the measured poses by X, Z and the logarithm of the scale, and by D.
+    """Jacobians of the measured poses by X, Z and log scale, and by D.
 
-    `Ts` are the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z, measured with translations divided by the scale;
-    `X_B` are X · B.
+    `Ts` are the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z, `X_B` are X · B.
     """
     J = np.zeros((len(Ts), 6, 13))
     J[:, :, :6] = -adjoint(invert(Ts))

@@ -1,8 +1,7 @@
 """Path delays of all streams that were shaken together: trackers, cameras, hands in the world.
 
-What is rigidly connected turns alike: each stream shows the same angular velocity, in axes of its
-own. For every two of them the turn between their axes (Kabsch) and the offset in time are
-estimated; the offsets of all pairs are adjusted together, and must agree around every loop.
+What is rigidly connected turns alike. For every two streams the turn between their axes (Kabsch)
+and the offset in time are estimated; the offsets of all pairs must agree around every loop.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -76,7 +75,7 @@ class PairOffset:
 class SharedTimes:
     """Delays of streams after a reference, which has 0.
 
-    `pairs` are the measured offsets, `unusable` says why others are not, and `loop_sigmas` is the
+    `pairs` are the measured offsets, `unusable` says why others are not, `loop_sigmas` is the
     largest error of a loop of three of them, in standard deviations; 0 without a loop.
     """
 
@@ -246,13 +245,10 @@ def _check_constant(
 def shared_times(turnings: Mapping[str, Turning], reference: str) -> SharedTimes:
     """Delays of streams after the reference, from the offsets of all pairs.
 
-    A delay's standard deviation is that of the best chain of pairs to the reference: more pairs of
-    the same streams share their noise, and make it no smaller. What loops miss zero by is added.
-
-    Raises:
-        DegenerateMotionError: a stream that agrees with no other one, or loops that do not close:
-            one of their streams moved by itself.
-        InvalidInputError: fewer than two streams, or the reference is none of them.
+    A delay's sigma is that of the best chain of pairs to the reference (more pairs of the same
+    streams share their noise), and what loops miss zero by. Raises DegenerateMotionError: a stream
+    that agrees with no other one, or loops that do not close; InvalidInputError: fewer than two
+    streams, or the reference is none of them.
     """
     if len(turnings) < 2 or reference not in turnings:
         raise InvalidInputError(
@@ -319,8 +315,7 @@ def _chain_sigmas_ns(
 def _check_loops(names: Sequence[str], pairs: Sequence[PairOffset]) -> float:
     """The largest error of a loop of three offsets in standard deviations.
 
-    Raises:
-        DegenerateMotionError: it is too large; names the stream that the wrong loops share.
+    Refuses one that is too large, and names the stream that the wrong loops share.
     """
     of = {(pair.a, pair.b): pair.offset for pair in pairs}
     worst, wrong, wrong_ms = 0.0, list[tuple[str, str, str]](), 0.0

@@ -1,12 +1,9 @@
 """Where a camera sits on its tracker, and a robot's base in the tracked world, with sigmas.
 
-A closed form provides the initial values, and degenerate motion is refused. Then the noise of
-tracker and camera is estimated from the residuals, and a bundle adjustment weighted with it
-estimates mount, board and the tracker error of every view. Its covariance is that of the result.
-
-A tracker on a robot's end effector says T_world_tracker = T_world_base · T_base_effector ·
-T_effector_tracker in every pose. Where the tracker sits on the effector is found too, unless it
-is given; both as in hand-eye calibration, with the base in the place of the board.
+A closed form provides the initial values, and degenerate motion is refused; then the noise is
+estimated from the residuals, and a weighted bundle adjustment gives mount and target. A tracker on
+a robot's effector says T_world_tracker = T_world_base · T_base_effector · T_effector_tracker: the
+base is in the place of the board.
 """
 
 from collections.abc import Sequence
@@ -62,10 +59,9 @@ POLISH_ROUNDS = 5
 class HandEyeNoise(TrackerNoise):
     """Expected noise, one sigma for each axis; refined from the views.
 
-    That of the tracker and the pixels holds for a Vive tracker and a sharp board. `board_*` are of
-    a board's pose that a solver found, in the camera's axes; they count only where no corners are
-    given. `board_scale` is how well the size of the print is known, as a share: by a
-    ruler a millimetre of 20 cm.
+    Of a Vive tracker and a sharp board. `board_*` are of a board's pose by a solver, in the
+    camera's axes, where no corners are given; `board_scale` is how well the size of the print is
+    known, as a share: by a ruler a millimetre of 20 cm.
     """
 
     pixel_px: float = 0.3
@@ -80,8 +76,7 @@ class HandEyeNoise(TrackerNoise):
 class HandEyeResult(PoseEstimate):
     """Where the camera sits on the tracker, and how well that is known.
 
-    `board_scale` is the size of the board by the tracker's metres over the size that was entered,
-    estimated with the mount, so that its uncertainty is part of the mount's.
+    `board_scale` is the board's size by the tracker's metres over the size that was entered.
     """
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
@@ -297,8 +292,7 @@ def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.
 class RobotBaseResult(PoseEstimate):
     """Pose of the robot's base in the tracked world, and how well it is known.
 
-    `T_effector_tracker`, where the tracker sits, is as given, or found. The two RMS are how far the
-    pairs turn and put the base from there.
+    `T_effector_tracker` is as given, or found; the RMS are how far the pairs are off.
     """
 
     T_world_base: Float64[np.ndarray, "4 4"]
@@ -313,9 +307,7 @@ def solve_robot_base(
     *,
     T_effector_tracker: np.ndarray | None = None,
 ) -> RobotBaseResult:
-    """Estimate the robot's base in the tracked world from simultaneous pairs of poses.
-
-    The noise of tracker and robot is estimated from the pairs too.
+    """Estimate the robot's base in the tracked world, and the noise, from simultaneous poses.
 
     Args:
         Ts_world_tracker: [n ≥ 4, 4, 4] poses of a tracker that the effector carries.
@@ -324,11 +316,10 @@ def solve_robot_base(
             frame; None to find it.
 
     Raises:
-        DegenerateMotionError: the effector was turned too little or about one axis only (or,
-            where the tracker's place is given, hardly moved), or the base stays less known than
-            half a degree and 10 mm.
-        InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series
-            is named).
+        DegenerateMotionError: the effector was turned too little or about one axis only (or, of a
+            known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
+        InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series is
+            named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, effector = checked_poses(

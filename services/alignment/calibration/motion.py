@@ -2,8 +2,7 @@
 
 With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
 = Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by
-R_X alone (Park and Martin 1994), which gives the rotation; the translation is linear. Motions that
-do not determine the result are refused, and views that disagree with the others are left out.
+R_X alone (Park and Martin 1994), which gives the rotation; the translation is linear.
 
 A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(twist) turns T in its
 own frame about its own origin and shifts it along its own axes.
@@ -158,9 +157,8 @@ def missing_axes(missing: np.ndarray) -> list[str]:
 def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement:
     """Mount (in closed form, unless it is given) and target, without outlier views.
 
-    Raises:
-        DegenerateMotionError: the views that agree show no mount.
-        InvalidInputError: the views contradict each other; an inverted series is named.
+    Raises DegenerateMotionError: the views that agree show no mount; InvalidInputError: the views
+    contradict each other (an inverted series is named).
     """
     num_views = len(series.Ts_world_body)
     views = np.arange(num_views)
@@ -243,11 +241,10 @@ def view_errors(
 
 
 def check_sides(series: Series, errors: np.ndarray) -> None:
-    """Refuse a series that fits much better when one side is inverted.
+    """Refuse a series that fits much better when one side is inverted, and name the side.
 
-    Consistency alone cannot show which side is wrong: with both turned round the views agree again,
-    on mount and target exchanged. The shorter mount is the likelier one. Raises InvalidInputError:
-    names the side.
+    With both sides inverted the views agree again, on mount and target exchanged: of two sides that
+    fit, the one with the shorter mount is the likelier.
     """
     body, target = series.Ts_world_body, series.Ts_mounted_target
     limit = INVERTED_SHARE * _rms(errors)

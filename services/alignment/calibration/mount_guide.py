@@ -1,8 +1,7 @@
 """How far the places so far determine a camera's mount on its tracker, and which motion is missing.
 
-Used while an operator still moves the camera in front of a fixed board. Every figure has its wanted
-value, and all of them together decide when there is enough. Motion is named in the camera's axes,
-which the views of the board show without knowing the mount.
+For an operator who still moves the camera in front of a fixed board. Motion is named in the
+camera's axes, which the views show without knowing the mount.
 """
 
 from dataclasses import dataclass
@@ -47,14 +46,7 @@ TURNS: Final = (
 
 @dataclass(frozen=True)
 class Gauge:
-    """One figure that has to reach a value.
-
-    Attributes:
-        title: what it measures.
-        value: how much there is, in words.
-        wanted: how much there has to be, in words.
-        share: of the way, 0 to 1.
-    """
+    """One figure in words, the value that it has to reach, and the share of the way (0 to 1)."""
 
     title: str
     value: str
@@ -66,12 +58,9 @@ class Gauge:
 class MountProgress:
     """What the places so far say of a mount.
 
-    Attributes:
-        num_places: views of one place (within 2 degrees and 10 mm) count once.
-        gauges: figures that have to reach a value, all of them.
-        todo: advice, most important first; empty if there is enough.
-        result: the mount by these places; None while they do not determine it.
-        problem: why the solver refuses the places, in its words; empty if it does not.
+    Views of one place (within 2 degrees and 10 mm) count once. `todo` is advice, most important
+    first, empty if there is enough; `result` the mount, None while it is not determined; `problem`
+    why the solver refuses the places.
     """
 
     num_places: int
@@ -99,13 +88,8 @@ def mount_progress(
 ) -> MountProgress:
     """Solve for the mount and say what is missing.
 
-    Args:
-        Ts_world_tracker: [n ≥ 0, 4, 4] poses of the tracker in the world, in the order of time.
-        Ts_camera_board: [n, 4, 4] poses of the fixed board in the camera, same moments.
-        views: the corners from which the board's poses were computed.
-
-    Raises:
-        ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
+    Arguments are those of `solve_hand_eye`, in the order of time, and may be empty. Raises
+    ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     num_places = _num_places(Ts_world_tracker, Ts_camera_board)
     spreads_rad = turn_spreads(Ts_camera_board)
@@ -150,8 +134,7 @@ def camera_turns(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "pairs 3"]:
 def turn_spreads(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "3"]:
     """How far the camera turned about each of its axes alone: RMS over pairs of views (rad).
 
-    Turns about an oblique axis do not count for the axes that it lies between: of the covariance C
-    of the turns this is 1 / sqrt((C⁻¹)_ii).
+    Of the covariance C of the turns this is 1 / sqrt((C⁻¹)_ii): oblique axes do not count.
     """
     if len(Ts_camera_board) < 2:
         return np.zeros(3)

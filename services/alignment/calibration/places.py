@@ -1,13 +1,8 @@
 """Places at which poses were recorded, and whether residuals change from one place to the next.
 
-A tracker errs by the same amount as long as it stands still, so that fifteen views of one place
-tell hardly more of it than one. They are averaged to one before anything is estimated. Residuals
+A tracker errs alike as long as it stands still: views of one place are averaged to one. Residuals
 that follow the order of the places tell of a mount that slipped, a target or a frame that moved,
 and poses of other times.
-
-`structure` tests residuals of any fit. Independent errors leave as much in any direction of the
-residuals as in any other; a model that does not fit leaves more in those of a few smooth functions,
-of the place in an image for instance.
 """
 
 from typing import NamedTuple
@@ -98,12 +93,10 @@ def excess_over_time(
         expected: noise of the body's poses, rad and m an axis.
 
     Returns:
-        By how much the variances of what was fitted are larger than independent errors make them:
-        drifts and neighbours that err alike.
+        By how much the variances of what was fitted are larger than independent errors make them.
 
     Raises:
-        InvalidInputError: the mount slipped, the target or the body's frame moved, or the two
-            series are not of the same times.
+        InvalidInputError: mount, target or the body's frame moved, or the clocks differ.
     """
     num_places = len(residuals)
     left, fitted = residuals.ravel(), J[:, :, free].reshape(6 * num_places, -1)
@@ -138,8 +131,7 @@ class Structure(NamedTuple):
     """How much of the residuals some functions explain.
 
     Attributes:
-        ratio: mean square of what they explain over that of the rest, both by degree of freedom;
-            about 1 for independent errors (an F statistic).
+        ratio: mean square of what they explain over that of the rest (an F statistic).
         p_value: how probable so large a ratio is for independent Gaussian errors.
         explained: sum of squares that they explain.
         rest: mean square of what they do not, by each of its `freedom` degrees of freedom.
@@ -166,11 +158,13 @@ def structure(
 ) -> Structure:
     """Test whether functions explain residuals of a fit better than chance.
 
+    Independent errors leave as much in any direction of the residuals as in any other.
+
     Args:
         residuals: of one size of error each (whitened).
         fitted: how the residuals change with the unknowns that were fitted.
         functions: what the residuals might follow.
-        num_others: unknowns that were fitted, too, and of which nothing is left in all three.
+        num_others: fitted unknowns of which nothing is left in all three.
         num_together: how many errors in turn are alike, and count as one.
     """
     U, s, _ = np.linalg.svd(fitted / _lengths(fitted), full_matrices=False)
@@ -204,8 +198,7 @@ def _change(left: np.ndarray, fitted: np.ndarray, functions: np.ndarray) -> Stru
 def _num_together(residuals: np.ndarray) -> float:
     """How many places in turn err alike, from the correlation of neighbours (1 if by chance).
 
-    That of an autoregressive series of first order. A tracker whose error varies smoothly over the
-    room errs so while it is moved on.
+    A tracker whose error varies smoothly over the room errs so (autoregressive, first order).
     """
     errors = residuals.reshape(-1, 6)
     correlation = float((errors[1:] * errors[:-1]).sum() / np.square(errors).sum())

@@ -57,17 +57,10 @@ MAX_FAULTY = 0.25
 
 @dataclass(frozen=True)
 class TaxelPress:
-    """A take under known pressure on some of the taxels.
+    """A take [T ≥ 60, cells] under a known pressure on some taxels.
 
-    Args:
-        pressure_kpa: above 0; force / area for a weight.
-        sigma_kpa: one standard deviation of it, 0 or more.
-        counts: [T ≥ 60, cells] raw readings during the press.
-        taxels: which taxels (anatomical order) were pressed.
-
-    Raises:
-        InvalidInputError: a pressure that is not above 0, or no taxel.
-        NonFiniteError: NaN or infinity in the pressure.
+    The pressure is above 0 kPa, its sigma 0 or more. Raises InvalidInputError: another pressure, or
+    no taxel; NonFiniteError: NaN or infinity in the pressure.
     """
 
     pressure_kpa: float
@@ -91,10 +84,9 @@ class TaxelGain:
 
     Attributes:
         gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
-        sigma_counts_per_kpa: of the gain, 0 where refused. It includes what is common to all
-            taxels: errors of the pressures, creep while a press lies, and a bend over pressure or a
-            drift from press to press where the presses show one. A single pressure shows no bend;
-            then it includes the largest that is tolerated.
+        sigma_counts_per_kpa: of the gain, 0 where refused. It includes errors of the pressures,
+            creep while a press lies, and a bend over pressure or a drift from press to press; of a
+            single pressure the largest bend that is tolerated.
         state: index into `tactile_tare.STATES`.
         residual_kpa: [press, taxels] what each press is off the line, 0 where not used.
     """
@@ -115,9 +107,8 @@ class GloveCalibration:
     def matrices(self) -> dict[str, Float64[np.ndarray, "1 cells"]]:
         """Matrices by their names in recordings, in scan order and in the unit of the readings.
 
-        A taxel whose gain was refused gets the median gain of its pad, so that counts of a faulty
-        taxel stay finite; `…_state` says which ones (index into `tactile_tare.STATES`). Cells
-        without a taxel get the median of all.
+        A taxel whose gain was refused gets the median gain of its pad, cells without a taxel that
+        of all; `…_state` says which taxels (index into `tactile_tare.STATES`).
         """
         side, step = self.tare.side, reading_step(self.tare.layout)
         found = {
@@ -224,11 +215,10 @@ def fit_gain(
 ) -> TaxelGain:
     """Weighted straight line of counts over pressure through each taxel's tare.
 
-    A taxel is refused, with its state, where it does not answer, saturates in all presses, bends,
-    or was pressed too little for 10 % of gain; its gain is then 0 and must not be used. Several
-    pressures show a bent response. Raises InvalidInputError: no press, no taxel that answers,
-    counts that fall under pressure, pressures that do not belong to the takes, or a glove whose
-    response bends or drifts by more than 10 %.
+    A taxel that does not answer, saturates in all presses, bends, or was pressed too little for 10
+    % of gain is refused, with its state and a gain of 0. Raises InvalidInputError: no press, no
+    taxel that answers, counts that fall under pressure, pressures that do not belong to the takes,
+    or a glove whose response bends or drifts by more than 10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")
@@ -318,9 +308,6 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
     """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
 
     Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
-
-    Raises:
-        InvalidInputError: it is too large; the trend is named.
     """
     used = points.used[:-1] & good & (gain > 0)
     highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)

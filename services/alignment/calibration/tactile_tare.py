@@ -1,8 +1,7 @@
 """Tare of a glove, detection of faulty taxels, and conversion of raw counts to pressures in kPa.
 
-The tare is the reading and noise of each cell without contact. A taxel is only called faulty on
-evidence: its neighbours (or the others under the same known pressure) moved, and it did not. Where
-nothing around it moved it stays `unproven`.
+A taxel is only called faulty on evidence: its neighbours (or the others under the same known
+pressure) moved, and it did not. Where nothing around it moved it stays `unproven`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -73,11 +72,7 @@ class Level:
 
 @dataclass(frozen=True)
 class TaxelTare:
-    """The zero of each of the raw cells of one glove: their level without load.
-
-    `restless` taxels (anatomical order) moved during the take of so many samples; few are
-    tolerated.
-    """
+    """The zero of the raw cells of a glove without load; few taxels may be `restless` meanwhile."""
 
     side: Side
     level: Level
@@ -93,16 +88,10 @@ class TaxelTare:
 def measure_tare(
     rest_counts: np.ndarray, *, side: Side, layout: TactileLayout = DEXTOUCH_V1
 ) -> TaxelTare:
-    """Zero of every cell from a take without contact.
+    """Zero of every cell from a take [T ≥ 60, cells] without contact, raw counts in scan order.
 
-    Args:
-        rest_counts: [T ≥ 60, cells] raw counts in scan order.
-        side: of the glove.
-        layout: of the glove.
-
-    Raises:
-        InvalidInputError: too short, or the glove was touched or still settling.
-        ShapeError, NonFiniteError: no [T, cells], or NaN.
+    Raises InvalidInputError: too short, or the glove was touched or still settling; ShapeError,
+    NonFiniteError: no [T, cells], or NaN.
     """
     counts = checked_counts(rest_counts, what=f"rest take of the {side} glove", layout=layout)
     level = steady_level(counts)
@@ -131,11 +120,10 @@ def steady_level(counts: Float64[np.ndarray, "time cells"]) -> Level:
 
 
 def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
-    """RMS error of the mean of rounded readings, over all true values.
+    """RMS error of the mean of rounded readings, over all true values; 1/√12 without noise.
 
-    Noise of `noise_counts` (with the rounding's own 1/12) dithers the steps away: the bias of a
-    rounded value x is Σ (−1)^k sin(2πkx) exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and
-    Kollár, Quantization Noise, 2008); 1/√12 without noise.
+    Noise dithers the steps away: the bias of a rounded value x is Σ (−1)^k sin(2πkx)
+    exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and Kollár, Quantization Noise, 2008).
     """
     variance = np.maximum(np.asarray(noise_counts, dtype=np.float64) ** 2 - 1 / 12, 0.0)
     orders = np.arange(1, 40)
@@ -260,7 +248,7 @@ class TactileCalibration:
         side: of the glove.
         num_cells: numbers that the glove sends in each sample.
         cells: raw cell of each taxel in anatomical order, −1 where the glove has none.
-        tare_counts: of each taxel, in the unit in which the glove sends its readings.
+        tare_counts: of each taxel, in the unit of the readings.
         gain_counts_per_kpa: of each taxel, above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.
         step: smallest difference of two readings, in their unit.
@@ -302,18 +290,16 @@ class TactileCalibration:
         """From a recording's calibration matrices.
 
         Args:
-            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells), the latter
-                unless the unit of the layout says it; if there are any `…_taxel_state` (1 × cells)
-                and `…_cells` (1 × taxels), which a glove that names no layout must have unless it
-                sends 360 numbers.
+            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells; the unit of
+                the layout may say it); if any `…_taxel_state` (1 × cells) and `…_cells` (1 ×
+                taxels; needed by a glove without layout that sends other than 360 numbers).
             side: of the glove.
             num_cells: numbers that the glove sends in each sample; None: those of the layout.
             stream: of a further glove of this side, whose matrices begin with its name.
             layout: that the stream names; None of `dextouch_v1`.
 
         Raises:
-            InvalidInputError: a matrix of this side is missing, has the wrong shape or invalid
-                values.
+            InvalidInputError: a matrix is missing, has the wrong shape or invalid values.
             NonFiniteError: NaN or infinity.
         """
         glove, about = stream or f"tactile_{side}", layout or DEXTOUCH_V1
@@ -332,15 +318,10 @@ class TactileCalibration:
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
     ) -> Float32[np.ndarray, "time taxels"]:
-        """Pressures in anatomical order; zero below the tare, NaN where the reading is.
+        """Pressures of readings [T, cells] in anatomical order; zero below the tare, NaN as read.
 
-        Args:
-            counts: [T, cells] raw readings of the glove.
-            refused: uint8 [taxels] of `unusable_taxels`, taxels that are set to zero; by default
-                those that the calibration refuses.
-
-        Raises:
-            ShapeError: not [T, cells].
+        Taxels are zero that `refused` says (uint8 [taxels] of `unusable_taxels`), by default those
+        that the calibration refuses. Raises ShapeError: not [T, cells].
         """
         offsets = self.taxels(counts).astype(np.float64) - self.tare_counts
         taxels = np.maximum(offsets / self.gain_counts_per_kpa, 0.0)

@@ -56,19 +56,11 @@ def unusable_taxels(
 ) -> UInt8[np.ndarray, " taxels"]:
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
-    In addition to those that the glove's calibration refuses: cells that are constant but not at
-    their tare (dead at zero, stuck elsewhere), or become so during the take; cells whose readings
-    are random, those of another cell, or below the tare for most of the time; cells that stay the
-    same within noise while those around them move; and cells that are NaN in more than a tenth of
-    the samples.
-
-    Args:
-        calibration: of the glove.
-        take: what its readings say.
-
-    Raises:
-        InvalidInputError: more than half of the taxels are random, copied, dead, stuck or below
-            their tare, some read more than any finger presses, or all more than their tare.
+    Besides those that the calibration refuses: cells that are constant but not at their tare, also
+    from some moment on (dead at zero, stuck elsewhere), random, those of another cell, mostly below
+    the tare, the same within noise while those around them move, or NaN in more than a tenth of the
+    samples. Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck
+    or below their tare, some read more than any finger presses, or all more than their tare.
     """
     reasons = calibration.state.copy()
     if take.num_samples < MIN_SAMPLES_TO_JUDGE:

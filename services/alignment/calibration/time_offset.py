@@ -1,13 +1,9 @@
 """Time offset between two streams, from common motion or from taps on a table.
 
-Signals of the same motion are low-passed without phase, correlated coarsely over all allowed
-offsets, and then fitted: b's cubic spline, moved by the offset, scaled and shifted, is brought onto
-a by Gauss–Newton. The offset's sigma comes from the fit; brisk motion makes it small, a high
-correlation alone does not.
-
-Taps are the fallback for a glove and a tracker, which have no motion in common: the glove's
-pressure starts between two samples; the tracker's height falls on a line and stops: a hinge, whose
-bend is the touch. The second difference would show the bend too early, so the hinge is fitted.
+Signals of the same motion are correlated coarsely over all allowed offsets; then b's cubic spline
+is fitted to a by Gauss–Newton. Taps are for a glove and a tracker: the pressure starts between two
+samples, and the tracker's height falls on a line and stops: a hinge, whose bend is the touch (the
+second difference would show it too early).
 """
 
 from dataclasses import dataclass
@@ -93,16 +89,14 @@ def estimate_tap_offset(
     t_height_ns: np.ndarray,
     height_m: np.ndarray,
 ) -> TimeOffset:
-    """Estimate the offset between pressure and height from taps at least 0.5 s apart.
+    """Offset to be added to a tracker's stamps to align it with a glove, from taps on a table.
 
     Args:
         t_pressure_ns: stamps [n], int64, strictly increasing.
-        pressure_kpa: the tapping pad's pressure [n]; below 2 kPa in the air.
+        pressure_kpa: the tapping pad's pressure [n]; below 2 kPa in the air. Taps are at least 0.5
+            s apart.
         t_height_ns: stamps [m] of the tracker.
         height_m: height [m] above the table, of a point of the hand.
-
-    Returns:
-        The offset to add to the tracker's timestamps to align them with the glove's.
 
     Raises:
         DegenerateMotionError: no tap, or none that falls briskly onto the table.
