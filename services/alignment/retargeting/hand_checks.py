@@ -1,9 +1,8 @@
 """Checks that tracked keypoints are the expected human hand in metres, in our order of nodes.
 
-Distances that no posture changes reveal the unit and the order of nodes. Other orders, which
-trackers and their users are known to produce, are compared with the mean hand as well: the best is
-named. A mirror image keeps all distances; the direction in which fingers curl distinguishes left
-from right.
+Distances that no posture changes reveal the unit and the order of nodes, of which known other
+orders are named. A mirror image keeps all distances: the direction in which fingers curl
+distinguishes left from right.
 """
 
 from functools import lru_cache
@@ -100,12 +99,9 @@ def thinned(samples: np.ndarray, most: int) -> np.ndarray:
 def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> float:
     """Size of a hand (1: the mean adult); refuses what is none in metres, in our order of nodes.
 
-    Keypoints are in any axes, of either hand; a node that is not seen is NaN.
-
-    Raises:
-        InvalidInputError: another unit or order of nodes (named where it is known: `details`
-            holds `fault` and `found`), or no hand, or too few nodes.
-        ShapeError: not [T ≥ 1, 25, 3].
+    Keypoints are in any axes, of either hand; a node that is not seen is NaN. Raises
+    InvalidInputError: another unit or order of nodes (named where it is known: `details` holds
+    `fault` and `found`), or no hand, or too few nodes; ShapeError: not [T ≥ 1, 25, 3].
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
     sizes, misfits = _compared(distances, _orders()[1])
@@ -150,10 +146,10 @@ def check_handedness(
 ) -> Side | None:
     """The side that a hand shows, None where it shows neither; refuses the mirror image.
 
-    Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
-    hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
-    is on the palm's side of the metacarpals. Raises InvalidInputError: they are of the other hand;
-    ShapeError: not [T ≥ 1, 25, 3].
+    Fingers bend to the palm only: bones turn about an axis that points to the thumb on a right
+    hand. If they hardly bend, the base of the thumb is used, which is on the palm's side of the
+    metacarpals. Raises InvalidInputError: they are of the other hand; ShapeError: not [T ≥ 1, 25,
+    3].
     """
     samples = seen_samples(keypoints_m, where=where)
     across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]

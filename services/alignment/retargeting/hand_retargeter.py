@@ -1,8 +1,7 @@
 """`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand, by its profile.
 
-Tracked points wobble by millimetres; bones do not. Bone lengths and the places of the knuckles in
-the wrist frame are therefore measured once a person, from calibration samples or from a whole
-recording, and later samples are checked against them and solved with them.
+Tracked points wobble by millimetres, bones do not: bone lengths and knuckles are measured once a
+person, and later samples are checked against them and solved with them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -78,8 +77,8 @@ class HandProfile:
     Attributes:
         bone_m: MCP–PIP, PIP–DIP, DIP–tip (of the thumb CMC–MCP, MCP–IP, IP–tip).
         knuckle_m: the MCP (of the thumb: the CMC) in the wrist frame.
-        travel: how much of the travel that the robot's knuckle makes with flexion the tracked one
-            makes: 0 for people, whose knuckles turn in place, 1 for the robot hand itself.
+        travel: share of the robot's knuckle travel with flexion that the tracked one makes: 0 for
+            people, whose knuckles turn in place, 1 for the robot hand itself.
         knuckle_sigma_m: standard deviation per axis of a knuckle's residual motion.
         point_sigma_m: standard deviation, an axis, of the tracker's noise.
     """
@@ -106,16 +105,15 @@ class HandProfile:
     def is_rigid(self) -> bool:
         """Whether this is the robot's own hand (or a copy), with exact bones and knuckles.
 
-        People's tracked bones and knuckles shift by millimetres with the posture; to hold them
-        fixed would bend fingers that are straight.
+        Those of people shift by millimetres with the posture: held fixed, they bend straight
+        fingers.
         """
         return bool(np.median(self.travel) >= RIGID_TRAVEL)
 
     def to_rows(self) -> Float64[np.ndarray, "5 9"]:
         """As a matrix for a recording's calibration.
 
-        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m), the tracker's
-        noise (m; the same in every row).
+        Columns: 3 bones, 3 knuckle coordinates, travel, knuckle sigma, the tracker's noise (m).
         """
         noise_m = np.full(NUM_FINGERS, self.point_sigma_m)
         columns = self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m, noise_m
@@ -210,14 +208,9 @@ def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
 def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
 
-    Args:
-        keypoints_m: [T, 25, 3] any samples of the hand; those with whole fingers count.
-        hand: the robot hand of the same side, whose axes define how far fingers are bent.
-
-    Raises:
-        ShapeError: wrong shape.
-        InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
-            order).
+    Keypoints are [T, 25, 3], any samples of the hand, of which those with whole fingers count; the
+    robot hand of the same side defines how far fingers are bent. Raises ShapeError: wrong shape;
+    InvalidInputError: a finger is complete in no sample, or its bones are invalid (unit, order).
     """
     # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
     points_m = checked_keypoints(keypoints_m)[:, _NODES]
@@ -309,8 +302,8 @@ class RetargetResult:
         joints_rad: angles in the order of the hand's joints (Wuji: 20, firmware order).
         status: `RetargetStatus` a sample.
         finger_status: `RetargetStatus` of every finger.
-        tip_error_m: distance of each fingertip from its measured place, both seen from the
-            knuckle, at the person's size; zero where `solved` is False, since there is none.
+        tip_error_m: distance of each fingertip from its measured place, both seen from the knuckle,
+            at the person's size; zero where `solved` is False.
         solved: which fingers followed points of this sample.
     """
 
@@ -360,13 +353,9 @@ class HandRetargeter:
     def reset(self, joints_rad: np.ndarray | None = None) -> None:
         """Forget all samples: the next `step` searches from several starts.
 
-        Args:
-            joints_rad: [J], where the robot's joints are; the next outputs lead from there at the
-                rate limit. None knows of no joints: the next output is wherever the hand is.
-
-        Raises:
-            ShapeError: not one angle a joint.
-            InvalidInputError: angles that are not finite.
+        The next outputs lead at the rate limit from where the robot's joints are [J]; with None,
+        the next output is wherever the hand is. Raises ShapeError: not one angle a joint;
+        InvalidInputError: angles that are not finite.
         """
         self._memory = self._blank()
         self._was_sent = joints_rad is not None
@@ -380,19 +369,15 @@ class HandRetargeter:
         self._memory.joints_rad[self._is_joint] = np.clip(angles, hand.lower_rad, hand.upper_rad)
 
     def step(self, keypoints_m: np.ndarray, elapsed_s: float = NOMINAL_PERIOD_S) -> RetargetResult:
-        """Joint angles of the next sample, live; fingers that are not tracked hold their angles.
+        """Joint angles of the next sample (T = 1), live; untracked fingers hold their angles.
 
         No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
-        time elapsed, nor than `max_step_rad`, whatever was lost before: a finger that is found
-        again is REACQUIRED until it has caught up. Only the first output after the start or
-        `reset` is where the hand is; give `reset` the robot's angles to begin there.
+        time elapsed, nor than `max_step_rad`: a finger that is found again is REACQUIRED until it
+        has caught up. Only the first output after the start or `reset` is where the hand is.
 
         Args:
             keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
             elapsed_s: since the sample before.
-
-        Returns:
-            A result of one sample (T = 1).
 
         Raises:
             ShapeError: wrong shape.
@@ -460,14 +445,9 @@ class HandRetargeter:
         return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray) -> HandProfile:
-        """Measure the profile of a person from calibration samples.
+        """Measure a person's profile from [T, 25, 3] of an open, closing and spreading hand.
 
-        Args:
-            keypoints_m: [T, 25, 3] of an open, closing and spreading hand.
-
-        Raises:
-            ShapeError: wrong shape.
-            InvalidInputError: wrong unit, or a finger that is complete in no sample.
+        Raises as `measure_profile`.
         """
         return measure_profile(keypoints_m, self.hand)
 
@@ -514,8 +494,7 @@ def warm_up() -> None:
 def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
     """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
 
-    So that a person whose finger is never seen, or missing, has a profile of the others. Trackers
-    may lack the metacarpals of all fingers, which no profile has.
+    So a person whose finger is never seen has a profile of the others.
     """
     filled = keypoints_m
     for chain in CHAINS:

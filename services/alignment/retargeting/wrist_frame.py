@@ -1,9 +1,8 @@
 """Wrist frame in a tracker's own axes, and conversion of a recording's keypoints to wrist axes.
 
 Wrist, metacarpals and knuckles are laid over the mean hand's by a similarity transform (Umeyama
-1991). One transform serves the whole recording: a separate frame for each sample would absorb part
-of the fingers' motion, because the palm deforms with them, and the noise of nine nodes. Keypoints
-in other axes are never turned by guess: only a calibration rotates them, and the result is checked.
+1991), one for the whole recording: of each sample it would absorb part of the fingers' motion,
+because the palm deforms with them. Keypoints in other axes are never turned by guess.
 """
 
 from collections.abc import Mapping
@@ -52,11 +51,10 @@ class WristFrame:
     """Pose of the wrist frame in the axes of keypoints, with its covariance.
 
     Attributes:
-        T_tracker_wrist: rigid; its origin is the wrist node (where that is not seen, where the
-            palm says it is), its axes ours: fingers along -z, thumb side +x, right palm +y, left
-            palm -y.
-        covariance: [3, 3] of the rotation (rad²), about the wrist's own axes: noise, and the
-            difference between this palm's shape and the mean one.
+        T_tracker_wrist: rigid; its origin is the wrist node (where that is not seen, where the palm
+            says it is), its axes ours: fingers along -z, thumb side +x, right palm +y, left palm
+            -y.
+        covariance: [3, 3] of the rotation (rad²) about the wrist's own axes, by noise and shape.
         size: of the hand, 1 is the mean adult's.
         misfit_m: RMS distance of the palm's nodes from the mean hand's of that size.
         turn_rad: how far single samples turn from this frame, RMS.
@@ -79,18 +77,11 @@ class WristFrame:
 def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints") -> WristFrame:
     """Estimate the wrist frame from the palm, in any posture of the fingers.
 
-    Args:
-        keypoints_m: [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
-            `dextouch.hands.NODES`; NaN where a node is not seen. Up to 300 evenly spaced samples
-            are used.
-        side: which hand.
-        where: stream and recording, for the message.
-
-    Raises:
-        InvalidInputError: wrong unit, order of nodes or hand (mirror image), too few nodes of the
-            palm or nodes along a line, or axes that are not fixed to the wrist; `details` holds
-            `fault`.
-        ShapeError: not [T ≥ 1, 25, 3].
+    Keypoints are [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
+    `dextouch.hands.NODES`, NaN where a node is not seen; up to 300 evenly spaced samples are used.
+    `where` is for the message. Raises InvalidInputError: wrong unit, order of nodes or hand (mirror
+    image), too few nodes of the palm or nodes along a line, or axes that are not fixed to the wrist
+    (`details` holds `fault`); ShapeError: not [T ≥ 1, 25, 3].
     """
     samples = seen_samples(keypoints_m, where=where)
     # Nodes along a line have no handedness; that is said before anything that follows from it.
@@ -140,13 +131,11 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
 def calibrate_wrist(
     keypoints_m: np.ndarray, side: Side, *, where: str = "flat-hand take"
 ) -> WristFrame:
-    """Estimate the wrist frame from a take of the flat hand, fingers straight.
+    """Estimate the wrist frame from a take of the flat hand; one second is enough.
 
     Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
-
-    One second of the flat hand is enough; keypoints as for `wrist_frame`. Raises InvalidInputError:
-    as `wrist_frame`, or fewer than 30 samples with straight fingers; ShapeError: not [T ≥ 1, 25,
-    3].
+    Raises InvalidInputError: as `wrist_frame`, or fewer than 30 samples with straight fingers;
+    ShapeError: not [T ≥ 1, 25, 3].
     """
     # Asked for its refusals only.
     seen_samples(keypoints_m, where=where)
@@ -220,16 +209,14 @@ def hand_axes_check(
     """Keypoints of one hand of a recording in wrist axes, checked; not finite where not seen.
 
     Args:
-        keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.NODES`, in wrist axes or,
-            where the calibration says how they are turned, in others that are fixed to the wrist;
-            NaN where a node is not seen.
+        keypoints_m: as `wrist_frame`, in wrist axes or, where the calibration says how they are
+            turned, in others that are fixed to the wrist.
         side: which hand.
         calibration: the recording's; `T_keypoints_SIDE_wrist_SIDE` is read.
 
     Raises:
-        InvalidInputError: what `wrist_frame` refuses (unit, order of nodes, the other hand, too
-            little seen, moving axes); keypoints in other axes than the wrist's, with or without
-            calibration (`details` holds `fault`); a calibration that is no rigid transform.
+        InvalidInputError: as `wrist_frame`; keypoints in other axes than the wrist's, with or
+            without calibration (`details` holds `fault`); a calibration that is no rigid transform.
         ShapeError: not [T ≥ 1, 25, 3], or a calibration that is not 4 by 4.
     """
     where = f"keypoints_{side}"

@@ -1,17 +1,12 @@
 """Transfer of a tracked hand to the robot so that it touches where the person did.
 
-A robot hand is larger than a human one and has different proportions. With a copied wrist pose its
-fingertips and palm are centimetres away from those of the human, and so is its grasp. The wrist is
-therefore shifted, in wrist axes, until the points in contact match the human's:
+With a copied wrist pose the larger robot hand's fingertips and palm are centimetres away from those
+of the human. The wrist is therefore shifted, in wrist axes, until the points in contact match:
 
     T_world_robot = T_world_human @ T_human_robot,  T_human_robot = (identity rotation, offset)
 
-The orientation is unchanged. The shifted hand has the person's posture, but around an object its
-fingertips still miss the human contact points. The solver closes pinches; with an object in
-between, only touch shows which fingertips matter. Those are moved to the human positions, each
-finger by its own four joints, near the retargeted angles; fingers without contact are unchanged.
-Neither task nor object is used, only both hands and, with a glove, its touch; without touch only a
-constant shift remains.
+Fingertips in contact are then moved to the human positions, each finger by its own joints, near the
+retargeted angles. Without touch only a constant shift remains.
 """
 
 from dataclasses import dataclass
@@ -47,10 +42,8 @@ _NO_SHARE: Final = 1e-3
 class MatchedPoints:
     """Positions of thumb … little fingertip and palm of both hands, each in its own wrist frame.
 
-    Attributes:
-        human_m: of the person; zero where not tracked.
-        robot_m: of the robot at the retargeted joint angles.
-        seen: whether the person's nodes of that point were tracked.
+    Those of the robot are at the retargeted joint angles; a person's point that is not `seen` is
+    zero.
     """
 
     human_m: Float64[np.ndarray, "time 6 3"]
@@ -68,16 +61,9 @@ def matched_points(
 ) -> MatchedPoints:
     """Fingertips and palm of a tracked hand and of the robot hand that follows it.
 
-    The palm is halfway between the wrist and the middle of the four finger knuckles.
-
-    Args:
-        keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-        joints_rad: [T, 20], retargeted angles.
-        hand: robot hand of the same side.
-
-    Raises:
-        ShapeError: other shapes.
-        NonFiniteError: joint angles that are not finite.
+    Keypoints are [T, 25, 3] in wrist axes (m; NaN where missing), joints [T, 20]. The palm is
+    halfway between the wrist and the middle of the four finger knuckles. Raises ShapeError: other
+    shapes; NonFiniteError: joint angles that are not finite.
     """
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     if keypoints.shape != (len(joints_rad), NUM_KEYPOINTS, 3):
@@ -124,13 +110,11 @@ def touch_offsets_m(
 
     offset(t) = (Σ k(t, s) F_i(s) dt offset_i(s) + A c) / (Σ k(t, s) F_i(s) dt + A), over samples s
     and points i, with k = exp(-|t - s| / reach), the constant offset c and its weight A. During a
-    grasp it is nearly constant, so that nothing slips. It depends on future samples, so it can
-    only be used for recordings.
+    grasp it is nearly constant, so that nothing slips. It needs future samples.
 
     Args:
         points: of T samples.
-        pad_forces_n: [T, 6] forces on thumb … little fingertip and palm, 0 or more
-            (`dextouch.tactile.pad_forces_n`).
+        pad_forces_n: [T, 6] on thumb … little fingertip and palm, 0 or more (`pad_forces_n`).
         t_s: [T] increasing times with any origin.
 
     Raises:
@@ -185,12 +169,7 @@ def _decaying(
 def shifted_wrist(
     Ts_world_human: np.ndarray, offset_m: np.ndarray
 ) -> Float64[np.ndarray, "time 4 4"]:
-    """T_world_robot of every sample: the human's pose, shifted in the axes of the wrist.
-
-    Args:
-        Ts_world_human: [T, 4, 4].
-        offset_m: [3] or [T, 3].
-    """
+    """Poses [T, 4, 4] of the human wrist, shifted by offsets [3] or [T, 3] in its own axes."""
     Ts = np.array(Ts_world_human, dtype=np.float64)
     shift_world = Ts[:, :3, :3] @ np.broadcast_to(offset_m, (len(Ts), 3))[..., None]
     Ts[:, :3, 3] += shift_world[..., 0]
@@ -206,12 +185,8 @@ def anchored_joints(
 ) -> Float64[np.ndarray, "time 20"]:
     """Joint angles, inside the limits, that move fingertips in contact to the human positions.
 
-    Args:
-        hand: robot hand.
-        joints_rad: [T, 20], retargeted angles inside the limits.
-        points: points of both hands at these angles (`matched_points`).
-        offset_m: [T, 3], offset of the robot's wrist in the human wrist frame (`touch_offsets_m`).
-        shares: [T, 5], share of the distance that each fingertip is moved (`touch_shares`).
+    Retargeted angles are [T, 20], `points` those of both hands there, `offset_m` [T, 3] that of the
+    robot's wrist (`touch_offsets_m`), `shares` [T, 5] of the distance that each tip is moved.
     """
     joints = np.array(joints_rad, dtype=np.float64)
     share = np.where(points.seen[:, :NUM_FINGERS], shares, 0.0)
@@ -284,8 +259,7 @@ def transfer_by_touch(
         t_s: increasing times with any origin.
 
     Returns:
-        T_world_robot of the wrist and joint angles of the robot, and the shift (m) of its wrist in
-        the wrist's own axes.
+        T_world_robot of the wrist, joint angles of the robot, and the shift (m) in wrist axes.
 
     Raises:
         ShapeError: lengths that differ.

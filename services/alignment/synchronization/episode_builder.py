@@ -97,11 +97,10 @@ def build_episode(
 ) -> BuiltEpisode:
     """Fit all clocks, find the longest stretch without a long gap, and make actions on its grid.
 
-    Streams that the recording lacks are omitted. Time 0 of the episode is the first moment at which
-    all streams that make up the action are there. Values of other streams are read only while the
-    episode's blocks are taken. Raises InvalidInputError: streams or calibration that every episode
-    needs are missing, or no stretch without a gap is long enough; ClockFitError: a stream whose
-    stamps fit no clock.
+    Time 0 of the episode is the first moment at which all streams that make up the action are
+    there. Values of other streams are read only while the episode's blocks are taken. Raises
+    InvalidInputError: streams or calibration that every episode needs are missing, or no stretch
+    without a gap is long enough; ClockFitError: a stream whose stamps fit no clock.
     """
     check_complete(recording)
     objects = options.of_task(recording.attributes.task).objects

@@ -47,8 +47,7 @@ REST_RAD_S = 0.1
 class GriddedStreams:
     """Streams that actions are computed from, and the placement of the grid among their samples.
 
-    The values of `TOUCH_STREAMS`, if there are any, are the forces (N) of the hand's pads. Steps
-    need not have touch.
+    Values of `TOUCH_STREAMS` are the forces (N) of the hand's pads; steps need not have touch.
     """
 
     grid_ns: Int64[np.ndarray, " n"]
@@ -76,8 +75,8 @@ class GriddedStreams:
 class GridActions:
     """Actions on the grid; `commanded` is None where nothing was commanded.
 
-    `absent` are the parts of actions that no step has, and `unseen_fingers` says by side at which
-    steps a finger was in a gap of its own.
+    `absent` are the parts of actions that no step has, `unseen_fingers` the steps of each side at
+    which a finger was in a gap of its own.
     """
 
     anchor: AnchorPoses
@@ -133,14 +132,8 @@ def make_actions(
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
     Human hands are retargeted, a robot's joints taken as they are. Parts that were not recorded
-    have the identity as their pose, and joints at rest.
-
-    Args:
-        gridded: placed streams.
-        domain: whose hands act.
-        calibration: of the recording.
-        wrist: where the robot's wrists are that stand for human ones.
-        max_gap_ns: longest time without a finger that is no gap of it; of slow streams longer.
+    have the identity as their pose, and joints at rest. `wrist` says where the robot's wrists are
+    that stand for human ones; a finger may be missing for `max_gap_ns` (of slow streams longer).
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     absent = [name for name in ACTION_STREAMS[domain] if name not in gridded.streams]
@@ -221,13 +214,10 @@ def retarget_hands(
 ) -> dict[Side, RetargetedHand]:
     """Joint angles of the recorded hands on the grid, each from a thread of its own.
 
-    Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
-    take the line between their two neighbours, which `gridded.at` has found to be in no gap.
-
-    The placement is valid at every step. `hand_profile_SIDE` of the calibration is the person's
-    hand, which is measured from the recording itself where it is absent. Raises InvalidInputError:
-    keypoints that are not a hand, of the other side or in other axes, see `hand_axes_check` and
-    `HandRetargeter.retarget`.
+    Every sample is retargeted once, at the rate of the tracker; the grid's steps take the line
+    between their two neighbours. The person's hand is `hand_profile_SIDE` of the calibration, else
+    it is measured from the recording. Raises InvalidInputError: keypoints that are not a hand, of
+    the other side or in other axes (`hand_axes_check`, `HandRetargeter.retarget`).
     """
     recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
     hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}

@@ -39,13 +39,9 @@ class CheckedStream:
 def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
     """Check one stream, and leave out what is implausible.
 
-    Args:
-        stream: of a recording.
-        max_gap_ns: longest gap that is interpolated. Where a tracker found itself anew there will
-            be a longer one, since nothing connects its worlds before and after.
-
-    Raises:
-        InvalidInputError: the whole stream is implausible (`details` has `fault` and `stream`).
+    Where a tracker found itself anew there will be a gap longer than `max_gap_ns`, the longest that
+    is interpolated: nothing connects its worlds before and after. Raises InvalidInputError: the
+    whole stream is implausible (`details` has `fault` and `stream`).
     """
     kind, name = stream.descriptor.kind, stream.name
     if stream.implausible:

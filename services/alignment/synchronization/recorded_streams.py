@@ -1,9 +1,8 @@
 """Streams of a recording on the host's clock, converted to the units of episodes, and cut to one.
 
-Stamps are read whole, values only where they are asked for, in pieces: an hour of images or
-pressures is never in memory at once. Images of `jpeg` and `h264` streams go over as the bytes that
-they are: nothing is decoded but for markers on objects, whose poses become streams too. An object
-has samples only where it was seen, so that gaps show where it was not.
+Stamps are read whole, values in pieces: an hour of images or pressures is never in memory at once.
+Encoded images go over as they are; they are decoded only for markers on objects, whose poses become
+streams that have samples only where the object was seen.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -92,9 +91,9 @@ class LoadedStream:
 class DatedStream:
     """One stream on the host's clock, whose values are read on demand.
 
-    `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
-    matrices that the episode carries beside those of the recording. `unseen` are keypoints that are
-    not to be believed, which become NaN, and `implausible` samples that were found on the way.
+    `descriptor` is that of the episode; `quality` are figures for the record, `calibration`
+    matrices that the episode carries besides. `unseen` are keypoints that are not to be believed,
+    which become NaN, and `implausible` samples that were found on the way.
     """
 
     recording: RecordingReader
@@ -198,8 +197,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
     """The samples of the episode's time, with the neighbours that its ends need.
 
-    `origin_ns` is the host time of the episode's time 0; `last_ns`, of the last step, counts from
-    there.
+    `origin_ns` is the host time of time 0; `last_ns`, of the last step, counts from there.
     """
     margin_ns = round(EDGE_PERIODS * stream.descriptor.period_ns())
     edges_ns = [origin_ns - margin_ns, origin_ns + last_ns + margin_ns]
@@ -217,8 +215,7 @@ def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStre
 def check_lens(stream: StreamDescriptor, calibration: Mapping[str, Matrix], *, where: str) -> None:
     """Refuse matrices of a camera that are none, or measured on images of another size.
 
-    Matrices that are absent are not asked for. Images are never undistorted here: the episode
-    carries `distortion_<camera>` beside `K_<camera>`.
+    Images are never undistorted here: the episode carries `distortion_<camera>` beside K.
     """
     camera = stream.name.removeprefix("camera_")
     if stream.kind != "image" or camera == stream.name:
@@ -412,13 +409,8 @@ def marker_streams(
 ) -> list[EpisodeStream]:
     """Poses of the objects that have markers; objects that were never seen are omitted.
 
-    Args:
-        recording: its calibration has K_head and, of a lens with distortion, distortion_head.
-        streams: of the recording, by name.
-        objects: of the recording's task.
-        inside_ns: host times of the first and the last step of the episode.
-        max_gap_ns: longest gap between poses of the camera.
-        on_progress: called as images are searched.
+    `inside_ns` are host times of the first and the last step of the episode, `max_gap_ns` the
+    longest gap between poses of the camera.
     """
     listed = [one for one in _listed(objects) if one.markers]
     if objects is None or not listed:

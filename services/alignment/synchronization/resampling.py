@@ -1,8 +1,7 @@
 """Resampling of vectors and poses to a common time grid, never across a gap, and what that refuses.
 
-An episode carries the parts of its recording that are not in it as matrices beside its calibration,
-one a reason and stream: `refused_<reason>_<stream>_s`, rows of start and stop in seconds after the
-recording's start.
+An episode carries the parts of its recording that are not in it as matrices, one a reason and
+stream: `refused_<reason>_<stream>_s`, rows of start and stop in seconds after its start.
 """
 
 import re
@@ -37,8 +36,8 @@ NS_PER_S = 1e9
 class GridPlacement:
     """Neighbouring samples and weights of each grid step in one stream.
 
-    `weight` of the right neighbour lies in [0, 1] inside the samples; within `EDGE_PERIODS`
-    of the ends it may lie outside (the line through the last two samples goes on).
+    `weight` of the right neighbour is in [0, 1], but outside within `EDGE_PERIODS` of the ends (the
+    line through the last two samples goes on).
     """
 
     left: Int64[np.ndarray, " n"]
@@ -59,10 +58,9 @@ def stream_gap_ns(max_gap_ns: int, period_ns: int) -> int:
 def place_on_grid(
     t_ns: np.ndarray, grid_ns: np.ndarray, *, period_ns: int, max_gap_ns: int
 ) -> GridPlacement:
-    """Neighbours and weights of grid times among samples of a nominal period.
+    """Neighbours and weights of grid times among samples with increasing times and a period.
 
-    Sample times are strictly increasing; fewer than two make every step invalid. Two that are
-    further apart than `max_gap_ns` are not connected.
+    Fewer than two make every step invalid; two further apart than `max_gap_ns` are not connected.
     """
     t_ns, grid_ns = np.asarray(t_ns, dtype=np.int64), np.asarray(grid_ns, dtype=np.int64)
     if t_ns.size < 2:
@@ -121,10 +119,9 @@ def bridged_run(valid: np.ndarray, *, max_steps: int) -> tuple[int, int]:
 
 
 class RefusedPart(FrozenModel):
-    """A stretch of the recording that is not in the episode.
+    """A stretch of the recording that is not in the episode, in seconds after its start.
 
-    `start_s` and `stop_s` count from the recording's start; `stream` is the one to blame, None
-    where none is.
+    `stream` is the one to blame, None where none is.
     """
 
     start_s: FiniteFloat
@@ -153,8 +150,8 @@ def refused_stretches(
 ) -> list[RefusedPart]:
     """Steps of the grid that are not in the episode, which has the steps `taken`: first, stop.
 
-    `t_ns` are times of at least two steps on the clock of `start_ns`, the recording's start;
-    `valid` says of each stream whether it can be read at each step.
+    `t_ns` are two times or more on the clock of the recording's start, `start_ns`; `valid` says of
+    each stream whether it can be read at each step.
     """
     step_ns = int(t_ns[1] - t_ns[0])
 
@@ -185,10 +182,9 @@ def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> 
 def interpolated_fingers(
     t_ns: np.ndarray, unseen: Mapping[Side, Bool[np.ndarray, "n 5"]]
 ) -> dict[str, Matrix]:
-    """When each finger was missing at steps of the episode, as it carries that.
+    """When each finger was missing at steps of the episode: start, stop (s), and the finger.
 
-    Rows are start and stop in seconds on the episode's clock, and the finger. Fingers that no step
-    has are absent parts of the episode instead.
+    Fingers that no step has are absent parts of the episode instead.
     """
     found = {}
     for side, of_hand in unseen.items():

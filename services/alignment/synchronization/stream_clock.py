@@ -81,16 +81,11 @@ def time_stream(
 ) -> TimedStream:
     """Fit the device's clock and compute the time of every sample.
 
-    The device's stamps are used where there are any (unless samples are numbered and the stamps, by
-    what is declared or by what they show, are coarser than a quarter of the period), else its
-    sequence numbers times the nominal period, else the count of samples that a steady device must
-    have sent, else the arrivals as they are.
-
-    The calibrated constant path delay `latency_ns` is taken away from all times; its sigma is None
-    if it was not measured.
-
-    Raises:
-        ClockFitError: too few samples, or stamps that no clock gives; names the stream.
+    The device's stamps are used where there are any (unless samples are numbered and the stamps are
+    declared or shown to be coarser than a quarter of the period), else its sequence numbers times
+    the period, else the count of samples that a steady device must have sent, else the arrivals.
+    The calibrated path delay `latency_ns` is taken away; its sigma is None if it was not measured.
+    Raises ClockFitError: too few samples, or stamps that no clock gives; names the stream.
     """
     try:
         dated = _dated(batch, descriptor)

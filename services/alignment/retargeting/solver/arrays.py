@@ -178,11 +178,9 @@ class RetargetOptions:
             weight (directions of people's bones count as points at 40 mm); at other rates in
             proportion to the rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
-        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
-            regardless of the elapsed time; the default is 9.6 rad/s at 30 Hz, the rate of the
-            slowest trackers.
-        pinch_far_m: from this distance of thumb and fingertip on the vector between them has no
-            weight, and they are solved apart.
+        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs;
+            the default is 9.6 rad/s at 30 Hz, the rate of the slowest trackers.
+        pinch_far_m: from this distance of thumb and fingertip on they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
     """
@@ -214,8 +212,7 @@ class RetargetOptions:
     def tuning(self, *, is_live: bool = False) -> np.ndarray:
         """The options as the record, shape [1], that the compiled solver reads.
 
-        Args:
-            is_live: every output is sent to motors, so no joint goes further than `max_step_rad`.
+        Where `is_live`, motors follow: no joint goes further than `max_step_rad`.
         """
         types = [(field.name, field.type) for field in fields(self)]
         return np.array([(*astuple(self), is_live)], dtype=[*types, ("is_live", bool)])

@@ -1,10 +1,8 @@
 """The least-squares problem of one finger or a group of pinching fingers, and its minimizer.
 
-Points of the virtual finger and their Jacobian give the cost and its Gauss–Newton Hessian.
-Levenberg–Marquardt with an active set: a joint at a border whose gradient points outward is held
-there, a step is cut at the border, so that limits hold exactly. A group is one finger alone, or the
-thumb and the fingers near it: an arrow-shaped system that is reduced to the thumb's block (Schur
-complement).
+Levenberg–Marquardt with an active set: a joint at a border whose gradient points outward is held, a
+step is cut at the border, so that limits hold exactly. The thumb and the fingers near it are an
+arrow-shaped system that is reduced to the thumb's block (Schur complement).
 """
 
 from typing import no_type_check

@@ -45,11 +45,8 @@ def follow_point(before, now, variance_m2):
 def noise_of_bones(bones_m, keypoints, nodes):
     """Mean square of the noise's length, by how the lengths of bones differ from their mean.
 
-    Args:
-        bones_m: [F, 3, 3], of each bone how often it was seen, its mean length and the mean
-            deviation from it, changed in place.
-        keypoints: [K, 3] of one sample.
-        nodes: [F, 4] of knuckle, PIP, DIP and tip, -1 where there is none.
+    Of each bone [F, 3, 3], changed in place: how often it was seen, its mean length and the mean
+    deviation. Keypoints are [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
     """
     total, count = 0.0, 0
     for finger in range(len(bones_m)):
@@ -91,9 +88,7 @@ def smooth_forward(keypoints, variance_m2):
 def smoothed(keypoints_m: np.ndarray, sigma_m: float) -> np.ndarray:
     """Keypoints [T, K, 3] smoothed forwards and backwards; the mean of both has no lag.
 
-    Args:
-        keypoints_m: NaN where missing.
-        sigma_m: the tracker's noise, standard deviation per axis.
+    NaN where missing; sigma is that of the tracker's noise, per axis.
     """
     passes = keypoints_m.copy(), keypoints_m[::-1].copy()
     for one in passes:

@@ -1,11 +1,8 @@
 """Entry point of the compiled solver: joint angles for every sample of a tracked hand.
 
-Samples are checked for plausibility first, finger by finger.
-
 Every finger is a small least-squares problem in a box: points of a *virtual hand* (the robot's
 axes, the person's bones) against measured points, plus a pull towards the sample before. Thumb and
-fingers that come near one another are solved together: vectors between the robot's own fingertips
-against the measured ones.
+fingers near one another are solved together, by vectors between the robot's own fingertips.
 """
 
 from typing import no_type_check
@@ -74,9 +71,8 @@ def read_sample(hand, person, work, keypoints, memory):
 def check_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
-    Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
-    errors of the tracker; the whole finger is rejected, because the wrong point cannot be
-    identified.
+    With bones of a length or bend that no finger has, or a knuckle far off, the whole finger is
+    rejected: the wrong point cannot be identified.
     """
     measured, usable = work.measured[finger], work.usable[finger]
     count, expected = 0, 0
