@@ -52,11 +52,7 @@ WHY = {
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run `dextouch align`: align recordings, report on one, or retarget one to another hand.
-
-    Returns:
-        0, or 3 if a recording was refused, with the reason on stderr.
-    """
+    """Run `dextouch align`; returns 0, or 3 if a recording was refused (reason on stderr)."""
     settings = load_settings(AlignmentSettings, [])
     parsed = align_parser(settings).parse_args(list(argv))
     if getattr(parsed, "objects", None) is not None:
@@ -185,8 +181,7 @@ def align_batch(
 ) -> Iterator[Outcome]:
     """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
 
-    `num_workers` are aligned at the same time, each in its own process; `on_progress` is called
-    from several threads.
+    Each worker is a process of its own; `on_progress` is called from several threads.
     """
     workers = [AlignmentWorker(store_url) for _ in range(num_workers)]
     idle = workers.copy()

@@ -56,14 +56,9 @@ class JobQueue:
     """All jobs of one service, in the order in which they were submitted.
 
     Change jobs only while holding `lock`; a change that cannot be saved raises `StorageError` and
-    leaves them as they were. Belongs to one event loop.
-
-    Args:
-        max_open: jobs that may wait or run.
-        max_kept: jobs that are remembered; the oldest ended ones are forgotten first.
-
-    Attributes:
-        problem: why the jobs could not be opened; they are neither listed nor accepted then.
+    leaves them as they were. Belongs to one event loop. `max_open` jobs may wait or run; of more
+    than `max_kept` the oldest ended ones are forgotten. `problem` is why the jobs could not be
+    opened: they are neither listed nor accepted then.
     """
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:
@@ -165,8 +160,7 @@ class JobQueue:
     async def add(self, jobs: Sequence[AlignmentJob]) -> None:
         """Append new jobs; those that wait, run or are done stay as they are.
 
-        Raises:
-            LimitExceededError: too many would be open; none is added.
+        Raises LimitExceededError: too many would be open; none is added.
         """
         known = {key for key, job in self._jobs.items() if job.state not in {"failed", "cancelled"}}
         new = {job.alignment_id: job for job in jobs if job.alignment_id not in known}
@@ -224,17 +218,11 @@ def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
 
 
 class JobDatabase:
-    """The table of jobs in SQLite; one process at a time may open it.
+    """The table of jobs in SQLite, in a folder that is made if needed; for one process at a time.
 
-    Every commit is on disk when it returns (write-ahead log, synchronous=FULL).
-
-    Args:
-        folder: of the database, created if needed.
-
-    Raises:
-        ConflictError: another process has it open.
-        CorruptDataError: the database is damaged.
-        StorageError: it cannot be read or written.
+    Every commit is on disk when it returns (write-ahead log, synchronous=FULL). Raises
+    ConflictError: another process has it open; CorruptDataError: it is damaged; StorageError: it
+    cannot be read or written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -284,8 +272,7 @@ class JobDatabase:
     def commit(self, removed: Iterable[str], saved: Iterable[AlignmentJob]) -> None:
         """Remove jobs, then insert or update others, in one transaction.
 
-        Raises:
-            StorageFullError: no space is left; nothing changed.
+        Raises StorageFullError: no space is left; nothing changed.
         """
         delete = "DELETE FROM jobs WHERE alignment_id = ?"
         with self._errors("write"), self._guard, self._connection as connection:

@@ -82,8 +82,8 @@ class AlignmentMetrics:
 class JobRunner:
     """The alignments of one store; asking again for the same one gives the same job.
 
-    Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs,
-    which are kept in `jobs_folder`; `metrics` shows them.
+    Runs between `start` and `close`, in one event loop. `queue` holds the jobs, which are kept in
+    `jobs_folder`; `metrics` shows them.
     """
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
@@ -106,8 +106,7 @@ class JobRunner:
     async def start(self) -> None:
         """Load the jobs on disk and start working on them.
 
-        While they cannot be opened the service runs without them: `queue.problem` says why, and
-        they are tried again every few seconds.
+        If they cannot be opened (`queue.problem`) they are tried again every few seconds.
         """
         is_open = await self._open_queue()
         await self._sweep()
@@ -305,12 +304,11 @@ class JobRunner:
 class NewRecordings:
     """Lists a store and submits a job for each recording that has no episode yet, once.
 
-    A recording is skipped when it has a job, in whatever state; when an episode
-    made from it is in the store or its trash, under any options; or when it is a calibration take.
-    One that cannot be aligned becomes a failed job with the reason; if the disk was full, it is
-    submitted again after RETRY_S. One that cannot be read is logged and tried again after RETRY_S.
-    One that comes back under the id of another that was deleted while this was watching counts as
-    new unless an episode was made from its content.
+    A recording is skipped when it has a job, in whatever state; when an episode made from it is in
+    the store or its trash, under any options; or when it is a calibration take. One that cannot be
+    aligned becomes a failed job with the reason (submitted again after RETRY_S if the disk was
+    full); one that cannot be read is tried again after RETRY_S. One that comes back under the id of
+    a deleted one is new unless an episode was made from its content.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:

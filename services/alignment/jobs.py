@@ -1,8 +1,4 @@
-"""Alignment of one recording into an episode of the same store, here or in a process of its own.
-
-With `AlignmentWorker` recordings are aligned side by side on several processors, and a process that
-is killed takes nothing but its own recording along.
-"""
+"""Alignment of one recording into an episode of the same store, here or in a process of its own."""
 
 import hashlib
 import sys
@@ -54,10 +50,10 @@ def align_recording(
     """Align one recording and write the episode.
 
     The episode's id follows from the recording's content and the options: doing it again, even from
-    two processes at once, gives the same episode and writes nothing. Progress is told in the
-    caller's thread. Raises NotFoundError: no such recording, or it was deleted meanwhile;
-    InvalidInputError: the recording lacks data that an episode needs (the message names it);
-    CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
+    two processes at once, gives the same episode. Progress is told in the caller's thread. Raises
+    NotFoundError: no such recording, or it was deleted meanwhile; InvalidInputError: the recording
+    lacks data that an episode needs (the message names it); CorruptDataError, StorageError: the
+    store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
@@ -98,9 +94,7 @@ def check_recordings(
 ) -> dict[str, str]:
     """Check several recordings; returns the id of each one's episode.
 
-    Raises:
-        NotFoundError: no such recording; of several, the message names all that are refused.
-        InvalidInputError: one lacks what every episode needs.
+    Raises as `check_recording`; of several, the message names all that are refused.
     """
     episodes: dict[str, str] = {}
     refused: dict[str, DexTouchError] = {}
@@ -165,9 +159,8 @@ class AlignmentWorker:
     ) -> AlignmentReport:
         """Align a finished recording; its progress is told a few times a second.
 
-        Raises:
-            UnavailableError: the process was killed; the store is as it was.
-            DexTouchError: as `align_recording`.
+        Raises UnavailableError: the process was killed, the store is as it was; others as
+        `align_recording`.
         """
         with self._in_use:
             self.start()

@@ -1,10 +1,8 @@
 """Markers on objects: poses of the objects in images, and sheets of markers to print.
 
-An object's pose comes from its ArUco or AprilTag markers, as a camera of known pose sees them. That
-of a single square has two solutions that look almost alike when it is small or seen from the front
-(Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). The other markers of
-the object decide, or a clearly smaller error, or the pose that the object had in neighbouring
-images; where nothing decides, the object counts as not seen.
+The pose of a single square has two solutions that look almost alike when it is small or seen from
+the front (Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). Other
+markers of the object decide, or a clearly smaller error, or the pose in neighbouring images.
 """
 
 from collections.abc import Iterator, Sequence
@@ -44,11 +42,7 @@ _EDGE_MM, _LABEL_MM = 12.0, 5.0
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """Where an object was seen.
-
-    `t_ns` are the times of the images that show it, `Ts_world_object` its poses there and
-    `reprojection_px` the RMS distance between corners as found and as predicted by the pose.
-    """
+    """Poses of an object at the times of the images that show it, and its corners' RMS error."""
 
     t_ns: Int64[np.ndarray, " n"]
     Ts_world_object: Float64[np.ndarray, "n 4 4"]
@@ -65,9 +59,8 @@ class MarkerDetector:
     """Finds markers of a dictionary in gray images, with unbiased corners.
 
     Of OpenCV's ways to refine corners, only the lines that AprilTag's fits to the edges have no
-    bias: the corners of the others lie inside the marker, and with 30 to 40 px a side objects come
-    out 3 to 14 mm too far away. It searches whole images, which takes long where they are noisy, so
-    that it is given the surroundings of markers that were found without it.
+    bias: others put objects with 30 to 40 px a side 3 to 14 mm too far away. It is slow on whole
+    noisy images, so that it is given the surroundings of markers that were found without it.
     """
 
     def __init__(self, dictionary: MarkerDictionary) -> None:
@@ -121,11 +114,7 @@ def _detected(
 class MarkerTracker:
     """Finds the objects of one task in the images of a camera.
 
-    Args:
-        objects: of the task.
-        dictionary: of their markers.
-        K: of the camera, in px, pixel centres at half-integers.
-        distortion: k1 k2 p1 p2 k3.
+    `K` is in px, pixel centres at half-integers; the distortion k1 k2 p1 p2 k3.
     """
 
     def __init__(

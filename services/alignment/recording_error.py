@@ -37,8 +37,8 @@ CLEARLY_BETTER = 0.5
 class Match:
     """Correspondence of the samples of a stream with the true ones.
 
-    `offset_ns` is episode time minus true time of each pair; `num_dropped` true samples between
-    the first and the last pair have none.
+    `offset_ns` is episode time minus true time of each pair; `num_dropped` true samples between the
+    first and the last pair have none.
     """
 
     index: Int64[np.ndarray, " n"]
@@ -57,20 +57,15 @@ def compare_with_truth(
 ) -> dict[str, Any]:
     """Errors of an episode against the truth episode that its mock devices replayed.
 
-    Args:
-        episode: made by alignment from the recording of the replay.
-        truth: the replayed episode.
-        origin_in_truth_ns: true time of the episode's time 0.
+    `origin_in_truth_ns` is the true time of the episode's time 0. Raises InvalidInputError: the two
+    share no stream.
 
     Returns:
-        `clock_rms_ms` {stream: ms} without each stream's constant delay; `latency_ms` {stream:
-        the delay, calibrated plus found}; `latency_error_ms` {stream: what calibration left};
-        `num_dropped` {stream}; `taxel_iou` and `taxel_mae_kpa` over samples that arrived (None
-        without gloves); `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg`, means over
-        the model grid.
-
-    Raises:
-        InvalidInputError: the two share no stream.
+        `clock_rms_ms` {stream: ms} without each stream's constant delay; `latency_ms` {stream: the
+            delay, calibrated plus found}; `latency_error_ms` {stream: what calibration left};
+            `num_dropped` {stream}; `taxel_iou` and `taxel_mae_kpa` over samples that arrived (None
+            without gloves); `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg`, means over
+            the model grid.
     """
     origin_ns = origin_in_truth_ns
     matches = match_streams(episode, truth, origin_ns)
@@ -128,8 +123,7 @@ def match_samples(
 ) -> Match:
     """Match every sample with its true one, near in time and of similar values.
 
-    A constant delay may be longer than a period, so shifts by whole periods, up to `reach_ns`, are
-    tried too, and used if the values then match clearly better.
+    Shifts by whole periods up to `reach_ns` are tried too, and used if values match clearly better.
     """
     num = round(reach_ns / period_ns)
     shifts_ns = [origin_ns + period_ns * shift for shift in sorted(range(-num, num + 1), key=abs)]

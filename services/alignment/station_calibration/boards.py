@@ -65,8 +65,7 @@ class BoardView:
     """Corners of the board detected in one photo.
 
     `points_board` are positions on the board (m), `pixels` follow OpenCV: the centre of the first
-    pixel is 0, 0. `pattern` is the board's print. `is_blurred` photos must be excluded: camera or
-    board moved, and the corners are inaccurate.
+    pixel is 0, 0. `pattern` is the board's print. `is_blurred` photos must be excluded.
     """
 
     name: str
@@ -180,10 +179,10 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
 
 
 def read_photos(paths: Sequence[Path], board: Board) -> Photos:
-    """Read photos and find the board in each, with a progress bar.
+    """Read photos and find the board in each; its print is the one with most corners.
 
-    The board's print is the one with most corners; others are false detections. Raises
-    CorruptDataError: a file that cannot be decoded; InvalidInputError: photos of different sizes.
+    Raises CorruptDataError: a file that cannot be decoded; InvalidInputError: photos of different
+    sizes.
     """
     seen: list[BoardView] = []
     size: tuple[int, ...] = ()
@@ -273,12 +272,10 @@ def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.
 class Coverage:
     """Coverage of a camera by views of a board.
 
-    Attributes:
-        views_by_region: number of views with corners in each ninth of the image.
-        tilts_rad: [n, 2] angle of the board's normal to the viewing ray: right, down.
-        focal_sigma: standard deviation of the focal length that these views give, as a share of
-            it; infinity where they give none.
-        todo: advice, most important first; empty if the coverage is sufficient.
+    `views_by_region` are numbers of views with corners in each ninth of the image, `tilts_rad` [n,
+    2] angles of the board's normal to the viewing ray (right, down), `focal_sigma` the sigma of the
+    focal length by these views as a share of it (infinity where they give none), `todo` advice,
+    most important first.
     """
 
     views_by_region: Int64[np.ndarray, "3 3"]
@@ -290,12 +287,9 @@ class Coverage:
 def camera_coverage(
     views: Sequence[BoardView], size_px: tuple[int, int], lens: Lens | None = None
 ) -> Coverage:
-    """Coverage of the image by positions, tilts and sizes of the board, and what it gives.
+    """Coverage of images of a size by positions, tilts and sizes of the board, and what it gives.
 
-    Args:
-        views: views with a detected board.
-        size_px: width and height of the photos.
-        lens: lens of the camera; a default guess if unknown.
+    The lens is a guess if None.
     """
     lens = lens or Lens.guessed(*size_px)
     by_region, by_edge = np.zeros((3, 3), dtype=np.int64), np.zeros(4, dtype=np.int64)

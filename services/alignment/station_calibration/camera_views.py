@@ -184,8 +184,7 @@ class Session:
         say: tells the operator something.
 
     Attributes:
-        views: kept so far.
-        coverage: of these views; None before the first.
+        coverage: of the views that are kept; None before the first.
         size_px: width and height of the newest image.
         todo: what to do next; empty if the coverage is sufficient.
         newest: board in the newest image; None if there is none.

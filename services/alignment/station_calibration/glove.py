@@ -196,13 +196,8 @@ def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> flo
 class Guide:
     """Leads an operator, who lays the glove down and presses it while a station records takes.
 
-    An invalid take is explained and repeated.
-
-    Args:
-        options: of the command.
-        recorder: records the takes.
-        ask: puts a question to the operator.
-        say: tells the operator something.
+    An invalid take is explained and repeated. `ask` puts a question to the operator, `say` tells
+    something.
     """
 
     def __init__(
@@ -306,8 +301,7 @@ def record_takes(
 ) -> tuple[str, list[PressRow]]:
     """Lead an operator through rest and presses; returns the rest take and valid presses.
 
-    The list of presses is stored in the folder, so that the calibration can be repeated from the
-    same takes.
+    The list of presses is kept, so that the calibration can be repeated from the same takes.
     """
     if guide is None:
         link = HttpLink(options.url, api_key=options.key)
@@ -329,8 +323,7 @@ def calibrate(
 ) -> dict[str, object]:
     """Calibrate the tare of one glove, and with presses its gain and fault map.
 
-    Raises:
-        InvalidInputError: unsuitable takes or pressures; the message says what to do.
+    Raises InvalidInputError: unsuitable takes or pressures; the message says what to do.
     """
     side = options.side
     rest, rows = _takes(options, guide)

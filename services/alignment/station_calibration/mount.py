@@ -45,10 +45,9 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Paired poses of tracker and board, with names of the views.
+    """Paired poses of tracker and board, with names of the views, and the corners of photos.
 
-    `corners` are the detected corners, if there are photos; `blurred` lists photos excluded for
-    blur.
+    `blurred` lists photos excluded for blur.
     """
 
     names: tuple[str, ...]
@@ -87,9 +86,8 @@ def mount_name(camera: str) -> str:
 def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Calibrate the mount of one camera on its tracker.
 
-    Raises:
-        DegenerateMotionError: the tracker was rotated too little; the message names the axis.
-        InvalidInputError: poses and photos that do not match or contradict each other.
+    Raises DegenerateMotionError: the tracker was rotated too little (names the axis);
+    InvalidInputError: poses and photos that do not match or contradict each other.
     """
     views = _read_views(options, say)
     trackers, boards = views.Ts_world_tracker, views.Ts_camera_board

@@ -88,15 +88,13 @@ def station_sightings(
 class MountSession:
     """Growing set of places, written to a folder as they are kept.
 
-    Args:
-        options: camera, board, calibration folder `to`, folder of the places `photos`.
-        is_resumed: go on with the places of an ended session; otherwise they are put aside.
+    A place is a photo of the board and the tracker's pose at it, kept as the command `hand-eye`
+    reads them, so that an ended session can be continued (`is_resumed`); else its places are put
+    aside.
 
     Attributes:
-        views: of the board at the places.
         progress: what the places say of the mount, and what is missing.
         newest: board in the newest image; None if there is none.
-        is_tracked: whether the tracker is seen.
         is_still: whether board and tracker stood still since the last image.
         hint: why the newest image was not kept; empty if it was.
         size_px: width and height of the images.

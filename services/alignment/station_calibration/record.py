@@ -1,8 +1,7 @@
 """Calibration folder and the inputs of calibrations: CSV rows, poses, streams of takes.
 
-The folder holds named matrices for recordings, with accuracy, age and provenance. Stations read
-`calibration.json` (DEXTOUCH_ACQUISITION_CALIBRATION). Sigma and time of a matrix are stored as
-matrices too (`…_sigma…`, `…_calibrated_at_unix_s`), so that every recording contains them.
+The folder holds named matrices for recordings, which stations read from `calibration.json`. Sigma
+and time of a matrix are matrices too (`…_sigma…`, `…_calibrated_at_unix_s`).
 """
 
 import codecs
@@ -56,8 +55,7 @@ def write_entry(
 
     Args:
         folder: created if absent.
-        entry: name of the main matrix, such as `K_head`; its time is stored as
-            `<entry>_calibrated_at_unix_s`.
+        entry: name of the main matrix, such as `K_head`; its time is stored beside it.
         matrices: finite; a number or a vector becomes a matrix of one row.
         facts: sigma, inputs and similar details for humans; JSON.
 
@@ -86,14 +84,9 @@ def write_entry(
 def write_pose(
     folder: Path, name: str, T: np.ndarray, sigma: tuple[float, float], facts: dict[str, object]
 ) -> str:
-    """Write a transform as an entry and say how well it is known.
+    """Write a transform [4, 4] as an entry and say how well it is known.
 
-    Args:
-        folder: of the calibration.
-        name: of the transform.
-        T: [4, 4] transform.
-        sigma: of its rotation (rad) and translation (m); the facts are extended by it.
-        facts: as in `write_entry`.
+    `sigma` is of its rotation (rad) and translation (m); the facts are extended by it.
     """
     rad, m = sigma
     facts |= {"sigma_rotation_deg": float(np.rad2deg(rad)), "sigma_translation_mm": m * 1e3}
@@ -242,17 +235,10 @@ def read_stream(take: str, name: str, store: str | None) -> TakeStream:
 
 
 def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row]:
-    """Rows of a CSV file in UTF-8, at least one; empty cells count as absent.
+    """Rows of a CSV file in UTF-8, at least one, of a kind; empty cells count as absent.
 
-    Args:
-        path: file with a line of column names.
-        kind: model of a row.
-        item: what a row is, for messages.
-        expected: columns of the file, for messages.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not such a CSV; the message names the line.
+    `item` and `expected` say in messages what a row is and what columns are expected. Raises
+    NotFoundError: no such file; InvalidInputError: not such a CSV; the message names the line.
     """
     rows = []
     try:

@@ -109,8 +109,8 @@ class StationLocation:
     def visited(self) -> "VisitedStation":
         """The place with the folder of its devices, and the station's streams.
 
-        Simulated devices have the folder `practice`, so that nobody records with their calibration.
-        While practice devices run, the place is theirs.
+        Simulated devices have the folder `practice`. While practice devices run, the place is
+        theirs.
         """
         with closing(self.link()) as link:
             reply = link.request("GET", "/v1/practice")
@@ -149,12 +149,7 @@ class VisitedStation(NamedTuple):
 
 
 class GuidedRun:
-    """One run, which another thread watches, answers and ends.
-
-    Args:
-        request: what is calibrated.
-        station: where.
-    """
+    """One run, which another thread watches, answers and ends."""
 
     def __init__(self, request: RunRequest, station: VisitedStation) -> None:
         self._place, self._streams, _ = station

@@ -22,11 +22,8 @@ Request = Callable[..., Reply]
 class Question(NamedTuple):
     """Question to an operator, and how it can be answered.
 
-    Attributes:
-        text: the question, or what to do before the answer.
-        action: what the answer starts, such as "Record 10 s".
-        takes_text: whether the answer is a text; otherwise it is empty.
-        choices: other answers, each with what it does.
+    The answer starts `action`, such as "Record 10 s"; it is empty unless it `takes_text`. `choices`
+    are other answers, each with what it does.
     """
 
     text: str
@@ -78,18 +75,10 @@ class TakeRecorder:
     ) -> tuple[str, Found]:
         """Record a valid take; interrupted and invalid ones are discarded.
 
-        Args:
-            name: id of the take.
-            words: description for the operator, also the take's instruction.
-            seconds: duration.
-            check: raises an error for an invalid take. If takes are only in the store, it runs
-                after the take is saved.
-
-        Returns:
-            The take's folder in the spool, or its id in the store; and the result of the check.
-
-        Raises:
-            ConflictError: the recorder is busy with another take; save or discard that.
+        `words` are for the operator, and the take's instruction. `check` raises an error for an
+        invalid take; of takes that are only in the store, after they are saved. Returns the take's
+        folder in the spool, or its id in the store, and the result of the check. Raises
+        ConflictError: the recorder is busy with another take; save or discard that.
         """
         self._act("arm", {"task": self._task, "instruction": words})
         self._act("record", {"recording_id": name})
