@@ -13,8 +13,9 @@ from services.alignment.calibration.tactile_tare import (
     TactileCalibration,
     TaxelTare,
     measure_tare,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0

@@ -17,8 +17,14 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
-from services.alignment.calibration.places import excess_over_time
+from services.alignment.calibration.motion import (
+    Agreement,
+    adjoint,
+    excess_over_time,
+    move,
+    twist,
+    twist_jacobian,
+)
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30

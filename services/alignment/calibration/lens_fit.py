@@ -16,7 +16,7 @@ from numpy.polynomial import chebyshev
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import NUM_DISTORTION, Distortion
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.places import Structure, structure
+from services.alignment.calibration.motion import Structure, structure
 
 # Radial functions show an equidistant lens, of which k1 k2 k3 leave waves along the radius.
 # fx fy cx cy and the distortion.

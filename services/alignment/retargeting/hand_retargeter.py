@@ -27,8 +27,7 @@ from services.alignment.retargeting.solver.arrays import (
     joint_places,
     zero_points_m,
 )
-from services.alignment.retargeting.solver.smoothing import smoothed
-from services.alignment.retargeting.solver.solve import retarget_samples
+from services.alignment.retargeting.solver.solve import retarget_samples, smoothed
 
 NUM_FINGERS = 5
 # Proximal phalanx of an index finger: that of the mean hand (39.7 mm) at the sizes that are

@@ -36,6 +36,7 @@ from services.alignment.station_calibration.boards import (
     reprojection,
 )
 from services.alignment.station_calibration.record import (
+    Say,
     named_matrix,
     read_matrices,
     write_entry,
@@ -64,7 +65,6 @@ _STATE_COLOURS = dict(zip(STATES, _COLOURS, strict=True))
 
 Arrivals = Iterator[tuple[str, bytes]]
 Wait = Callable[[float], None]
-Say = Callable[[str], None]
 
 
 def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
@@ -291,17 +291,25 @@ def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) ->
 
     `link` is connected to the station, `wait` sleeps between requests.
     """
-    path, last = f"/v1/live/cameras/camera_{camera}", b""
+    last = b""
     for number in count():
-        try:
-            data = link.request("GET", path, accept="image/jpeg").body
-        except StaleDataError:
-            # The camera pauses; an old image would look like a static board.
-            data = b""
+        data = live_image(link, camera)
         if data and data != last:
             last = data
             yield f"live image {number}", data
         wait(LIVE_PERIOD_S)
+
+
+def live_image(link: HttpLink, camera: str) -> bytes:
+    """The newest image (JPEG) of a station's camera; empty while the camera pauses.
+
+    An old image would look like a static board.
+    """
+    path = f"/v1/live/cameras/camera_{camera}"
+    try:
+        return link.request("GET", path, accept="image/jpeg").body
+    except StaleDataError:
+        return b""
 
 
 def coverage_picture(

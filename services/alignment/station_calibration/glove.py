@@ -7,7 +7,7 @@ import argparse
 import csv
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -39,16 +39,15 @@ from services.alignment.calibration.tactile_tare import (
 from services.alignment.station_calibration.camera_views import glove_picture
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
+    Ask,
+    Question,
+    Say,
+    TakeRecorder,
+    ask_at_terminal,
     read_rows,
     read_stream,
     write_entry,
     write_picture,
-)
-from services.alignment.station_calibration.takes import (
-    Ask,
-    Question,
-    TakeRecorder,
-    ask_at_terminal,
 )
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -71,8 +70,6 @@ _PRESS = re.compile(
     r"(?:(?P<pressure_kpa>[0-9.]+)(?: ?kpa)?"
     r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
 )
-
-Say = Callable[[str], None]
 
 
 class PressRow(BaseModel):

@@ -15,7 +15,7 @@ from dextouch.schemas import Matrix
 from dextouch.serving import RequireScope
 from services.alignment.retargeting.hand_retargeter import profile_name
 from services.alignment.station_calibration.judgement import Finding, entry_of, judge
-from services.alignment.station_calibration.mount_session import num_kept_places
+from services.alignment.station_calibration.mount import num_kept_places
 from services.alignment.station_calibration.record import (
     DETAILS_FILE,
     MATRICES_FILE,

@@ -34,13 +34,13 @@ from services.alignment.station_calibration.camera_views import (
     station_arrivals,
 )
 from services.alignment.station_calibration.glove import Guide
-from services.alignment.station_calibration.mount import calibrate_mount
-from services.alignment.station_calibration.mount_session import (
+from services.alignment.station_calibration.mount import (
     POSES_FILE,
     MountSession,
+    calibrate_mount,
     station_sightings,
 )
-from services.alignment.station_calibration.record import TRACKERS
+from services.alignment.station_calibration.record import TICK_S, TRACKERS, Question, TakeRecorder
 from services.alignment.station_calibration.run_status import (
     ENDED,
     CameraRunView,
@@ -53,7 +53,6 @@ from services.alignment.station_calibration.run_status import (
     RunRequest,
     RunStatus,
 )
-from services.alignment.station_calibration.takes import TICK_S, Question, TakeRecorder
 from services.alignment.station_calibration.times import measure_times
 
 logger = structlog.get_logger(__name__)

@@ -1,7 +1,7 @@
 """Command `dextouch station calibrate time`: path delays of everything that was shaken together."""
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -24,6 +24,7 @@ from services.alignment.calibration.common_motion import (
 )
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
+    Say,
     TakeStream,
     number_of,
     open_take,
@@ -36,8 +37,6 @@ from services.alignment.synchronization.recorded_streams import check_lens
 _IMAGES_AT_ONCE: Final = 32
 # Chosen: slower cameras lose the corners between two images of a brisk turn.
 MIN_CAMERA_HZ: Final = 15.0
-
-Say = Callable[[str], None]
 
 
 def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:

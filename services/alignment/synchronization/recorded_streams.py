@@ -35,8 +35,12 @@ from dextouch.streams import (
     check_camera_matrix,
     encoded_values,
 )
-from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
+from services.alignment.calibration.tactile_tare import (
+    REASONS,
+    TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
+)
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,

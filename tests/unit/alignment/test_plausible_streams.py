@@ -18,8 +18,9 @@ from services.alignment.calibration.tactile_tare import (
     REASONS,
     STUCK,
     TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 from services.alignment.command_line import report_line
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions

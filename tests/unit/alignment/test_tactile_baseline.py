@@ -9,8 +9,9 @@ from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.alignment.calibration.tactile_tare import (
     REASONS,
     TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 RNG = np.random.default_rng(0)
 TARE, GAIN = RNG.uniform(110, 130, 360), RNG.uniform(38, 42, 360)
