@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
-from dextouch.tactile.layout import FINGERS, NUM_TAXELS, SIDES, taxel_areas_m2
+from dextouch.tactile.layout import DEXTOUCH_V1, FINGERS, NUM_TAXELS, SIDES
 from services.twin.mjcf import PHYSICS_RATE_HZ
 from services.twin.scene import Scene
 
@@ -239,7 +239,7 @@ class TactileReader:
 
     def __init__(self, scene: Scene) -> None:
         self._model = scene.model
-        self._areas_m2 = taxel_areas_m2()
+        self._areas_m2 = DEXTOUCH_V1.areas_m2
         self._pads: list[_Pad] = []
         self._pad_of_geom = np.full(scene.model.ngeom, -1, dtype=np.int64)
         for side_index, side in enumerate(SIDES):

@@ -172,11 +172,10 @@ def unpack_action(actions: np.ndarray) -> ActionParts:
 def actions_from_poses(
     trajectory: HandTrajectory, anchor: AnchorPoses
 ) -> Float64[np.ndarray, "time 67"]:
-    """Actions of absolute poses, relative to the anchor's poses.
+    """Actions of absolute poses relative to the anchor's, whose own is exactly the identity.
 
     For measured actions the anchor is the trajectory's own first step; commanded actions are
-    relative to the *measured* poses of the anchor step. Where a pose is the anchor's own, its
-    action is exactly the identity.
+    relative to the *measured* poses of the anchor step.
     """
     T_left, T_right, T_camera = anchor.as_tuple()
     return pack_action(
@@ -223,11 +222,10 @@ def reanchor(
 ) -> Float64[np.ndarray, "time 67"]:
     """Re-express actions [T, 67], all relative to one anchor, relative to the step at `index`.
 
-    The poses of that step come out as exactly the identity. `anchor_action` [67], relative to the
-    same anchor as `actions`, is the source of the new anchor instead of `actions[index]`. Commanded
-    actions need it: their anchor is the *measured* action of the step.
-
-    Raises InvalidInputError for an index outside 0 … T-1.
+    The poses of that step come out as exactly the identity. Commanded actions need `anchor_action`
+    [67], the *measured* action of the step relative to the same anchor. Raises InvalidInputError
+    for
+    an index outside 0 … T-1.
     """
     checked = check_actions(actions)
     if not 0 <= index < len(checked):

@@ -1,9 +1,8 @@
 """Human hand skeleton of 25 tracked keypoints, identified by chain and joint, and its mean shape.
 
-Bone lengths of the mean hand, the reference for the orientation of tracked hands, are adult means
-(Buryanov and Kotiuk 2010). Position and spread of the metacarpals are our estimate from common
-anatomy; they define our wrist axes of a human hand: -z along the third metacarpal, x across the
-palm to the thumb's side, y through the palm.
+Bone lengths are adult means (Buryanov and Kotiuk 2010); position and spread of the metacarpals are
+our estimate. They define our wrist axes of a human hand: -z along the third metacarpal, x across
+the palm to the thumb's side, y through the palm.
 """
 
 from collections import Counter
@@ -123,11 +122,7 @@ _THUMB_WORDS: Final = (("cmc", "mcp", "ip", "tip"), ("mcp", "pip", "dip", "tip")
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """Assignment of a tracker's nodes to keypoints.
-
-    `places` are our keypoint indices of the tracker's nodes, −1 for a palm; `absent` nodes it
-    lacks.
-    """
+    """Our keypoint index of each node of a tracker, −1 for a palm, and the nodes that it lacks."""
 
     places: tuple[int, ...]
     absent: tuple[Node, ...]
@@ -153,10 +148,10 @@ def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> Nod
     """Assign a tracker's nodes, given in its order by chain and joint; case-insensitive.
 
     Chains are by our names ("pinky" is "little", the chain "hand" the wrist), joints of a chain all
-    by our names, or all by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames
-    them. A palm is ignored. Nodes that the tracker `may_lack` are such as `FINGER_METACARPALS`.
-
-    Raises InvalidInputError for unknown, missing or duplicate nodes, which it lists.
+    by our names, by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them. A
+    palm is
+    ignored. Raises InvalidInputError for unknown, duplicate or missing nodes that it does not
+    `may_lack`.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)

@@ -46,9 +46,8 @@ def checked_pair(
 def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean over images of 10 log10(255² / MSE) in dB, each image capped at 100 dB.
 
-    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded).
-
-    Raises ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
+    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded). Raises
+    ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
     """
     a, b = checked_pair(predicted, true, what="PSNR of images", tail=(None, None, 3))
     mse = np.mean((a - b) ** 2, axis=(-3, -2, -1))

@@ -1,7 +1,6 @@
 """Agreement between policy scores in reality and in imagination: correlations, MMRV, bias.
 
-Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagined is an easy
-mistake. Undefined values are NaN, never 0 or 1.
+Arguments are keyword-only, since MMRV is not symmetric. Undefined values are NaN.
 """
 
 from typing import Final

@@ -1,8 +1,7 @@
 """Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., taxels].
 
-Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.layout`). NaN is refused, but where `measured` is false: what was
-not measured counts nowhere, or, in SSIM, as right; None: all was. `layout` is that of the glove.
+All given samples, hands and taxels are pooled. NaN is refused, but where `measured` is false: what
+was not measured counts nowhere, or, in SSIM, as right; None: all was.
 """
 
 import numpy as np
@@ -155,8 +154,7 @@ def pad_contact_f1(
 ) -> float:
     """F1 of pads in contact, six of each hand; 1 when neither side has contact.
 
-    A fingertip or palm is in contact if one of its taxels is. Where exactly skin is pressed does
-    not matter, which differs between people and robots.
+    A pad is in contact if one of its taxels is: where exactly skin is pressed does not matter.
     """
     a, b = _pair(predicted_kpa, true_kpa, "contact F1 of pads", measured, layout)
     touched_a, touched_b = (layout.by_part(in_contact(kpa), np.any) for kpa in (a, b))

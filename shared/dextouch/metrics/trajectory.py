@@ -17,8 +17,7 @@ MIN_FOUND_SHARE = 0.1
 def dynamic_time_warping(first: np.ndarray, second: np.ndarray) -> float:
     """Least sum of distances over monotone alignments of two trajectories [n, d] and [m, d].
 
-    Both ends are aligned, and every point of either has at least one partner (Sakoe and Chiba 1978,
-    steps of one in either or both).
+    Both ends are aligned, every point has a partner (Sakoe and Chiba 1978).
     """
     distances = np.linalg.norm(first[:, None] - second[None], axis=2)
     cost = np.full((len(first) + 1, len(second) + 1), np.inf)

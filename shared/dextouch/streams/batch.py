@@ -1,9 +1,7 @@
 """A batch of samples as bytes, the same in a spool's log, on the wire and in the store's upload.
 
-The body of a batch is its samples end to end, so that bodies end to end are a body, too. A sample
-is t_host_ns, t_device_ns and sequence as int64, then its values, or of an encoded image its length
-as u32 and its bytes. On the wire a header comes first. All numbers are little endian. See
-docs/wire_format.md.
+A body is samples end to end: t_host_ns, t_device_ns and sequence as int64, then the values, or the
+length (u32) and bytes of an encoded image; little endian. See docs/wire_format.md.
 """
 
 import struct
@@ -168,9 +166,8 @@ def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> S
 def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> EncodedBatch:
     """Validate bytes of an untrusted source as the expected batch of a stream.
 
-    Raises PacketError: not a batch of this version, or damaged in transit; LimitExceededError:
-    larger than allowed; InvalidInputError: a batch of another stream or number, or with wrong
-    contents.
+    Raises PacketError: not a batch of this version, or damaged; LimitExceededError: too large;
+    InvalidInputError: a batch of another stream or number, or with wrong contents.
     """
     if len(data) > MAX_BATCH_BYTES:
         raise LimitExceededError(

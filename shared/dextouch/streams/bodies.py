@@ -1,8 +1,4 @@
-"""Checks whether poses of a head and two wrists can be those of one body.
-
-A single stream does not show feet for metres, mirrored axes or exchanged trackers; head and hands
-together do. Stations apply the checks to the last seconds, alignment to whole recordings.
-"""
+"""Checks whether poses of a head and two wrists can be those of one body, live or recorded."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -116,13 +112,12 @@ def implausible_bodies(
     """The first reason why a head and two wrists cannot be those of one body, None without one.
 
     Heads are upright and look at the hands, a person's hands are within reach, on their own sides,
-    with fingers that point away from the head, and a robot's wrists are where they are commanded.
-    Where that does not hold, but does with another reading of the poses, they are to be read so.
-    Fewer than 60 samples say nothing, and nor do poses without one of the three bodies.
+    with fingers that point away from the head, and a robot's wrists are where they are
+    commanded. Fewer than 60 samples say nothing, nor do poses without one of the three bodies.
 
     Args:
         poses: of the trackers as they were sent, x y z (m) qw qx qy qz, at common times, by stream;
-            those that are commanded, too.
+        those that are commanded, too.
         to_body: mounts of trackers on their bodies, by stream.
         of_robot: whether they are a robot's.
     """

@@ -1,8 +1,6 @@
 """Checks whether values of a stream can be true: units, speeds, limits, frozen and repeated values.
 
-Stations apply them to what devices send now, alignment to whole recordings. What is wrong with
-single samples is located, so that they can be left out; what is wrong with all of them (another
-unit, for example) is named with the values that were found.
+Stations apply them to what devices send now, alignment to whole recordings.
 """
 
 from collections.abc import Iterator
@@ -81,9 +79,9 @@ def implausible_values(
 ) -> list[Implausible]:
     """What is implausible in samples [n, …] of a stream of poses, joints or keypoints.
 
-    What is commanded may leap, may be kept, and may lie beyond limits to press: only its unit is
-    checked. What is `of_robot` may rest exactly; joints and poses in a robot's base always may.
-    Times increase.
+    Times increase. Only the unit is checked of what is commanded. What is `of_robot` may rest
+    exactly;
+    joints and poses in a robot's base always may.
     """
     if descriptor.kind == "pose":
         can_rest = of_robot or descriptor.frame == "base"

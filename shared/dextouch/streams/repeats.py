@@ -145,8 +145,7 @@ def implausible_repeats(
 def _held(equal: np.ndarray) -> tuple[Bool[np.ndarray, " n"], float]:
     """Samples that only repeat a value which is held for a number of samples, and this number.
 
-    A device that is at rest as well repeats its value for longer: of that, samples at that distance
-    remain.
+    Of a longer rest, samples at that distance remain.
     """
     none = np.zeros(len(equal) + 1, dtype=bool)
     begins = np.concatenate([[0], np.flatnonzero(~equal) + 1])
@@ -204,9 +203,7 @@ def _runs(marked: np.ndarray, least: int) -> list[tuple[int, int]]:
 def still_parts(
     parts: Float64[np.ndarray, "n parts size"],
 ) -> list[tuple[int, Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]]:
-    """Parts of noisy values that stand still, such as one axis or finger, exactly or nearly.
-
-    Consecutive samples; NaN is no value.
+    """Parts of noisy consecutive values, such as one axis or finger, that stand still, or nearly.
 
     Returns:
         Part, samples in which it stands still though it moved (it ends elsewhere, or not at all),
