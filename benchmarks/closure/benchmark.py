@@ -56,8 +56,8 @@ from services.alignment.synchronization.resampling import (
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import Recorder, TakeOptions, TruthEpisode, TruthStream, record
-from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.names import Domain
+from services.twin.scene import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ
 from services.twin.stage import Plan, Stage, command_row

@@ -1,8 +1,4 @@
-"""Cameras by ray casting, and printed markers in their images, without GPU or OpenGL.
-
-Flat object colours with Lambert shading by one light, and a chequered table that makes motion
-visible. It is deterministic: equal states give equal bytes.
-"""
+"""Deterministic cameras by ray casting, and printed markers in their images, without GPU."""
 
 import itertools
 import math
@@ -92,9 +88,8 @@ def _wrist_mount(palm_sign: float) -> Float64[np.ndarray, "4 4"]:
 class Appearance:
     """What a scene looks like besides its geometry.
 
-    `colours` are RGB 0 … 1 of every geom, `to_light` the direction to the light, `ambient` the
-    share of light from everywhere, `checker_depth` how much darker every second field of the table
-    is.
+    `colours` are RGB 0 … 1 of every geom, `ambient` the share of light from everywhere,
+    `checker_depth` how much darker every second field of the table is.
     """
 
     colours: Float64[np.ndarray, "geoms 3"]
@@ -205,13 +200,9 @@ class Markers:
         K: Float64[np.ndarray, "3 3"],
         Ts_camera_object: Float64[np.ndarray, "objects 4 4"],
     ) -> None:
-        """Draw the markers that the camera sees and nothing hides.
+        """Draw the markers that the camera (K in pixels) sees and nothing hides, into `image`.
 
-        Args:
-            image: changed.
-            range_m: distance from the camera to what each pixel shows, infinite for nothing.
-            K: of the camera, in pixels.
-            Ts_camera_object: poses of all objects.
+        `range_m` is the distance to what each pixel shows, infinite for nothing.
         """
         for one in self._prints:
             T = Ts_camera_object[one.object_index] @ one.T_object_marker
@@ -271,10 +262,7 @@ def _averaged(
 
 
 class CameraRig:
-    """The three cameras of a scene; rays are computed once and rotated with the camera.
-
-    `appearance` is what the scene looks like, `markers` those that are glued to its objects.
-    """
+    """The three cameras of a scene; rays are computed once and rotated with the camera."""
 
     def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
         self._model = scene.model
@@ -332,8 +320,9 @@ class CameraRig:
     def _cast(self, simulation: Simulation, camera: str) -> "_View":
         """Find what each ray of a camera meets.
 
-        MuJoCo tests every ray against every geom. Most rays meet the top of the table or nothing,
-        which one division tells; only rays near other geoms are left to MuJoCo, with equal results.
+        Most rays meet the top of the table or nothing, which one division tells; only rays near
+        other
+        geoms are left to MuJoCo, with equal results.
         """
         T_world_camera = self.pose(simulation, camera)
         rays = np.ascontiguousarray(self.rays[camera] @ T_world_camera[:3, :3].T)

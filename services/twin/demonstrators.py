@@ -1,8 +1,6 @@
 """Scripted demonstrators: smooth commands on the model grid from waypoints of both hands.
 
-Motions off the script (retreat, push, slip, wander) start at any of its steps and are random: a
-network trained on scripts only predicts success for any similar motion, whereas their outcome must
-be learned from the state.
+Motions off the script are random, so that their outcome must be learned from the state.
 """
 
 from collections.abc import Sequence

@@ -24,8 +24,7 @@ from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene, with_motion
 from services.twin.hands import HumanHand
 from services.twin.mistakes import with_mistakes
-from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.scene import object_boxes_m
+from services.twin.scene import PHYSICS_RATE_HZ, object_boxes_m
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
@@ -57,8 +56,8 @@ class TruthStream:
 class TruthEpisode:
     """Ground truth of one take.
 
-    `pad_forces_n` is the true contact force at the tactile rate: normal force on thumb … little tip
-    and palm, left then right; pressures times taxel areas sum to it.
+    `pad_forces_n` is the true normal force on thumb … little tip and palm at the tactile rate, left
+    then right; pressures times taxel areas sum to it.
     """
 
     attributes: EpisodeAttributes

@@ -1,9 +1,7 @@
 """Mistakes of demonstrators and policies: changes of the commands of a whole take.
 
-An evaluator must be right about mistakes of every kind. Its training data therefore contain many
-(`TRAINING`), others guide its development (`DEVELOPMENT`), and it is measured on those that nothing
-was trained or chosen on (`HELD_OUT`). Every kind has a size that grows with its strength, 0 … 1;
-directions, signs and times are drawn.
+Evaluators are trained on the kinds of `TRAINING`, developed on those of `DEVELOPMENT`, measured on
+those of `HELD_OUT`. Each has a size that grows with its strength, 0 … 1; the rest is drawn.
 """
 
 import re
@@ -51,11 +49,7 @@ class Mistake:
 
     @classmethod
     def parse(cls, text: str) -> "Mistake":
-        """A mistake from KIND=STRENGTH.
-
-        Raises InvalidInputError: other text, or a strength outside 0 … 1; UnknownNameError: no such
-        kind.
-        """
+        """A mistake from KIND=STRENGTH; raises InvalidInputError or UnknownNameError."""
         match = _FORM.fullmatch(text)
         if match is None:
             raise InvalidInputError(f"mistake: got {text!r}, expected KIND=STRENGTH, 0 … 1")

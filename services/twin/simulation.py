@@ -1,12 +1,8 @@
 """Running simulation of a scene: commands on the model grid, physics, contacts and poses.
 
-Scripted demonstrators and policies both use `Simulation.advance`, so they share physics and
-interpolation of commands.
-
-Touch: MuJoCo's tactile sensor gives the penetration depth of each taxel, hence the *pattern*; the
-contact solver gives the force on each pad, hence the *magnitude*. Depths are converted to pressures
-of an elastic layer that integrate to the pad's force; if a pad is pressed without any taxel
-penetrating, the force goes to the taxel nearest to each contact.
+Touch: the depths of MuJoCo's tactile sensor are the *pattern*, the forces of the contact solver
+on each pad the *magnitude* of the pressures of an elastic layer. If no taxel of a pressed pad has
+a depth, the force goes to the taxel nearest to each contact.
 """
 
 from collections.abc import Iterator
@@ -19,8 +15,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.tactile.layout import DEXTOUCH_V1, FINGERS, NUM_TAXELS, SIDES
-from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.scene import Scene
+from services.twin.scene import PHYSICS_RATE_HZ, Scene
 
 MODEL_RATE_HZ = 15  # as in the paper
 STEPS_PER_GRID = PHYSICS_RATE_HZ // MODEL_RATE_HZ
@@ -100,9 +95,8 @@ class Simulation:
     def advance(self, target: Command) -> Iterator[int]:
         """Simulate one grid interval, moving the command linearly to `target`.
 
-        Yields the index of every physics step; poses are current at each step, everything else
-        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE. Raises InvalidInputError
-        if the physics diverged.
+        Yields the index of every physics step; only poses are current at each, all else at steps
+        divisible by STEPS_PER_TACTILE. Raises InvalidInputError if the physics diverged.
         """
         poses, joints_rad = self._interpolated(target)
         for pose, joints in zip(poses, joints_rad, strict=True):
@@ -316,15 +310,11 @@ class TactileReader:
 def elastic_layer(
     depths_m: Float64[np.ndarray, " taxels"], force_n: float, stiffness_n_m: float
 ) -> Float64[np.ndarray, " taxels"]:
-    """Forces of an elastic layer at depths that are known up to a common offset c.
+    """Forces, of sum F, of an elastic layer at depths that are known up to a common offset c.
 
-    Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M, and scales
-    the result so that it sums to F.
-
-    Args:
-        depths_m: 0 or more, at least one of them positive.
-        force_n: sum of the forces.
-        stiffness_n_m: stiffness of one taxel.
+    Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M; depths are 0
+    or
+    more, one of them positive, k is the stiffness of one taxel.
     """
     touched = depths_m > 0.0
     deepest_first = np.sort(depths_m[touched])[::-1]

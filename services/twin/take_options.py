@@ -45,13 +45,12 @@ class TakeOptions:
 
     `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while the
     motion stays, `images` are the cameras to record. At most one of three modifies the commands:
-    `frozen_from_step` (0 … 80) freezes them from that step on (0: from the start), `motion`
-    replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
-    this take's start. `mistakes` change the commands of the script, in their order.
-
-    With `varied`, colours, light and the home of the head camera differ from take to take; `sizes`
-    are those of the objects, unknown to the demonstrator. Cameras record at 30 Hz, or at grid steps
-    that are multiples of `image_every` and the last three. With `training`, only touch, images,
+    `frozen_from_step` (0 … 80) freezes them from that step on, `motion` replaces the script, and
+    `actions_of_seed` plays the demonstration of another seed, relative to this take's start.
+    `mistakes` change the commands of the script, in their order; with `varied`, colours, light and
+    the
+    home of the head camera differ from take to take. Cameras record at 30 Hz, or at grid steps that
+    are multiples of `image_every` and the last three; with `training` streams, only touch, images,
     actions, and object poses at grid steps are recorded.
     """
 
@@ -134,10 +133,9 @@ class TakeOptions:
 
 @dataclass(frozen=True)
 class PlayedActions:
-    """Commands of a take from another source, such as a policy.
+    """Commands of a take, relative to its start, row 0 being its pose, from another source.
 
-    `actions` are relative to the take's start, row 0 being its pose; `name` becomes part of the
-    episode's id, and `command` is the command that reproduces the episode.
+    `name` becomes part of the episode's id; `command` is the command that reproduces the episode.
     """
 
     name: str
@@ -189,10 +187,9 @@ class Mix:
     Scripts: `exact`, with noise of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
     deviation, or with the levels `LADDER_M` cycled over the seeds (`ladder`). The other kinds have
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
-    starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.demonstrators`;
-    `other_scene` plays the actions of another seed; `mistaken` has one to four of the mistakes
-    `services.twin.mistakes.TRAINING`, two of five in a script that is also noisy;
-    `otherwise_mistaken` has one of the kinds `services.twin.mistakes.DEVELOPMENT`.
+    starts; the `MOTION_KINDS`; `other_scene` plays the actions of another seed; `mistaken` has one
+    to
+    four mistakes of `TRAINING`, `otherwise_mistaken` one of `DEVELOPMENT`.
     """
 
     exact: float = 0.0

@@ -48,10 +48,10 @@ class TwinState:
 class TwinWorld:
     """Reference world of the platform, in place of a real robot.
 
-    A rollout starts from task and seed, at the first observation of the demonstration of that seed;
-    replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
-    treated as commands. The physics has no noise, so the seed of a step has no effect. Raises
-    UnknownNameError for an unknown camera.
+    A rollout starts at the first observation of the demonstration of a task and seed; replaying its
+    `action_commanded` reproduces it exactly. Measured actions are treated as commands. The physics
+    has
+    no noise, so the seed of a step has no effect. Raises UnknownNameError for an unknown camera.
     """
 
     def __init__(self, settings: TwinSettings) -> None:

@@ -1,8 +1,6 @@
 """Tasks with a can: four that start alike, and one in which it is grasped a second time.
 
-The four test whether a policy or a world model heeds the instruction: the first observation of a
-seed is the same in all of them, so only the instruction tells how heavy the can is and where it
-goes (held up, or moved to the left or right).
+The first observation of a seed is the same in the four: only the instruction tells what to do.
 """
 
 from dataclasses import dataclass
@@ -14,8 +12,8 @@ from jaxtyping import Float64
 from dextouch.geometry import transform_from_pose
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.grasps import CylinderGrasp
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import Draw, Grip, Noise, Poses, at_rest, one_handed
 
