@@ -179,9 +179,9 @@ def align_batch(
     num_workers: int,
     on_progress: OnRecordingProgress,
 ) -> Iterator[Outcome]:
-    """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
+    """Align recordings in parallel processes; yields outcomes, also failures, as they complete.
 
-    Each worker is a process of its own; `on_progress` is called from several threads.
+    `on_progress` is called from several threads.
     """
     workers = [AlignmentWorker(store_url) for _ in range(num_workers)]
     idle = workers.copy()

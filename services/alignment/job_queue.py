@@ -1,7 +1,4 @@
-"""Alignment jobs of one service, kept in SQLite so that they outlive a crash or a power failure.
-
-Every step of a job is committed to disk before anyone hears of it; only progress is kept in memory.
-"""
+"""Alignment jobs of a service, whose steps are committed to SQLite before anyone hears of them."""
 
 import asyncio
 import sqlite3
@@ -53,12 +50,13 @@ RETRY_AFTER_S = 5
 
 
 class JobQueue:
-    """All jobs of one service, in the order in which they were submitted.
+    """All jobs of one service in the order of submission; belongs to one event loop.
 
     Change jobs only while holding `lock`; a change that cannot be saved raises `StorageError` and
-    leaves them as they were. Belongs to one event loop. `max_open` jobs may wait or run; of more
-    than `max_kept` the oldest ended ones are forgotten. `problem` is why the jobs could not be
-    opened: they are neither listed nor accepted then.
+    leaves them as they were. `max_open` jobs may wait or run; of more than `max_kept` the oldest
+    ended
+    ones are forgotten. `problem` is why the jobs could not be opened: none are listed or accepted
+    then.
     """
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:
@@ -89,10 +87,7 @@ class JobQueue:
             self._database = None
 
     def get(self, alignment_id: str) -> AlignmentJob:
-        """The current state of a job.
-
-        Raises NotFoundError: never submitted, or ended long ago.
-        """
+        """The current state of a job; raises NotFoundError: never submitted, or ended long ago."""
         self._require_open()
         if alignment_id not in self._jobs:
             raise NotFoundError(
@@ -108,10 +103,9 @@ class JobQueue:
         limit: int,
         recording_ids: Collection[str] = (),
     ) -> AlignmentList:
-        """Some of the jobs, or of those in one state, oldest first, from the one `after` an id on.
+        """Some of the jobs, of one state or of these recordings, oldest first, after an id.
 
-        With `recording_ids`, only those of these recordings. Raises NotFoundError: there is no job
-        `after`.
+        Raises NotFoundError: there is no job `after`.
         """
         self._require_open()
         jobs = [
@@ -220,9 +214,8 @@ def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
 class JobDatabase:
     """The table of jobs in SQLite, in a folder that is made if needed; for one process at a time.
 
-    Every commit is on disk when it returns (write-ahead log, synchronous=FULL). Raises
-    ConflictError: another process has it open; CorruptDataError: it is damaged; StorageError: it
-    cannot be read or written.
+    Every commit is on disk when it returns. Raises ConflictError: another process has it open;
+    CorruptDataError: it is damaged; StorageError: it cannot be read or written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -246,10 +239,7 @@ class JobDatabase:
             raise CorruptDataError(f"{self._path}: damaged (it is empty); {MOVE_AWAY}")
 
     def load(self) -> dict[str, AlignmentJob]:
-        """Jobs by id, in the order in which they were submitted.
-
-        Raises CorruptDataError: a row does not match its checksum or is not a job.
-        """
+        """Jobs by id, in order of submission; raises CorruptDataError for a damaged row."""
         select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
         with self._errors("read"), self._guard:
             rows = self._connection.execute(select).fetchall()
@@ -270,10 +260,7 @@ class JobDatabase:
         return jobs
 
     def commit(self, removed: Iterable[str], saved: Iterable[AlignmentJob]) -> None:
-        """Remove jobs, then insert or update others, in one transaction.
-
-        Raises StorageFullError: no space is left; nothing changed.
-        """
+        """Remove jobs and write others in one transaction; raises StorageFullError."""
         delete = "DELETE FROM jobs WHERE alignment_id = ?"
         with self._errors("write"), self._guard, self._connection as connection:
             connection.executemany(delete, [(key,) for key in removed])

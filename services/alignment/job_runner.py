@@ -1,7 +1,4 @@
-"""Runs the alignment jobs of a service in worker processes, and submits those of new recordings.
-
-Jobs are resumed after a restart.
-"""
+"""Runs the alignment jobs of a service in worker processes, and submits those of new recordings."""
 
 import asyncio
 import re
@@ -80,10 +77,9 @@ class AlignmentMetrics:
 
 
 class JobRunner:
-    """The alignments of one store; asking again for the same one gives the same job.
+    """The alignments of one store, which run between `start` and `close`, in one event loop.
 
-    Runs between `start` and `close`, in one event loop. `queue` holds the jobs, which are kept in
-    `jobs_folder`; `metrics` shows them.
+    `queue` holds the jobs, which are kept in `jobs_folder` and resumed after a restart.
     """
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
@@ -104,10 +100,7 @@ class JobRunner:
         self.is_warm = False
 
     async def start(self) -> None:
-        """Load the jobs on disk and start working on them.
-
-        If they cannot be opened (`queue.problem`) they are tried again every few seconds.
-        """
+        """Load the jobs on disk, every few seconds until they open, and work on them."""
         is_open = await self._open_queue()
         await self._sweep()
         work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
@@ -116,10 +109,7 @@ class JobRunner:
         self._tasks = [asyncio.create_task(one) for one in work]
 
     async def _open_queue(self) -> bool:
-        """Load the jobs on disk, and put those back that were running; whether that was possible.
-
-        The same failure is logged only once.
-        """
+        """Load the jobs on disk, and put running ones back; whether it worked."""
         before = self.queue.problem
         async with self._changed:
             try:
@@ -165,9 +155,9 @@ class JobRunner:
     async def submit(self, request: AlignmentRequest) -> tuple[AlignmentJob, ...]:
         """Submit alignments, or find those that run or are done; failed ones are submitted again.
 
-        All of them are accepted or none. Raises NotFoundError: no such recording;
-        InvalidInputError: a recording lacks what every episode needs; LimitExceededError: too many
-        are waiting.
+        All are accepted or none. Raises NotFoundError: no such recording; InvalidInputError: it
+        lacks what
+        every episode needs; LimitExceededError: too many are waiting.
         """
         options = request.options or self._options
         if options.objects is None:
@@ -304,11 +294,13 @@ class JobRunner:
 class NewRecordings:
     """Lists a store and submits a job for each recording that has no episode yet, once.
 
-    A recording is skipped when it has a job, in whatever state; when an episode made from it is in
-    the store or its trash, under any options; or when it is a calibration take. One that cannot be
-    aligned becomes a failed job with the reason (submitted again after RETRY_S if the disk was
-    full); one that cannot be read is tried again after RETRY_S. One that comes back under the id of
-    a deleted one is new unless an episode was made from its content.
+    A recording is skipped when it has a job; when an episode made from it is in the store or its
+    trash, under any options; or when it is a calibration take. One that cannot be aligned becomes a
+    failed job with the reason; it is submitted again after RETRY_S if the disk was full, and one
+    that
+    cannot be read is tried again. One that comes back under the id of a deleted one is new unless
+    an
+    episode was made from its content.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:

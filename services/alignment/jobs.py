@@ -50,10 +50,10 @@ def align_recording(
     """Align one recording and write the episode.
 
     The episode's id follows from the recording's content and the options: doing it again, even from
-    two processes at once, gives the same episode. Progress is told in the caller's thread. Raises
-    NotFoundError: no such recording, or it was deleted meanwhile; InvalidInputError: the recording
-    lacks data that an episode needs (the message names it); CorruptDataError, StorageError: the
-    store's bytes are damaged or cannot be written.
+    two processes at once, gives the same episode. Raises NotFoundError: no such recording, or it
+    was
+    deleted meanwhile; InvalidInputError: it lacks data that an episode needs; CorruptDataError,
+    StorageError: the store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
@@ -79,10 +79,9 @@ def align_recording(
 
 
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
-    """Check that a recording has the data that an episode needs; returns the id of its episode.
+    """Check that a recording has what an episode needs; returns the id of its episode.
 
-    Raises NotFoundError: no such recording; InvalidInputError: streams or calibration that every
-    episode needs are missing.
+    Raises NotFoundError: no such recording; InvalidInputError: streams or calibration are missing.
     """
     recording = store.recording(recording_id)
     check_complete(recording)
@@ -137,10 +136,7 @@ class AlignmentWorker:
         self._in_use = threading.RLock()
 
     def start(self) -> None:
-        """Start the process and wait until its solver is ready; does nothing if it runs.
-
-        Raises UnavailableError: it does not start.
-        """
+        """Start the process and wait until its solver is ready; raises UnavailableError."""
         with self._in_use:
             with self._guard:
                 if self._child is not None and self._child.is_running:
@@ -159,8 +155,7 @@ class AlignmentWorker:
     ) -> AlignmentReport:
         """Align a finished recording; its progress is told a few times a second.
 
-        Raises UnavailableError: the process was killed, the store is as it was; others as
-        `align_recording`.
+        Raises UnavailableError: the process was killed; others as `align_recording`.
         """
         with self._in_use:
             self.start()

@@ -1,8 +1,7 @@
 """Markers on objects: poses of the objects in images, and sheets of markers to print.
 
-The pose of a single square has two solutions that look almost alike when it is small or seen from
-the front (Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). Other
-markers of the object decide, or a clearly smaller error, or the pose in neighbouring images.
+A single square has two poses that look almost alike (Schweighofer and Pinz, 2006; IPPE gives both).
+Other markers decide, or a clearly smaller error, or the pose in neighbouring images.
 """
 
 from collections.abc import Iterator, Sequence
@@ -58,9 +57,10 @@ class _Candidate:
 class MarkerDetector:
     """Finds markers of a dictionary in gray images, with unbiased corners.
 
-    Of OpenCV's ways to refine corners, only the lines that AprilTag's fits to the edges have no
-    bias: others put objects with 30 to 40 px a side 3 to 14 mm too far away. It is slow on whole
-    noisy images, so that it is given the surroundings of markers that were found without it.
+    Of OpenCV's ways to refine corners, only AprilTag's has no bias: others put objects with 30 to
+    40 px
+    a side 3 to 14 mm too far away. It is slow, so that it is given the surroundings of found
+    markers.
     """
 
     def __init__(self, dictionary: MarkerDictionary) -> None:
@@ -71,10 +71,7 @@ class MarkerDetector:
         self._fine = cv2.aruco.ArucoDetector(kind, parameters)
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> dict[int, list[Float64[np.ndarray, "4 2"]]]:
-        """Corners (px, the first pixel spans 0 … 1) of every marker, by its id.
-
-        Corners are in the order of OpenCV: upper left, upper right, lower right, lower left.
-        """
+        """Corners (px, the first pixel spans 0 … 1; from the upper left) of markers by id."""
         found: dict[int, list[np.ndarray]] = {}
         for number, corners in _detected(self._coarse, gray):
             refined = self._refined(gray, number, corners)
@@ -251,10 +248,9 @@ def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate |
 
 
 def marker_sheet(objects: SceneObjects) -> str:
-    """SVG with the markers of all objects on A4 pages below one another.
+    """SVG with the markers of all objects, to cut out, on A4 pages below one another.
 
-    Every marker has a dashed line to cut along, and below it the object, its id and side. Raises
-    InvalidInputError: there is no marker, or one is larger than the page.
+    Raises InvalidInputError: there is no marker, or one is larger than the page.
     """
     printed = {
         (one.name, marker.id, marker.size_m): marker

@@ -35,10 +35,9 @@ CLEARLY_BETTER = 0.5
 
 @dataclass(frozen=True)
 class Match:
-    """Correspondence of the samples of a stream with the true ones.
+    """Correspondence of the samples of a stream with the true ones; `offset_ns` is minus true time.
 
-    `offset_ns` is episode time minus true time of each pair; `num_dropped` true samples between the
-    first and the last pair have none.
+    `num_dropped` true samples between the first and the last pair have none.
     """
 
     index: Int64[np.ndarray, " n"]
@@ -57,15 +56,13 @@ def compare_with_truth(
 ) -> dict[str, Any]:
     """Errors of an episode against the truth episode that its mock devices replayed.
 
-    `origin_in_truth_ns` is the true time of the episode's time 0. Raises InvalidInputError: the two
-    share no stream.
-
-    Returns:
-        `clock_rms_ms` {stream: ms} without each stream's constant delay; `latency_ms` {stream: the
-            delay, calibrated plus found}; `latency_error_ms` {stream: what calibration left};
-            `num_dropped` {stream}; `taxel_iou` and `taxel_mae_kpa` over samples that arrived (None
-            without gloves); `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg`, means over
-            the model grid.
+    `origin_in_truth_ns` is the true time of the episode's time 0. By stream are `clock_rms_ms`
+    without
+    a constant delay, `latency_ms` (calibrated plus found), `latency_error_ms` (what calibration
+    left)
+    and `num_dropped`; `taxel_iou` and `taxel_mae_kpa` are over samples that arrived (None without
+    gloves), `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg` means over the model grid. It
+    raises InvalidInputError if the two share no stream.
     """
     origin_ns = origin_in_truth_ns
     matches = match_streams(episode, truth, origin_ns)

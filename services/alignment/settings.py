@@ -155,10 +155,7 @@ class AlignmentSettings(ServiceSettings):
 
     @cached_property
     def wanted_options(self) -> AlignmentOptions:
-        """The options, with the objects of the file.
-
-        Raises NotFoundError, InvalidInputError: as `load_scene_objects`.
-        """
+        """The options, with the objects of the file; raises as `load_scene_objects`."""
         if self.objects is None:
             return self.options
         return self.options.model_copy(update={"objects": load_scene_objects(self.objects)})

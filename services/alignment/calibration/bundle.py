@@ -1,11 +1,10 @@
 """Weighted estimate of a mount and a target from two series of poses, with its uncertainty.
 
 Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the measured
-pose B of the target in the mounted frame, and a small correction D of the tracker's pose. The size
-of each source of noise is estimated from the residuals, then all poses together by Gauss–Newton.
-The corrections are eliminated by the Schur complement, which leaves 13 unknowns; the last one is
-the scale of the second series: an error of the board's size would otherwise move the mount without
-a trace in its covariance.
+pose B of the target in the mounted frame, and a small correction D of the tracker's pose. Sources
+of noise are estimated from the residuals, then all poses by Gauss–Newton. The Schur complement
+eliminates the corrections; the last of 13 unknowns is the scale of the second series: an error of
+the board's size would otherwise move the mount without a trace in its covariance.
 """
 
 from collections.abc import Callable
@@ -131,10 +130,10 @@ def weighted_bundle(
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
-    The second series has the noise `own`, and a scale of one within `scale_sigma` (exactly one if
-    0). The covariance holds for errors as large as those along changes from place to place. Raises
-    InvalidInputError: mount, target or clock changed along the views, or the steps do not become
-    small.
+    The second series has the noise `own`, and a scale of one within `scale_sigma`. The covariance
+    holds for errors as large as changes from place to place. Raises InvalidInputError: mount,
+    target
+    or clock changed along the views, or the steps do not become small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
@@ -166,10 +165,7 @@ def weighted_bundle(
 def sensor_components(
     sensor: str, maps: np.ndarray, sigmas: tuple[float, float]
 ) -> dict[str, Component]:
-    """Rotation and translation noise of a pose sensor, in its own axes; rad and m an axis.
-
-    `maps` [n, 6, 6] take its twists to those of the views.
-    """
+    """Rotation (rad) and translation (m) noise of a sensor's twists; `maps` take them to views'."""
     maps_T = np.swapaxes(maps, 1, 2)
     turns, shifts = maps[:, :, :3] @ maps_T[:, :3], maps[:, :, 3:] @ maps_T[:, 3:]
     return {
@@ -184,9 +180,10 @@ def estimate_sigmas(
     """Standard deviation of each component (variance component estimation).
 
     The residual twist of view i [n, 6], which changes with the m fitted unknowns by J [n, 6, m],
-    has the covariance Σ_k θ_k M_ki. The best θ are found by Fisher scoring of the restricted
-    likelihood (Patterson and Thompson 1971), with a log-normal prior about the declared sizes, as
-    few views say little.
+    has
+    the covariance Σ_k θ_k M_ki. Fisher scoring of the restricted likelihood finds the best θ
+    (Patterson
+    and Thompson 1971), with a log-normal prior about the declared sizes.
     """
     M = np.stack([component.shapes for component in components])
     declared = np.log(np.square([component.sigma for component in components]))
@@ -240,16 +237,11 @@ def solve_bundle(
 ) -> Bundle:
     """Estimate mount, target pose and scale from all views together.
 
-    Args:
-        Ts_world_tracker: [n, 4, 4].
-        measurement: of the target's poses in the mounted frame.
-        tracker_sigma: the tracker's noise, rad and m an axis; above zero.
-        start: X and Z within a few degrees and centimetres.
-        is_mount_known: leave X as it is.
-        scale_sigma: expected deviation of the scale from one (one sigma); 0 leaves it at one.
-
-    Raises:
-        InvalidInputError: the steps do not become small.
+    `measurement` is of the target's poses in the mounted frame, the tracker's noise in rad and m an
+    axis; `start` are X (which stays if `is_mount_known`) and Z within a few degrees and
+    centimetres;
+    `scale_sigma` is the expected deviation of the scale from one, 0 leaves it at one. Raises
+    InvalidInputError: the steps do not become small.
     """
     X, Z = start
     free = free_unknowns(is_mount_known=is_mount_known, is_scale_known=scale_sigma == 0)

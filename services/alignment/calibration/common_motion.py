@@ -1,7 +1,6 @@
 """Path delays of all streams that were shaken together: trackers, cameras, hands in the world.
 
-What is rigidly connected turns alike. For every two streams the turn between their axes (Kabsch)
-and the offset in time are estimated; the offsets of all pairs must agree around every loop.
+The turn between the axes (Kabsch) and the offset in time of every two streams are estimated.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -112,9 +111,9 @@ def turning_of_images(
 ) -> Turning:
     """Angular velocity of a camera from the corners that consecutive images share, in its axes.
 
-    What is far away moves by the rotation alone; what is near or moves by itself is left out as far
-    as most corners agree. Steps without enough corners (blur, a bare wall) have none. Raises
-    DegenerateMotionError: fewer than half of the steps show enough corners.
+    What is near or moves by itself is left out as far as most corners agree; steps without enough
+    corners (blur, a bare wall) have none. Raises DegenerateMotionError: fewer than half have
+    enough.
     """
     times_ns, turns = list[int](), list[np.ndarray]()
     steps_ns = np.diff(t_ns)
@@ -177,9 +176,8 @@ def _turn_between(
 def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     """Offset to be added to b's times to align it with a, of streams that turn together.
 
-    Offset and turn between their axes are fitted together (Gauss–Newton): where a hand circles, one
-    makes up for the other, and the offset is known the less. Raises DegenerateMotionError,
-    InvalidInputError: as `estimate_time_offset`, or the offset is not the same throughout.
+    Offset and turn between their axes are fitted together (Gauss–Newton). Raises
+    DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or the offset changes.
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])
@@ -313,10 +311,7 @@ def _chain_sigmas_ns(
 
 
 def _check_loops(names: Sequence[str], pairs: Sequence[PairOffset]) -> float:
-    """The largest error of a loop of three offsets in standard deviations.
-
-    Refuses one that is too large, and names the stream that the wrong loops share.
-    """
+    """The largest error of a loop of three offsets in standard deviations, unless too large."""
     of = {(pair.a, pair.b): pair.offset for pair in pairs}
     worst, wrong, wrong_ms = 0.0, list[tuple[str, str, str]](), 0.0
     for loop in combinations(names, 3):

@@ -1,9 +1,7 @@
 """Where a camera sits on its tracker, and a robot's base in the tracked world, with sigmas.
 
-A closed form provides the initial values, and degenerate motion is refused; then the noise is
-estimated from the residuals, and a weighted bundle adjustment gives mount and target. A tracker on
-a robot's effector says T_world_tracker = T_world_base · T_base_effector · T_effector_tracker: the
-base is in the place of the board.
+A tracker on a robot's effector says T_world_tracker = T_world_base · T_base_effector ·
+T_effector_tracker: the base is in the place of the board.
 """
 
 from collections.abc import Sequence
@@ -77,11 +75,10 @@ TURNS: Final = (
 
 @dataclass(frozen=True)
 class HandEyeNoise(TrackerNoise):
-    """Expected noise, one sigma for each axis; refined from the views.
+    """Expected noise of a Vive tracker and a sharp board, one sigma an axis, before refinement.
 
-    Of a Vive tracker and a sharp board. `board_*` are of a board's pose by a solver, in the
-    camera's axes, where no corners are given; `board_scale` is how well the size of the print is
-    known, as a share: by a ruler a millimetre of 20 cm.
+    `board_*` are of a board's pose by a solver, in the camera's axes, where no corners are given;
+    `board_scale` is how well the size of the print is known: by a ruler a millimetre of 20 cm.
     """
 
     pixel_px: float = 0.3
@@ -94,10 +91,7 @@ class HandEyeNoise(TrackerNoise):
 
 @dataclass(frozen=True)
 class HandEyeResult(PoseEstimate):
-    """Where the camera sits on the tracker, and how well that is known.
-
-    `board_scale` is the board's size by the tracker's metres over the size that was entered.
-    """
+    """The mount of a camera, and how well it is known; `board_scale` is true over entered size."""
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
     board_scale: float
@@ -179,18 +173,15 @@ def solve_hand_eye(
 ) -> HandEyeResult:
     """Estimate the mount of a camera on a tracker from views of a fixed board.
 
-    Args:
-        Ts_world_tracker: [n ≥ 4, 4, 4] poses of the tracker in the world.
-        Ts_camera_board: [n, 4, 4] poses of the board in the camera, same moments.
-        views: the corners from which the board's poses were computed; with them each view is
-            weighted by the information in its pixels, which is more accurate.
-        noise: expected noise; default `HandEyeNoise()`.
+    Both series are poses [n ≥ 4, 4, 4] of the same moments. With the corners (`views`) from which
+    the
+    board's poses were computed, each view is weighted by the information in its pixels.
 
     Raises:
         DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
-            uncertainty of the mount exceeds half a degree or 10 mm.
+        uncertainty of the mount exceeds half a degree or 10 mm.
         InvalidInputError: too few views, a board of another size than was entered, or views that
-            contradict each other (an inverted series is named).
+        contradict each other (an inverted series is named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, board = checked_poses(
@@ -278,10 +269,7 @@ def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[s
 def project(
     points_board: np.ndarray, Ts_camera_board: np.ndarray, K: np.ndarray, distortion: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n k 2"], Float64[np.ndarray, "n k 2 6"]]:
-    """Project corners [n, k, 3], with the Jacobian by twists of the board's poses.
-
-    Raises InvalidInputError: a corner lies behind the camera.
-    """
+    """Project corners [n, k, 3] before the camera, with Jacobians by twists of the board."""
     import cv2
 
     points = points_board @ np.swapaxes(Ts_camera_board[:, :3, :3], 1, 2)
@@ -329,17 +317,17 @@ def solve_robot_base(
 ) -> RobotBaseResult:
     """Estimate the robot's base in the tracked world, and the noise, from simultaneous poses.
 
-    Args:
-        Ts_world_tracker: [n ≥ 4, 4, 4] poses of a tracker that the effector carries.
-        Ts_base_effector: [n, 4, 4] poses of the effector, from the robot's own joints.
-        T_effector_tracker: where the tracker sits; the identity where both series are of the same
-            frame; None to find it.
+    Both series are [n ≥ 4, 4, 4], of a tracker that the effector carries, and of the effector by
+    the
+    robot's own joints. `T_effector_tracker` is the identity where both are of the same frame, None
+    to
+    find it.
 
     Raises:
         DegenerateMotionError: the effector was turned too little or about one axis only (or, of a
-            known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
+        known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
         InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series is
-            named).
+        named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, effector = checked_poses(
@@ -486,7 +474,7 @@ def camera_turns(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "pairs 3"]:
 
 
 def turn_spreads(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "3"]:
-    """How far the camera turned about each of its axes alone: RMS over pairs of views (rad).
+    """RMS of the camera's turns about each of its axes alone (rad), over pairs of views.
 
     Of the covariance C of the turns this is 1 / sqrt((C⁻¹)_ii): oblique axes do not count.
     """

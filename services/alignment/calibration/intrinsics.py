@@ -1,7 +1,6 @@
 """Camera intrinsics from photos of a flat board: detected corners, blur, and calibration.
 
-Motion during a photo shifts all corners along it, by half a pixel at 6 px of blur. Residuals do not
-show that, since the board's pose absorbs it; the edges across the motion do.
+Blur of 6 px shifts all corners by half a pixel, which the board's pose absorbs: only edges show it.
 """
 
 from collections.abc import Callable, Sequence
@@ -88,9 +87,10 @@ class CharucoBoard:
 class FoundBoards:
     """Corners of one board on photos of one size (width, height).
 
-    `points_board` are [k, 3] corners of each photo in board coordinates (m), `pixels_px` [k, 2]
-    where they are, `photos` the indices of those of `num_photos` that show the board; `pattern`
-    says how it is printed.
+    `points_board` are [k, 3] corners of each photo on the board (m), `pixels_px` [k, 2] where they
+    are,
+    `photos` the indices of those of `num_photos` that show the board, `pattern` says how it is
+    printed.
     """
 
     points_board: tuple[Float32[np.ndarray, "_ 3"], ...]
@@ -106,9 +106,8 @@ class CameraCalibration:
     """A pinhole camera (K in px) with distortion k1 k2 p1 p2 k3, and standard deviations.
 
     Attributes:
-        sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
-            is. `rms_px` does not: it is as small for 8 views as for 40.
-        rms_px: of the residuals between corners and model, both axes together.
+        sigma_fxfycxcy_px: standard deviations of fx fy cx cy: how good the calibration is.
+        rms_px: of the residuals, both axes together; as small for 8 views as for 40.
         rms_by_place_px: the same by place of the board; a much larger one is of a blurred photo.
         board_bend_m: height of the board's bend, which is estimated where the corners show it.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
@@ -167,16 +166,10 @@ def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) 
 def calibrate_camera(
     images: Sequence[np.ndarray], board: Chessboard | CharucoBoard
 ) -> CameraCalibration:
-    """Intrinsics from photos of one board in different tilts and places.
+    """Intrinsics from photos, uint8 [h, w] or [h, w, 3], of one board in different tilts.
 
-    Args:
-        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are left out.
-        board: what is on the photos.
-
-    Raises:
-        ShapeError: no images, or of different sizes.
-        InvalidInputError: the board is found in too few photos, or is no board.
-        DegenerateMotionError: the views do not show the focal length; tilt the board.
+    Photos without the board are left out. Raises ShapeError: no images, or of different sizes;
+    others as `calibrate_found`.
     """
     return calibrate_found(find_boards(images, board))
 
@@ -185,11 +178,10 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
     """`calibrate_camera` for corners that were detected before.
 
     Photos of one place count once; places that do not fit the others are left out, at most a fifth.
-
-    Raises:
-        InvalidInputError: the board is found in too few photos.
-        DegenerateMotionError: the views do not show the focal length; tilt the board.
-        LensModelError: the lens is none of the model's, such as a fisheye, or it changed.
+    Raises InvalidInputError: the board is found in too few photos; DegenerateMotionError: the views
+    do
+    not show the focal length; LensModelError: another kind of lens, such as a fisheye, or it
+    changed.
     """
     if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
@@ -334,9 +326,9 @@ def edge_width_px(
 ) -> float:
     """Width over which edges of squares rise: 2.5 sigma of the blur; infinity without neighbours.
 
-    The edges of corners [n, 3] of a regular grid (m), seen at [n, 2] pixels (middle of the first
-    pixel 0, 0), along each of the board's two axes are summarized by their median; the wider
-    counts.
+    Corners [n, 3] of a regular grid (m) are seen at [n, 2] pixels (middle of the first pixel 0, 0);
+    the
+    wider of the medians along the board's two axes counts.
     """
     grid = np.asarray(points_board, dtype=np.float64)[:, :2]
     separation_m = grid[None] - grid[:, None]

@@ -1,8 +1,8 @@
 """Pinhole camera with distortion fitted to corners of a board that may be slightly bent.
 
-The residuals of a bent board follow the place on the board; the bend is then estimated as well
-(Strobl and Hirzinger 2011 estimate the whole board). Of another lens model they follow the place in
-the image, and of a lens that was focused or zoomed meanwhile the order of the photos.
+Residuals of a bent board follow the place on it, and the bend is estimated, too (as Strobl and
+Hirzinger 2011); of another lens model the place in the image, of a changed lens the order of
+photos.
 """
 
 from collections.abc import Sequence
@@ -41,11 +41,9 @@ class LensFit(NamedTuple):
 
     Attributes:
         covariance: of fx fy cx cy k1 k2 p1 p2 k3, for errors as large as those along smooth
-            functions of image, board and time, where these are larger than between neighbouring
-            corners.
+        functions of image, board and time, if larger than between neighbouring corners.
         board_bend_m: largest distance of a corner from a plane.
-        image: structure over the image.
-        drift: structure over the order of the photos.
+        image: structure over the image; `drift`: over the order of the photos.
         misfit_px: RMS of the residuals that `image` explains, both axes together.
         image_share: of the squares of all residuals that it explains.
         focal_drift: change of the focal length from the first photo to the last, as a share of it.

@@ -102,10 +102,9 @@ class Agreement(NamedTuple):
 
 
 def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "n 4 4"]]:
-    """Validate series of poses: float64 [n, 4, 4], all of one length.
+    """Validate series of poses: float64 [n, 4, 4], all of one length, at least four, rigid.
 
-    Raises ShapeError, NonFiniteError: no [n, 4, 4], or NaN; InvalidInputError: no rigid transforms,
-    or fewer than four.
+    Raises ShapeError, NonFiniteError or InvalidInputError.
     """
     arrays = {name: np.asarray(poses, dtype=np.float64) for name, poses in series.items()}
     shapes = [array.shape for array in arrays.values()]
@@ -135,10 +134,7 @@ def view_pairs(num_views: int) -> np.ndarray:
 
 
 def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
-    """Refuse poses [n, 4, 4] of a body that turns about a single axis, or hardly at all.
-
-    Raises DegenerateMotionError: names the axes of the body about which it was not turned.
-    """
+    """Refuse poses [n, 4, 4] that turn about one axis, or hardly; raises DegenerateMotionError."""
     pairs = view_pairs(len(Ts_world_body))
     A = invert(Ts_world_body[pairs[:, 1]]) @ Ts_world_body[pairs[:, 0]]
     turns_rad = vector_from_rotation(A[:, :3, :3])
@@ -258,8 +254,7 @@ def view_errors(
 def check_sides(series: Series, errors: np.ndarray) -> None:
     """Refuse a series that fits much better when one side is inverted, and name the side.
 
-    With both sides inverted the views agree again, on mount and target exchanged: of two sides that
-    fit, the one with the shorter mount is the likelier.
+    Of two sides that fit (both inverted agree again), that of the shorter mount is the likelier.
     """
     body, target = series.Ts_world_body, series.Ts_mounted_target
     limit = INVERTED_SHARE * _rms(errors)
@@ -284,10 +279,7 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
 
 
 def check_scale(series: Series, errors: np.ndarray) -> None:
-    """Refuse a target's series in another unit, or of a board of another size than was entered.
-
-    Raises InvalidInputError: names the series and its scale.
-    """
+    """Refuse a target's series in another unit or size than entered; raises InvalidInputError."""
     X, scale = scaled_park(series.Ts_world_body, series.Ts_mounted_target)
     if scale <= 0:
         return
@@ -348,10 +340,7 @@ def twist(T: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
 
 
 def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Inverse right Jacobian of SO(3) at a rotation vector.
-
-    For angles below half a turn (Solà et al. 2018, A micro Lie theory, eq. 144).
-    """
+    """Inverse right Jacobian of SO(3) below half a turn (Solà et al. 2018, eq. 144)."""
     angle = np.linalg.norm(vectors_rad, axis=-1)[..., None, None]
     small = angle < SERIES_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
@@ -382,10 +371,7 @@ def nearest_rotation(matrix: np.ndarray) -> Float64[np.ndarray, "3 3"]:
 
 
 def place_labels(series: Series, *, min_places: int = MIN_VIEWS) -> Int64[np.ndarray, " n"]:
-    """Number of the place of each view, in the order in which they were first visited.
-
-    Raises InvalidInputError: fewer than `min_places` places.
-    """
+    """Place of each view, numbered by first visit; raises InvalidInputError for too few places."""
     labels = np.full(len(series.Ts_world_body), -1)
     num_places = 0
     for index in range(len(labels)):
@@ -423,21 +409,14 @@ def excess_over_time(
     free: np.ndarray,
     expected: tuple[float, float],
 ) -> float:
-    """Test whether mount, target and clock are the same at all places, in their order.
+    """By how much variances exceed those of independent errors, from places in their order.
 
-    Args:
-        series: of places.
-        residuals: [n, 6] twists that are left, whitened.
-        J: how they change with mount, target and scale.
-        C: how they change with errors of the body's poses, as twists.
-        free: unknowns that were fitted.
-        expected: noise of the body's poses, rad and m an axis.
-
-    Returns:
-        By how much the variances of what was fitted are larger than independent errors make them.
-
-    Raises:
-        InvalidInputError: mount, target or the body's frame moved, or the clocks differ.
+    Residual twists [n, 6] are whitened; they change by J with mount, target and scale, the unknowns
+    `free` of which were fitted, and by C with errors of the body's poses, whose `expected` noise is
+    in
+    rad and m an axis. Raises InvalidInputError: mount, target or the body's frame moved, or the
+    clocks
+    differ.
     """
     num_places = len(residuals)
     left, fitted = residuals.ravel(), J[:, :, free].reshape(6 * num_places, -1)
@@ -497,14 +476,12 @@ def structure(
 ) -> Structure:
     """Test whether functions explain residuals of a fit better than chance.
 
-    Independent errors leave as much in any direction of the residuals as in any other.
-
-    Args:
-        residuals: of one size of error each (whitened).
-        fitted: how the residuals change with the unknowns that were fitted.
-        functions: what the residuals might follow.
-        num_others: fitted unknowns of which nothing is left in all three.
-        num_together: how many errors in turn are alike, and count as one.
+    Independent errors leave as much in any direction of the residuals as in any other. Residuals
+    are
+    whitened; `fitted` says how they change with the unknowns that were fitted, `num_others` counts
+    fitted unknowns of which nothing is left in any of the three, `num_together` errors in turn that
+    are
+    alike, and count as one.
     """
     # Here, since commands that measure nothing import this module on stations without scipy.
     from scipy.special import fdtrc
@@ -538,10 +515,7 @@ def _change(left: np.ndarray, fitted: np.ndarray, functions: np.ndarray) -> Stru
 
 
 def _num_together(residuals: np.ndarray) -> float:
-    """How many places in turn err alike, from the correlation of neighbours (1 if by chance).
-
-    A tracker whose error varies smoothly over the room errs so (autoregressive, first order).
-    """
+    """How many places in turn err alike, by the correlation of neighbours (autoregressive)."""
     errors = residuals.reshape(-1, 6)
     correlation = float((errors[1:] * errors[:-1]).sum() / np.square(errors).sum())
     if correlation < MIN_CORRELATION_SIGMAS / np.sqrt(errors.size):

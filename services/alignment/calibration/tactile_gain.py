@@ -1,7 +1,4 @@
-"""Calibration of one glove from presses of known pressure: gain and state of each taxel.
-
-The result holds tare, gain and states as recordings carry them.
-"""
+"""Calibration of one glove from presses of known pressure: gain and state of each taxel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,13 +77,12 @@ class TaxelPress:
 
 @dataclass(frozen=True)
 class TaxelGain:
-    """Gain of each taxel in counts per kPa, anatomical order.
+    """Gain of each taxel in counts per kPa, anatomical order; where refused, gain and sigma are 0.
 
     Attributes:
-        gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
-        sigma_counts_per_kpa: of the gain, 0 where refused. It includes errors of the pressures,
-            creep while a press lies, and a bend over pressure or a drift from press to press; of a
-            single pressure the largest bend that is tolerated.
+        sigma_counts_per_kpa: includes errors of the pressures, creep while a press lies, and a bend
+        over pressure or a drift from press to press; of a single pressure the largest bend that is
+        tolerated.
         state: index into `tactile_tare.STATES`.
         residual_kpa: [press, taxels] what each press is off the line, 0 where not used.
     """
@@ -169,10 +165,7 @@ def calibrate_glove(
 def filled_gain(
     gain: TaxelGain, layout: TactileLayout = DEXTOUCH_V1
 ) -> Float64[np.ndarray, " taxels"]:
-    """Gains in which refused taxels have the median of their pad, or of the glove.
-
-    Raises InvalidInputError: not one gain is known.
-    """
+    """Gains with the median of pad or glove for refused taxels; raises InvalidInputError."""
     known = gain.state == OK
     if not known.any():
         raise InvalidInputError("glove: the gain of no taxel is known")
@@ -192,10 +185,7 @@ def _slices(layout: TactileLayout) -> dict[str, slice]:
 
 
 def pad_taxels(names: str, layout: TactileLayout = DEXTOUCH_V1) -> Bool[np.ndarray, " taxels"]:
-    """Which taxels belong to pads, named with + between them, such as `thumb+index`, or `all`.
-
-    Raises UnknownNameError: no such pad.
-    """
+    """Taxels of pads such as `thumb+index`, or `all`; raises UnknownNameError for no such pad."""
     taxels, slices = np.zeros(layout.num_taxels, dtype=np.bool_), _slices(layout)
     for name in names.split("+"):
         if name == "all":
@@ -215,10 +205,11 @@ def fit_gain(
 ) -> TaxelGain:
     """Weighted straight line of counts over pressure through each taxel's tare.
 
-    A taxel that does not answer, saturates in all presses, bends, or was pressed too little for 10
-    % of gain is refused, with its state and a gain of 0. Raises InvalidInputError: no press, no
-    taxel that answers, counts that fall under pressure, pressures that do not belong to the takes,
-    or a glove whose response bends or drifts by more than 10 %.
+    Taxels that do not answer, saturate in all presses, bend, or were pressed too little for 10 % of
+    gain are refused. Raises InvalidInputError: no press, no taxel that answers, counts that fall
+    under
+    pressure, pressures that do not belong to the takes, or a glove that bends or drifts by above 10
+    %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")
@@ -305,10 +296,7 @@ def _creep(press: TaxelPress, tare: TaxelTare) -> float:
 
 
 def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, " taxels"]:
-    """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
-
-    Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
-    """
+    """Error of gains, as a share, by trends of all taxels, or the largest bend tolerated."""
     used = points.used[:-1] & good & (gain > 0)
     highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
     has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
@@ -385,10 +373,7 @@ def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
 
 
 def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain, its sigma, zero and excess (χ² a degree of freedom) of each taxel's line.
-
-    The pressure's sigma enters through the gain, hence the rounds (York 1966, uncorrelated).
-    """
+    """Gain, its sigma, zero and excess (χ² a degree of freedom) of taxels' lines (York 1966)."""
     P, gain = points.pressure_kpa, np.zeros(points.counts.shape[1])
     for _ in range(ROUNDS):
         variance = points.sigma_counts**2 + (gain * points.sigma_kpa) ** 2

@@ -1,7 +1,6 @@
 """Tare of a glove, detection of faulty taxels, and conversion of raw counts to pressures in kPa.
 
-A taxel is only called faulty on evidence: its neighbours (or the others under the same known
-pressure) moved, and it did not. Where nothing around it moved it stays `unproven`.
+A taxel is only faulty if its neighbours, or others under the same pressure, moved, and it did not.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -141,11 +140,7 @@ def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
 def checked_counts(
     counts: np.ndarray, *, what: str, layout: TactileLayout = DEXTOUCH_V1
 ) -> Float64[np.ndarray, "time cells"]:
-    """Counts as float64.
-
-    Raises ShapeError: not [T, cells]; NonFiniteError: NaN or infinity; InvalidInputError: too few
-    readings.
-    """
+    """Counts [T, cells] as float64; raises ShapeError, NonFiniteError or InvalidInputError."""
     raw = np.asarray(counts, dtype=np.float64)
     if raw.ndim != 2 or raw.shape[1] != layout.num_raw_cells:
         raise ShapeError(f"{what}: got {raw.shape}, expected [T, {layout.num_raw_cells}]")
@@ -161,10 +156,7 @@ def checked_counts(
 def classify_taxels(
     takes: Sequence[np.ndarray], tare: TaxelTare, *, full_scale_counts: float = FULL_SCALE_COUNTS
 ) -> UInt8[np.ndarray, " taxels"]:
-    """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
-
-    The takes are raw counts [T, cells] each; the rest take may be among them.
-    """
+    """State of each taxel (index into `STATES`) from takes [T, cells] with contact."""
     level, num_taxels = tare.level, tare.layout.num_taxels
     evidence, silent, moves = (np.zeros(num_taxels, dtype=np.int64) for _ in range(3))
     zero, noise = tare.select(level.mean_counts), tare.select(level.noise_counts)
@@ -199,10 +191,7 @@ def kind_of_silence(takes: Sequence[np.ndarray], tare: TaxelTare) -> UInt8[np.nd
 
 
 def _slow_noise_factor(counts: np.ndarray, noise: np.ndarray) -> float:
-    """By how much means of blocks spread more than independent readings would; at least 1.
-
-    One number for the whole glove: of a single cell's few blocks it would be a guess.
-    """
+    """By how much means of blocks spread more than independent readings; one number a glove."""
     size = len(counts) // NUM_BLOCKS
     blocks = counts[: size * NUM_BLOCKS].reshape(NUM_BLOCKS, size, -1).mean(axis=1)
     noisy = noise > 0.5
@@ -249,16 +238,14 @@ def _least_neighbour(
 
 @dataclass(frozen=True)
 class TactileCalibration:
-    """counts = tare + gain · pressure for each taxel of one glove of any maker.
+    """counts = tare + gain · pressure for each taxel, in anatomical order, of a glove.
 
     Attributes:
-        side: of the glove.
         num_cells: numbers that the glove sends in each sample.
-        cells: raw cell of each taxel in anatomical order, −1 where the glove has none.
-        tare_counts: of each taxel, in the unit of the readings.
-        gain_counts_per_kpa: of each taxel, above 0; 1 where it is not measured.
+        cells: raw cell of each taxel, −1 where the glove has none.
+        tare_counts: in the unit of the readings, whose smallest difference is `step`.
+        gain_counts_per_kpa: above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.
-        step: smallest difference of two readings, in their unit.
 
     Raises:
         InvalidInputError: a gain that is not positive, or not one taxel that is measured.
@@ -294,20 +281,17 @@ class TactileCalibration:
         stream: str | None = None,
         layout: TactileLayout | None = None,
     ) -> "TactileCalibration":
-        """From a recording's calibration matrices.
+        """From a recording's calibration matrices of one side.
 
-        Args:
-            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells; the unit of
-                the layout may say it); if any `…_taxel_state` (1 × cells) and `…_cells` (1 ×
-                taxels; needed by a glove without layout that sends other than 360 numbers).
-            side: of the glove.
-            num_cells: numbers that the glove sends in each sample; None: those of the layout.
-            stream: of a further glove of this side, whose matrices begin with its name.
-            layout: that the stream names; None of `dextouch_v1`.
-
-        Raises:
-            InvalidInputError: a matrix is missing, has the wrong shape or invalid values.
-            NonFiniteError: NaN or infinity.
+        These are `tactile_<side>_tare_counts`, `…_gain_counts_per_kpa` (1 × cells; the unit of the
+        layout
+        may say it) and, if any, `…_taxel_state` (1 × cells) and `…_cells` (1 × taxels; needed by a
+        glove
+        without layout that sends other than 360 numbers). `num_cells` is that of a sample, None
+        that of
+        the `layout`, which is `dextouch_v1` if None; `stream` begins the names of a further glove.
+        It
+        raises InvalidInputError or NonFiniteError for a matrix that is missing or invalid.
         """
         glove, about = stream or f"tactile_{side}", layout or DEXTOUCH_V1
         num_cells = about.num_raw_cells if num_cells is None else num_cells
@@ -336,10 +320,7 @@ class TactileCalibration:
         return taxels.astype(np.float32)
 
     def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time taxels"]:
-        """Readings [T, cells] by taxel; where there is no cell, those of any other.
-
-        Raises ShapeError: not [T, cells].
-        """
+        """Readings [T, cells] by taxel; where there is no cell, those of any. Raises ShapeError."""
         raw = np.asarray(counts)
         if raw.ndim != 2 or raw.shape[1] != self.num_cells:
             raise ShapeError(
@@ -349,10 +330,7 @@ class TactileCalibration:
 
 
 def reading_step(layout: TactileLayout) -> float:
-    """Smallest difference of two readings: one count, of other units a part in 65535 of full scale.
-
-    What floats resolve is not known; 16 bits are what the converters of such gloves have.
-    """
+    """Smallest difference of two readings: a count, or a part in 65535 of full scale."""
     return 1.0 if layout.unit == "counts" else layout.full_scale / FULL_SCALE_COUNTS
 
 
@@ -447,10 +425,7 @@ def taxel_faults(
     pieces: Iterable[np.ndarray],
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> TaxelFaults:
-    """What consecutive raw readings [T, cells] of a take say of its taxels.
-
-    Raises ShapeError: not [T, cells].
-    """
+    """What consecutive raw readings [T, cells] of a take say of its taxels; raises ShapeError."""
     take = TaxelFaults(
         calibration.tare_counts,
         calibration.gain_counts_per_kpa,
@@ -468,11 +443,10 @@ def unusable_taxels(
 ) -> UInt8[np.ndarray, " taxels"]:
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
-    Besides those that the calibration refuses: cells that are constant but not at their tare, also
-    from some moment on (dead at zero, stuck elsewhere), random, those of another cell, mostly below
-    the tare, the same within noise while those around them move, or NaN in more than a tenth of the
-    samples. Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck
-    or below their tare, some read more than any finger presses, or all more than their tare.
+    Besides those that the calibration refuses: dead, stuck, random, a copy of another cell, mostly
+    below the tare, still while those around them move, or NaN in more than a tenth of the samples.
+    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck or below
+    their tare, some read more than any finger presses, or all more than their tare.
     """
     reasons = calibration.state.copy()
     if take.num_samples < MIN_SAMPLES_TO_JUDGE:

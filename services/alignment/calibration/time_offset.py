@@ -1,9 +1,7 @@
 """Time offset between two streams, from common motion or from taps on a table.
 
-Signals of the same motion are correlated coarsely over all allowed offsets; then b's cubic spline
-is fitted to a by Gauss–Newton. Taps are for a glove and a tracker: the pressure starts between two
-samples, and the tracker's height falls on a line and stops: a hinge, whose bend is the touch (the
-second difference would show it too early).
+Signals of the same motion are correlated coarsely; then b's cubic spline is fitted to a by
+Gauss–Newton. In a tap the tracker's height falls on a line and stops: its bend is the touch.
 """
 
 from dataclasses import dataclass
@@ -48,11 +46,9 @@ def estimate_time_offset(
 ) -> TimeOffset:
     """Estimate the offset between two streams that measured the same motion.
 
-    Args:
-        t_a_ns: stamps [n] of stream a, int64, strictly increasing.
-        signal_a: [n] or [n, k]: angular speed, or k components in common axes (better).
-        t_b_ns: stamps [m] of stream b.
-        signal_b: [m] or [m, k]; may have another unit and zero than a.
+    Stamps [n] and [m] are int64, strictly increasing; signals are [n] or [n, k]: angular speed, or
+    k
+    components in common axes (better). That of b may have another unit and zero.
 
     Raises:
         DegenerateMotionError: no motion, too slow, too periodic, or not the same one.
@@ -91,17 +87,12 @@ def estimate_tap_offset(
 ) -> TimeOffset:
     """Offset to be added to a tracker's stamps to align it with a glove, from taps on a table.
 
-    Args:
-        t_pressure_ns: stamps [n], int64, strictly increasing.
-        pressure_kpa: the tapping pad's pressure [n]; below 2 kPa in the air. Taps are at least 0.5
-            s apart.
-        t_height_ns: stamps [m] of the tracker.
-        height_m: height [m] above the table, of a point of the hand.
-
-    Raises:
-        DegenerateMotionError: no tap, or none that falls briskly onto the table.
-        InvalidInputError: stamps out of order.
-        ShapeError, NonFiniteError: values that do not fit or hold NaN.
+    Stamps [n] and [m] are int64, strictly increasing. The tapping pad's pressure [n] is below 2 kPa
+    in
+    the air, the height [m] (m) that of a point of the hand above the table; taps are at least 0.5 s
+    apart. Raises DegenerateMotionError: no tap, or none that falls briskly onto the table;
+    InvalidInputError: stamps out of order; ShapeError, NonFiniteError: values that do not fit, or
+    NaN.
     """
     start_ns = t_pressure_ns[:1]
     pressure, height = np.asarray(pressure_kpa)[..., None], np.asarray(height_m)[..., None]
@@ -128,10 +119,9 @@ def estimate_tap_offset(
 def checked_signal(
     what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """Times of a signal in seconds after a reference [1], and its values [n] or [n, k] as [n, k].
+    """Seconds after a reference [1], and values [n] or [n, k] as [n, k].
 
-    Raises InvalidInputError: fewer than two stamps, or stamps out of order; ShapeError,
-    NonFiniteError: values that do not fit or hold NaN.
+    Raises InvalidInputError: fewer than two stamps, or out of order; ShapeError, NonFiniteError.
     """
     t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(signal, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values

@@ -1,7 +1,6 @@
 """`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand, by its profile.
 
-Tracked points wobble by millimetres, bones do not: bone lengths and knuckles are measured once a
-person, and later samples are checked against them and solved with them.
+Bone lengths and knuckles are measured once a person, since tracked points wobble by millimetres.
 """
 
 from collections.abc import Mapping, Sequence
@@ -102,11 +101,7 @@ class HandProfile:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether this is the robot's own hand (or a copy), with exact bones and knuckles.
-
-        Those of people shift by millimetres with the posture: held fixed, they bend straight
-        fingers.
-        """
+        """Whether this is the robot's own hand; those of people shift with the posture."""
         return bool(np.median(self.travel) >= RIGID_TRAVEL)
 
     def to_rows(self) -> Float64[np.ndarray, "5 9"]:
@@ -120,10 +115,7 @@ class HandProfile:
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":
-        """From the matrix of `to_rows`.
-
-        Raises ShapeError: not [5, 9]; InvalidInputError: not finite, or not a valid hand.
-        """
+        """From the matrix of `to_rows`; raises ShapeError or InvalidInputError."""
         table = np.asarray(rows, dtype=np.float64)
         if table.shape != (NUM_FINGERS, NUM_COLUMNS):
             raise ShapeError(f"hand profile: got shape {table.shape}, expected [5, {NUM_COLUMNS}]")
@@ -138,19 +130,13 @@ def profile_name(side: str) -> str:
 def calibrated_profile(
     calibration: Mapping[str, Sequence[Sequence[float]]], side: str
 ) -> HandProfile | None:
-    """The hand profile of a recording's calibration; None if it has none.
-
-    Raises ShapeError, InvalidInputError: it is not a valid hand.
-    """
+    """The profile of a calibration, None if it has none; raises ShapeError, InvalidInputError."""
     rows = calibration.get(profile_name(side))
     return None if rows is None else HandProfile.from_rows(rows)
 
 
 def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
-    """Refuse an index finger's proximal bone that is not 19.0–66.8 mm long.
-
-    Raises InvalidInputError: most likely millimetres, or nodes in another order.
-    """
+    """Refuse an index finger's proximal bone outside 19.0–66.8 mm; raises InvalidInputError."""
     low, high = INDEX_PROXIMAL_RANGE_M
     if not low <= index_proximal_m <= high:
         is_in_mm = low * 1e3 <= index_proximal_m <= high * 1e3
@@ -163,10 +149,7 @@ def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
 
 
 def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
-    """Record `PERSON` for the fingers that the robot hand has.
-
-    Without a profile, bones and knuckles of each sample are used.
-    """
+    """Record `PERSON` for the robot's fingers; without a profile, each sample has its own bones."""
     record = np.zeros(1, dtype=PERSON)
     person, num, own_m = record[0], len(hand.fingers), robot_bone_m(hand)
     if profile is None:
@@ -316,17 +299,12 @@ class RetargetResult:
 class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
-    `retarget` may run in several threads at once; `step` continues from the previous sample, so a
-    retargeter can be used for one live stream only.
-
-    Args:
-        hand: "left" or "right" for the Wuji hand, or any hand with keypoints of its side.
-        profile: of the person; if None, it is measured from the recording (`retarget`) or each
-            sample is used alone (`step`).
-        options: of the solver.
-
-    Raises:
-        UnknownNameError: any other side.
+    `retarget` may run in several threads at once; `step` continues from the previous sample of one
+    live
+    stream. The hand is "left" or "right" for the Wuji hand, or any one with keypoints of its side.
+    A
+    profile of None is measured from the recording (`retarget`), or each sample is used alone
+    (`step`).
     """
 
     def __init__(
@@ -352,9 +330,9 @@ class HandRetargeter:
     def reset(self, joints_rad: np.ndarray | None = None) -> None:
         """Forget all samples: the next `step` searches from several starts.
 
-        The next outputs lead at the rate limit from where the robot's joints are [J]; with None,
-        the next output is wherever the hand is. Raises ShapeError: not one angle a joint;
-        InvalidInputError: angles that are not finite.
+        The next outputs lead at the rate limit from the robot's joints [J], if given. Raises
+        ShapeError:
+        not one angle a joint; InvalidInputError: angles that are not finite.
         """
         self._memory = self._blank()
         self._was_sent = joints_rad is not None
@@ -370,17 +348,13 @@ class HandRetargeter:
     def step(self, keypoints_m: np.ndarray, elapsed_s: float = NOMINAL_PERIOD_S) -> RetargetResult:
         """Joint angles of the next sample (T = 1), live; untracked fingers hold their angles.
 
-        No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
-        time elapsed, nor than `max_step_rad`: a finger that is found again is REACQUIRED until it
-        has caught up. Only the first output after the start or `reset` is where the hand is.
-
-        Args:
-            keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
-            elapsed_s: since the sample before.
-
-        Raises:
-            ShapeError: wrong shape.
-            InvalidInputError: elapsed time not positive and finite.
+        Keypoints are [25, 3] in wrist axes (m), NaN where missing, `elapsed_s` after the sample
+        before. No
+        joint goes further than `velocity_limit_rad_s` allows in the time elapsed, nor than
+        `max_step_rad`: a finger that is found again is REACQUIRED until it has caught up. Only the
+        first
+        output after the start or `reset` is where the hand is. Raises ShapeError: wrong shape;
+        InvalidInputError: elapsed time not positive and finite.
         """
         keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
         if keypoints.shape != (NUM_KEYPOINTS, 3):
@@ -402,16 +376,13 @@ class HandRetargeter:
     ) -> RetargetResult:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
-        Args:
-            keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [T, 25], False for nodes that are not to be used; None uses all that are
-                not NaN.
-            t_s: [T] rising times, relative to any moment; None takes 60 Hz.
-
-        Raises:
-            ShapeError: wrong shapes.
-            InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
-                followed in no sample. Joints of one that is never tracked are at rest.
+        Keypoints are [T, 25, 3] in wrist axes (m), NaN, or False in `valid` [T, 25], where they are
+        not to
+        be used; times [T] rise (60 Hz if None). Raises ShapeError: wrong shapes; InvalidInputError:
+        times
+        that do not rise, wrong unit, or a finger that is tracked, but followed in no sample. Joints
+        of one
+        that is never tracked are at rest.
         """
         keypoints = checked_keypoints(keypoints_m)
         if valid is not None:
@@ -444,10 +415,7 @@ class HandRetargeter:
         return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray) -> HandProfile:
-        """Measure a person's profile from [T, 25, 3] of an open, closing and spreading hand.
-
-        Raises as `measure_profile`.
-        """
+        """A person's profile from an open, closing, spreading hand (`measure_profile`)."""
         return measure_profile(keypoints_m, self.hand)
 
     def _blank(self) -> Memory:
@@ -468,10 +436,7 @@ class HandRetargeter:
         )
 
     def _filled(self, result: RetargetResult, t_s: np.ndarray) -> np.ndarray:
-        """Angles with untracked stretches of fingers filled linearly, in time; held at ends.
-
-        So the rate limit, which the samples around keep, holds within as well.
-        """
+        """Angles with untracked stretches of fingers filled linearly, in time; held at ends."""
         filled = result.joints_rad.copy()
         for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
             known = result.solved[:, finger]
@@ -491,10 +456,7 @@ def warm_up() -> None:
 
 
 def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
-    """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
-
-    So a person whose finger is never seen has a profile of the others.
-    """
+    """Keypoints with the mean hand's nodes of fingers that are complete in no sample."""
     filled = keypoints_m
     for chain in CHAINS:
         nodes = solver_indices(chain)

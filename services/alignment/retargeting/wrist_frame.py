@@ -1,8 +1,7 @@
 """Wrist frame in a tracker's own axes, and conversion of a recording's keypoints to wrist axes.
 
 Wrist, metacarpals and knuckles are laid over the mean hand's by a similarity transform (Umeyama
-1991), one for the whole recording: of each sample it would absorb part of the fingers' motion,
-because the palm deforms with them. Keypoints in other axes are never turned by guess.
+1991), one for the whole recording, so that it absorbs no motion of the fingers.
 """
 
 from collections.abc import Mapping
@@ -51,9 +50,7 @@ class WristFrame:
     """Pose of the wrist frame in the axes of keypoints, with its covariance.
 
     Attributes:
-        T_tracker_wrist: rigid; its origin is the wrist node (where that is not seen, where the palm
-            says it is), its axes ours: fingers along -z, thumb side +x, right palm +y, left palm
-            -y.
+        T_tracker_wrist: its origin is the wrist node (or where the palm says it is), its axes ours.
         covariance: [3, 3] of the rotation (rad²) about the wrist's own axes, by noise and shape.
         size: of the hand, 1 is the mean adult's.
         misfit_m: RMS distance of the palm's nodes from the mean hand's of that size.
@@ -78,10 +75,10 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
     """Estimate the wrist frame from the palm, in any posture of the fingers.
 
     Keypoints are [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
-    `dextouch.hands.NODES`, NaN where a node is not seen; up to 300 evenly spaced samples are used.
-    `where` is for the message. Raises InvalidInputError: wrong unit, order of nodes or hand (mirror
-    image), too few nodes of the palm or nodes along a line, or axes that are not fixed to the wrist
-    (`details` holds `fault`); ShapeError: not [T ≥ 1, 25, 3].
+    `dextouch.hands.NODES`, NaN where not seen; `where` is for the message. Raises ShapeError: other
+    shapes; InvalidInputError: wrong unit, order of nodes or hand, too few nodes of the palm or
+    nodes
+    along a line, or axes that are not fixed to the wrist (`details` holds `fault`).
     """
     samples = seen_samples(keypoints_m, where=where)
     # Nodes along a line have no handedness; that is said before anything that follows from it.
@@ -133,9 +130,8 @@ def calibrate_wrist(
 ) -> WristFrame:
     """Estimate the wrist frame from a take of the flat hand; one second is enough.
 
-    Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
-    Raises InvalidInputError: as `wrist_frame`, or fewer than 30 samples with straight fingers;
-    ShapeError: not [T ≥ 1, 25, 3].
+    In a grip, ring and little metacarpals give way. Raises InvalidInputError: as `wrist_frame`, or
+    fewer than 30 samples with straight fingers; ShapeError: not [T ≥ 1, 25, 3].
     """
     # Asked for its refusals only.
     seen_samples(keypoints_m, where=where)
@@ -163,8 +159,7 @@ def calibrated_transform(
 ) -> Float64[np.ndarray, "4 4"] | None:
     """A rigid transform of a recording's calibration; None if it has none of this name.
 
-    Raises ShapeError: not 4 by 4; NonFiniteError: NaN or infinity; InvalidInputError: its rotation
-    is none, or mirrors, or the last row is not 0 0 0 1.
+    Raises ShapeError: not 4 by 4; NonFiniteError: NaN or infinity; InvalidInputError: not rigid.
     """
     if name not in calibration:
         return None
@@ -208,16 +203,11 @@ def hand_axes_check(
 ) -> Float64[np.ndarray, "time 25 3"]:
     """Keypoints of one hand of a recording in wrist axes, checked; not finite where not seen.
 
-    Args:
-        keypoints_m: as `wrist_frame`, in wrist axes or, where the calibration says how they are
-            turned, in others that are fixed to the wrist.
-        side: which hand.
-        calibration: the recording's; `T_keypoints_SIDE_wrist_SIDE` is read.
-
-    Raises:
-        InvalidInputError: as `wrist_frame`; keypoints in other axes than the wrist's, with or
-            without calibration (`details` holds `fault`); a calibration that is no rigid transform.
-        ShapeError: not [T ≥ 1, 25, 3], or a calibration that is not 4 by 4.
+    They are as of `wrist_frame`, or turned as `T_keypoints_SIDE_wrist_SIDE` of the calibration
+    says.
+    Raises InvalidInputError: as `wrist_frame`, keypoints in other axes (`details` holds `fault`),
+    or a
+    calibration that is no rigid transform; ShapeError: not [T ≥ 1, 25, 3], or not 4 by 4.
     """
     where = f"keypoints_{side}"
     T_keypoints_wrist = calibrated_transform(calibration, calibration_name(side))

@@ -1,12 +1,8 @@
 """Transfer of a tracked hand to the robot so that it touches where the person did.
 
-With a copied wrist pose the larger robot hand's fingertips and palm are centimetres away from those
-of the human. The wrist is therefore shifted, in wrist axes, until the points in contact match:
-
-    T_world_robot = T_world_human @ T_human_robot,  T_human_robot = (identity rotation, offset)
-
-Fingertips in contact are then moved to the human positions, each finger by its own joints, near the
-retargeted angles. Without touch only a constant shift remains.
+With a copied wrist pose the larger robot hand would touch centimetres away. The wrist is therefore
+shifted, in wrist axes, until the points in contact match; then each finger in contact is moved to
+the human position by its own joints. Without touch only a constant shift remains.
 """
 
 from dataclasses import dataclass
@@ -42,8 +38,7 @@ _NO_SHARE: Final = 1e-3
 class MatchedPoints:
     """Positions of thumb … little fingertip and palm of both hands, each in its own wrist frame.
 
-    Those of the robot are at the retargeted joint angles; a person's point that is not `seen` is
-    zero.
+    The robot's are at the retargeted joint angles; a person's that is not `seen` is zero.
     """
 
     human_m: Float64[np.ndarray, "time 6 3"]
@@ -61,9 +56,9 @@ def matched_points(
 ) -> MatchedPoints:
     """Fingertips and palm of a tracked hand and of the robot hand that follows it.
 
-    Keypoints are [T, 25, 3] in wrist axes (m; NaN where missing), joints [T, 20]. The palm is
-    halfway between the wrist and the middle of the four finger knuckles. Raises ShapeError: other
-    shapes; NonFiniteError: joint angles that are not finite.
+    Keypoints are [T, 25, 3] in wrist axes (m; NaN where missing), joints [T, 20]; the palm is
+    halfway
+    from the wrist to the middle of the finger knuckles. Raises ShapeError, NonFiniteError.
     """
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     if keypoints.shape != (len(joints_rad), NUM_KEYPOINTS, 3):
@@ -92,10 +87,7 @@ def _palm_m(wrist_m: np.ndarray, knuckles_m: np.ndarray) -> np.ndarray:
 
 
 def constant_offset_m(points: MatchedPoints) -> Float64[np.ndarray, "3"]:
-    """Constant offset that matches all points of all samples best (least squares: their mean).
-
-    Raises InvalidInputError: no point was ever tracked.
-    """
+    """Constant offset that matches all points best, their mean; refuses none."""
     if not points.seen.any():
         raise InvalidInputError(
             "wrist transfer: got no sample with a tracked fingertip or palm, expected at least one"
@@ -109,18 +101,11 @@ def touch_offsets_m(
     """Offset for every sample: mean over points in contact, weighted by force and time difference.
 
     offset(t) = (Σ k(t, s) F_i(s) dt offset_i(s) + A c) / (Σ k(t, s) F_i(s) dt + A), over samples s
-    and points i, with k = exp(-|t - s| / reach), the constant offset c and its weight A. During a
-    grasp it is nearly constant, so that nothing slips. It needs future samples.
-
-    Args:
-        points: of T samples.
-        pad_forces_n: [T, 6] on thumb … little fingertip and palm, 0 or more (`pad_forces_n`).
-        t_s: [T] increasing times with any origin.
-
-    Raises:
-        ShapeError: shapes that do not fit.
-        NonFiniteError: forces or times that are not finite.
-        InvalidInputError: times that do not increase, or a negative force.
+    and points i, with k = exp(-|t - s| / reach), the constant offset c and its weight A: nearly
+    constant during a grasp, so that nothing slips. Forces [T, 6] are on thumb … little fingertip
+    and
+    palm, 0 or more; times [T] increase. Raises ShapeError: shapes that do not fit; NonFiniteError;
+    InvalidInputError: times that do not increase, or a negative force.
     """
     forces, times = _checked(len(points.seen), pad_forces_n, t_s)
     # Samples are weighted by their duration, so that the result does not depend on the rate.
@@ -185,8 +170,8 @@ def anchored_joints(
 ) -> Float64[np.ndarray, "time 20"]:
     """Joint angles, inside the limits, that move fingertips in contact to the human positions.
 
-    Retargeted angles are [T, 20], `points` those of both hands there, `offset_m` [T, 3] that of the
-    robot's wrist (`touch_offsets_m`), `shares` [T, 5] of the distance that each tip is moved.
+    Retargeted angles are [T, 20], `offset_m` [T, 3] that of the robot's wrist (`touch_offsets_m`),
+    `shares` [T, 5] of the distance that each tip is moved.
     """
     joints = np.array(joints_rad, dtype=np.float64)
     share = np.where(points.seen[:, :NUM_FINGERS], shares, 0.0)
@@ -202,9 +187,9 @@ def anchored_joints(
 
 
 def touch_shares(pad_forces_n: np.ndarray, t_s: np.ndarray) -> Float64[np.ndarray, "time 5"]:
-    """Share of the distance to the human position that each fingertip is moved.
+    """Share of the distance that each fingertip is moved: 0 without contact, near 1 with it.
 
-    It is 0 without contact and near 1 with contact. Arguments and errors as `touch_offsets_m`.
+    Arguments and errors as `touch_offsets_m`.
     """
     forces, times = _checked(len(t_s), pad_forces_n, t_s)
     near = np.maximum(*_decaying(forces[:, :NUM_FINGERS], times, np.maximum))
@@ -250,20 +235,13 @@ def transfer_by_touch(
 ]:
     """Shift the wrist and move touching fingertips to the person's positions.
 
-    Args:
-        hand: robot hand.
-        Ts_world_human: tracked wrist of the person.
-        joints_rad: retargeted angles.
-        keypoints_m: of the person, in wrist axes; NaN marks a missing node.
-        pad_forces_n: forces on thumb … little fingertip and palm; zeros without a glove.
-        t_s: increasing times with any origin.
-
-    Returns:
-        T_world_robot of the wrist, joint angles of the robot, and the shift (m) in wrist axes.
-
-    Raises:
-        ShapeError: lengths that differ.
-        InvalidInputError: no fingertip and no palm was ever tracked.
+    Keypoints are in wrist axes (NaN where missing), forces on thumb … little fingertip and palm
+    (zeros
+    without a glove), times increase. Returns T_world_robot of the wrist, joint angles of the robot,
+    and
+    the shift (m) in wrist axes. Raises ShapeError: lengths that differ; InvalidInputError: no
+    fingertip
+    and no palm was ever tracked.
     """
     points = matched_points(keypoints_m, joints_rad, hand)
     offset_m = touch_offsets_m(points, pad_forces_n, t_s)

@@ -1,7 +1,4 @@
-"""Views of a board from photos or a running station, the intrinsics they give, and pictures.
-
-The pictures are SVG of all calibrations: coverage, residuals, rotations, maps of taxels.
-"""
+"""Views of a board from photos or a station, the intrinsics they give, and pictures (SVG)."""
 
 import argparse
 import time
@@ -177,11 +174,8 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
 class Session:
     """Growing set of views of one camera, with its coverage picture in the calibration folder.
 
-    Args:
-        options: of the command: board, calibration folder and camera.
-        live: folder in which images of a running station are kept, in new positions of a static
-            board; None for photos, which are kept already.
-        say: tells the operator something.
+    `live` is the folder in which images of a running station are kept, in new positions of a static
+    board; None for photos, which are kept already.
 
     Attributes:
         coverage: of the views that are kept; None before the first.
@@ -287,10 +281,7 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
 
 
 def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) -> Arrivals:
-    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
-
-    `link` is connected to the station, `wait` sleeps between requests.
-    """
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones."""
     last = b""
     for number in count():
         data = live_image(link, camera)
@@ -301,10 +292,7 @@ def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) ->
 
 
 def live_image(link: HttpLink, camera: str) -> bytes:
-    """The newest image (JPEG) of a station's camera; empty while the camera pauses.
-
-    An old image would look like a static board.
-    """
+    """The newest image (JPEG) of a camera; empty while it pauses, as an old one looks static."""
     path = f"/v1/live/cameras/camera_{camera}"
     try:
         return link.request("GET", path, accept="image/jpeg").body

@@ -1,7 +1,4 @@
-"""Calibration of a glove: tare, gain and fault map of the taxels, from takes.
-
-Takes are named ones, or those that a running station records now.
-"""
+"""Calibration of a glove: tare, gain and fault map, from takes or what a station records now."""
 
 import argparse
 import csv
@@ -73,10 +70,7 @@ _PRESS = re.compile(
 
 
 class PressRow(BaseModel):
-    """One row of the list of presses, by default of the whole take.
-
-    Instead of `pressure_kpa`, a weight may be given by `mass_kg` and `area_cm2`.
-    """
+    """A row of presses, by default of the whole take; a pressure, or mass_kg and area_cm2."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -102,10 +96,7 @@ class PressRow(BaseModel):
         return {n: v for n, v in given.items() if n not in weight} | {"pressure_kpa": pressure_kpa}
 
     def known_to(self, relative_sigma: float) -> "PressRow":
-        """The row with a sigma; without one of its own, a share of the pressure.
-
-        Raises InvalidInputError: a negative or infinite share.
-        """
+        """The row with a sigma, if none then a share, which must be 0 or more, of the pressure."""
         if not 0 <= relative_sigma < math.inf:
             raise InvalidInputError(
                 f"pressure sigma: got {relative_sigma:g}, expected a share of the pressure, 0 or "
@@ -193,8 +184,7 @@ def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> flo
 class Guide:
     """Leads an operator, who lays the glove down and presses it while a station records takes.
 
-    An invalid take is explained and repeated. `ask` puts a question to the operator, `say` tells
-    something.
+    An invalid take is explained and repeated.
     """
 
     def __init__(
@@ -296,10 +286,7 @@ class Guide:
 def record_takes(
     options: argparse.Namespace, guide: Guide | None = None
 ) -> tuple[str, list[PressRow]]:
-    """Lead an operator through rest and presses; returns the rest take and valid presses.
-
-    The list of presses is kept, so that the calibration can be repeated from the same takes.
-    """
+    """Lead an operator through rest and presses; returns and keeps the rest take and them."""
     if guide is None:
         link = HttpLink(options.url, api_key=options.key)
         recorder = TakeRecorder(link.request, TASK, spool=options.spool, store=options.store)
@@ -318,10 +305,7 @@ def record_takes(
 def calibrate(
     options: argparse.Namespace, guide: Guide | None = None, *, say: Say = print
 ) -> dict[str, object]:
-    """Calibrate the tare of one glove, and with presses its gain and fault map.
-
-    Raises InvalidInputError: unsuitable takes or pressures; the message says what to do.
-    """
+    """Tare of a glove, with presses gain and fault map; raises InvalidInputError of bad takes."""
     side = options.side
     rest, rows = _takes(options, guide)
     tare = tare_of(rest, options)

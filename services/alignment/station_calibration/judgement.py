@@ -35,10 +35,7 @@ Sigma = tuple[str, list[Problem]]
 
 @dataclass(frozen=True)
 class Finding:
-    """Assessment of one calibration: age and accuracy.
-
-    `level` is OK, WARN or ERROR; `reasons` explain a level other than OK and what to do.
-    """
+    """Age and accuracy of a calibration: OK, WARN or ERROR by `reasons`, which say what to do."""
 
     name: str
     shape: str

@@ -1,7 +1,4 @@
-"""Where a camera sits on its tracker, from photos of a fixed board and the tracker's poses.
-
-The command `hand-eye` of `dextouch station calibrate` and the guided run of a mount both end here.
-"""
+"""Where a camera sits on its tracker, from photos of a fixed board and the tracker's poses."""
 
 import argparse
 import csv
@@ -76,10 +73,7 @@ MAX_POSES_BYTES: Final = 1_000_000
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Paired poses of tracker and board, with names of the views, and the corners of photos.
-
-    `blurred` lists photos excluded for blur.
-    """
+    """Paired poses of tracker and board, names and corners of views; `blurred` are left out."""
 
     names: tuple[str, ...]
     Ts_world_tracker: Float64[np.ndarray, "n 4 4"]
@@ -118,7 +112,7 @@ def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[st
     """Calibrate the mount of one camera on its tracker.
 
     Raises DegenerateMotionError: the tracker was rotated too little (names the axis);
-    InvalidInputError: poses and photos that do not match or contradict each other.
+    InvalidInputError: poses and photos do not match, or contradict each other.
     """
     views = _read_views(options, say)
     trackers, boards = views.Ts_world_tracker, views.Ts_camera_board
@@ -218,10 +212,7 @@ def _with_photos(
 
 
 class Sighting(NamedTuple):
-    """A live image (JPEG; empty if the camera pauses), and the tracker's pose before and after it.
-
-    The pose is None if the tracker is not seen.
-    """
+    """A live image (JPEG; empty if there is none) and, if seen, the tracker's pose around it."""
 
     image: bytes
     T_before: np.ndarray | None
@@ -252,9 +243,10 @@ def station_sightings(
 class MountSession:
     """Growing set of places, written to a folder as they are kept.
 
-    A place is a photo of the board and the tracker's pose at it, kept as the command `hand-eye`
-    reads them, so that an ended session can be continued (`is_resumed`); else its places are put
-    aside.
+    A place is a photo of the board and the tracker's pose at it, as the command `hand-eye` reads
+    them,
+    so that an ended session can be continued (`is_resumed`); else its places are put aside. Raises
+    NotFoundError: no lens yet; InvalidInputError: an ambiguous board, or another one than before.
 
     Attributes:
         progress: what the places say of the mount, and what is missing.
@@ -262,10 +254,6 @@ class MountSession:
         is_still: whether board and tracker stood still since the last image.
         hint: why the newest image was not kept; empty if it was.
         size_px: width and height of the images.
-
-    Raises:
-        NotFoundError: the camera has no lens yet.
-        InvalidInputError: a board whose pose is ambiguous, or another one than the session's.
     """
 
     def __init__(self, options: argparse.Namespace, *, is_resumed: bool = False) -> None:

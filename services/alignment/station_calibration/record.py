@@ -1,7 +1,6 @@
 """Calibration folder and the inputs of calibrations: CSV rows, poses, streams of takes.
 
-The folder holds named matrices for recordings, which stations read from `calibration.json`. Sigma
-and time of a matrix are matrices too (`…_sigma…`, `…_calibrated_at_unix_s`).
+Named matrices for recordings are in `calibration.json`; sigma and time of one are matrices, too.
 """
 
 import codecs
@@ -64,15 +63,10 @@ def write_entry(
 ) -> None:
     """Write an entry of a calibration folder, measured now; other entries are kept.
 
-    Args:
-        folder: created if absent.
-        entry: name of the main matrix, such as `K_head`; its time is stored beside it.
-        matrices: finite; a number or a vector becomes a matrix of one row.
-        facts: sigma, inputs and similar details for humans; JSON.
-
-    Raises:
-        NonFiniteError: NaN or infinity in a matrix.
-        CorruptDataError: an existing file cannot be read.
+    An entry is named as its main matrix, such as `K_head`; numbers and vectors become matrices of
+    one
+    row; the facts are details for humans, JSON. Raises NonFiniteError: NaN or infinity in a matrix;
+    CorruptDataError: an existing file cannot be read.
     """
     for name, matrix in matrices.items():
         if not np.all(np.isfinite(matrix)):
@@ -106,10 +100,7 @@ def write_pose(
 
 
 def read_matrices(folder: Path) -> dict[str, Matrix]:
-    """Read the matrices of a folder or a JSON file.
-
-    Raises NotFoundError: no calibration; CorruptDataError: not a JSON file of matrices.
-    """
+    """Matrices of a folder or JSON file; raises NotFoundError or CorruptDataError."""
     path = folder / MATRICES_FILE if folder.is_dir() else folder
     if not path.is_file():
         raise NotFoundError(
@@ -204,10 +195,7 @@ class TakeStream:
         return timing.t_host_ns, self.batch.values[timing.kept]
 
     def poses(self) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
-        """Times and poses of valid tracking.
-
-        Raises InvalidInputError: fewer than two.
-        """
+        """Times and poses of valid tracking; raises InvalidInputError: fewer than two."""
         t_ns, values = self.timed()
         poses = values.astype(np.float64)
         seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
@@ -220,10 +208,7 @@ class TakeStream:
 
 
 def open_take(take: str, store: str | None) -> SpoolReader | RecordingReader:
-    """Open a take by the path of its spool folder, or a recording of a store by its id.
-
-    Raises NotFoundError for no such take.
-    """
+    """Open a take by its spool folder, or by id in the store; raises NotFoundError."""
     if Path(take).is_dir():
         return SpoolReader(Path(take))
     if store:
@@ -248,8 +233,8 @@ def read_stream(take: str, name: str, store: str | None) -> TakeStream:
 def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row]:
     """Rows of a CSV file in UTF-8, at least one, of a kind; empty cells count as absent.
 
-    `item` and `expected` say in messages what a row is and what columns are expected. Raises
-    NotFoundError: no such file; InvalidInputError: not such a CSV; the message names the line.
+    `item` and `expected` are a row and the columns in messages. Raises NotFoundError: no such file;
+    InvalidInputError: not such a CSV; the message names the line.
     """
     rows = []
     try:
@@ -274,8 +259,7 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
 def read_pairs(path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
     """Pairs of 4x4 matrices from a JSON file, at least one.
 
-    Raises NotFoundError: no such file; InvalidInputError: not JSON, or not numbers; ShapeError: not
-    pairs of 4x4.
+    Raises NotFoundError: no such file; InvalidInputError: no JSON of numbers; ShapeError: no pairs.
     """
     try:
         pairs = np.array(json.loads(_existing(path, expected).read_bytes()), dtype=np.float64)
@@ -307,10 +291,9 @@ def _existing(path: Path, expected: str) -> Path:
 
 
 class Question(NamedTuple):
-    """Question to an operator, and how it can be answered.
+    """Question to an operator; the answer starts `action`, or is a text if it `takes_text`.
 
-    The answer starts `action`, such as "Record 10 s"; it is empty unless it `takes_text`. `choices`
-    are other answers, each with what it does.
+    `choices` are other answers, each with what it does.
     """
 
     text: str
@@ -332,14 +315,9 @@ def ask_at_terminal(question: Question) -> str:
 class TakeRecorder:
     """Records takes with a station's recorder; interrupted and invalid ones are discarded.
 
-    Args:
-        request: sends a request to the station, as `HttpLink.request`.
-        task: of the takes.
-        spool: folder in which the station keeps its takes, if it is on this machine.
-        store: store that the takes are uploaded to.
-        is_practice: whether the devices are those to practise with, whose takes are not uploaded.
-        wait: sleeps.
-        announce: called with the duration of a take (s) when it begins.
+    `request` is as `HttpLink.request`, `spool` the folder of takes of a station on this machine,
+    `store` what takes are uploaded to, but those of practice devices; `announce` is called with the
+    duration of a take (s) when it begins, `wait` sleeps.
     """
 
     def __init__(  # noqa: PLR0913 - all but two by name

@@ -81,10 +81,7 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class StationLocation:
-    """Where the station answers, where its takes are, and the folder of its calibration.
-
-    `practice` is the state of its practice devices.
-    """
+    """Where a station and its practice devices answer, folders of takes and calibration."""
 
     url: str | None
     key: str | None
@@ -94,10 +91,7 @@ class StationLocation:
     practice: Literal["unavailable", "off", "on"] = "unavailable"
 
     def link(self) -> HttpLink:
-        """A connection to the station.
-
-        Raises InvalidInputError: no station is set.
-        """
+        """A connection to the station; raises InvalidInputError: no station is set."""
         if self.url is None:
             raise InvalidInputError(
                 "calibration: no station_url is set; start the alignment service with "
@@ -106,10 +100,9 @@ class StationLocation:
         return HttpLink(self.url, api_key=self.key)
 
     def visited(self) -> "VisitedStation":
-        """The place with the folder of its devices, and the station's streams.
+        """The place, or that of practice devices while they run, and the station's streams.
 
-        Simulated devices have the folder `practice`. While practice devices run, the place is
-        theirs.
+        Simulated devices have the folder `practice`.
         """
         with closing(self.link()) as link:
             reply = link.request("GET", "/v1/practice")
@@ -131,10 +124,7 @@ class StationLocation:
         return self.folder / "photos" / f"mount-{camera}"
 
     def switch_practice(self, *, is_on: bool) -> None:
-        """Start or stop the practice devices of the station.
-
-        Raises ConflictError: the station has real devices.
-        """
+        """Start or stop practice devices; raises ConflictError: the station has real ones."""
         with closing(self.link()) as link:
             link.request("POST", f"/v1/practice/{'start' if is_on else 'stop'}")
 
@@ -184,8 +174,7 @@ class GuidedRun:
     def answer(self, text: str) -> RunStatus:
         """Answer the question of the run.
 
-        Raises ConflictError: it asks nothing; InvalidInputError: a text that is none of the answers
-        to this question.
+        Raises ConflictError: it asks nothing; InvalidInputError: a text that is no answer to it.
         """
         with self._lock:
             asked = self._status
@@ -202,10 +191,7 @@ class GuidedRun:
         return self._status
 
     def order(self, order: Order) -> RunStatus:
-        """Keep the present place of a mount's run as soon as it is still, or drop the last one.
-
-        Raises ConflictError: the run is of another kind, or not on.
-        """
+        """Keep the place of a mount once it is still, or drop one; raises ConflictError."""
         if self._request.kind != "mount" or self._status.state != "running":
             raise ConflictError(
                 f"calibration run: {self._status.state}, it keeps no places that could be "
@@ -220,10 +206,7 @@ class GuidedRun:
         return self._status
 
     def cancel(self) -> RunStatus:
-        """End the run without a result.
-
-        A take that is being recorded is discarded; the places of a mount are kept.
-        """
+        """End the run without a result; a take is discarded, places of a mount are kept."""
         self._is_cancelled.set()
         self._answers.put(None)
         self._thread.join()
@@ -458,8 +441,7 @@ class CalibrationRuns:
     def start(self, request: RunRequest) -> RunStatus:
         """Begin a run.
 
-        Raises ConflictError: another one is not done; InvalidInputError: no such board, subject or
-        station.
+        Raises ConflictError: one is on; InvalidInputError: no such board, subject or station.
         """
         subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(request.kind, tuple(TRACKERS))
         if request.subject not in subjects:
@@ -500,10 +482,7 @@ class CalibrationRuns:
         return None if self._run is None else self._run.status
 
     def present(self) -> GuidedRun:
-        """The run that is on, or the last one.
-
-        Raises NotFoundError: none was begun.
-        """
+        """The run that is on, or the last one; raises NotFoundError: none was begun."""
         if self._run is None:
             raise NotFoundError("calibration run: none was begun; start one first")
         return self._run

@@ -42,8 +42,9 @@ MIN_CAMERA_HZ: Final = 15.0
 def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Measure the delays of all streams of a take that turned together, after a reference.
 
-    Raises DegenerateMotionError: too little, too slow or too regular motion, or streams that did
-    not move together; InvalidInputError: fewer than two streams show how they turned.
+    Raises DegenerateMotionError: too little, slow or regular motion, or streams did not move
+    together;
+    InvalidInputError: fewer than two streams show how they turned.
     """
     where = f"take {options.take!r}"
     reader = open_take(options.take, options.store)
@@ -86,10 +87,7 @@ def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str,
 def _turning(
     reader: SpoolReader | RecordingReader, name: str, cameras: dict[str, Matrix], where: str
 ) -> Turning | str:
-    """How a stream turned, or why it does not show that.
-
-    Raises InvalidInputError for a camera's matrix that is none, or of images of another size.
-    """
+    """How a stream turned, or why it does not show that; refuses another camera's matrix."""
     descriptor = reader.streams[name]
     if descriptor.kind == "image":
         return _camera_turning(reader, name, cameras, where)

@@ -76,10 +76,7 @@ class BuiltEpisode:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """The part of a recording that becomes the episode.
-
-    `matrices` say why the rest does not, and which steps are interpolated across gaps.
-    """
+    """The part of a recording that becomes the episode; `matrices` say why the rest does not."""
 
     gridded: GriddedStreams
     origin_ns: int
@@ -97,10 +94,11 @@ def build_episode(
 ) -> BuiltEpisode:
     """Fit all clocks, find the longest stretch without a long gap, and make actions on its grid.
 
-    Time 0 of the episode is the first moment at which all streams that make up the action are
-    there. Values of other streams are read only while the episode's blocks are taken. Raises
-    InvalidInputError: streams or calibration that every episode needs are missing, or no stretch
-    without a gap is long enough; ClockFitError: a stream whose stamps fit no clock.
+    Time 0 is the first moment at which all streams of the action are there; values of others are
+    read
+    while the episode's blocks are taken. Raises InvalidInputError: streams or calibration are
+    missing,
+    or no stretch is long enough; ClockFitError: a stream whose stamps fit no clock.
     """
     check_complete(recording)
     objects = options.of_task(recording.attributes.task).objects
@@ -271,10 +269,7 @@ def _episode_attributes(
 
 
 def check_complete(recording: RecordingReader) -> None:
-    """Refuse a recording from which no episode can be made: one without any hand.
-
-    Raises InvalidInputError: names the streams that are missing, or a matrix that does not fit.
-    """
+    """Refuse a recording without any hand or with wrong matrices; raises InvalidInputError."""
     where = f"recording {recording.attributes.recording_id!r}"
     _check_hands(recording, recording.streams)
     # One window holds both hands.

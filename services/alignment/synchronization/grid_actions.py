@@ -45,10 +45,7 @@ REST_RAD_S = 0.1
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams that actions are computed from, and the placement of the grid among their samples.
-
-    Values of `TOUCH_STREAMS` are the forces (N) of the hand's pads; steps need not have touch.
-    """
+    """Streams of which actions are made, `TOUCH_STREAMS` as forces (N) of pads, and their grid."""
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
@@ -97,10 +94,7 @@ class RetargetedHand:
 
 
 def commanded_streams(names: Collection[str]) -> tuple[str, ...]:
-    """The streams that commanded actions are made of, among those of a recording; () if none are.
-
-    Joints, and each wrist that is tracked or commanded.
-    """
+    """Streams of commanded actions: joints, and wrists tracked or commanded; () if none are."""
     wrists = [f"wrist_{side}" for side in SIDES]
     wrists = [f"{one}_commanded" for one in wrists if {one, f"{one}_commanded"} & set(names)]
     needed = ("joints_commanded", *wrists)
@@ -131,9 +125,10 @@ def make_actions(
 ) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
-    Human hands are retargeted, a robot's joints taken as they are. Parts that were not recorded
-    have the identity as their pose, and joints at rest. `wrist` says where the robot's wrists are
-    that stand for human ones; a finger may be missing for `max_gap_ns` (of slow streams longer).
+    Human hands are retargeted. Parts that were not recorded have the identity as their pose, and
+    joints
+    at rest. `wrist` says where the robot's wrists are that stand for human ones; a finger may be
+    missing for `max_gap_ns` (of slow streams longer).
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     absent = [name for name in ACTION_STREAMS[domain] if name not in gridded.streams]
@@ -214,10 +209,10 @@ def retarget_hands(
 ) -> dict[Side, RetargetedHand]:
     """Joint angles of the recorded hands on the grid, each from a thread of its own.
 
-    Every sample is retargeted once, at the rate of the tracker; the grid's steps take the line
-    between their two neighbours. The person's hand is `hand_profile_SIDE` of the calibration, else
-    it is measured from the recording. Raises InvalidInputError: keypoints that are not a hand, of
-    the other side or in other axes (`hand_axes_check`, `HandRetargeter.retarget`).
+    Samples are retargeted at the tracker's rate, steps interpolated. The person's hand is
+    `hand_profile_SIDE` of the calibration, else measured from the recording. Raises
+    InvalidInputError:
+    no such hand, or other axes (`hand_axes_check`, `HandRetargeter.retarget`).
     """
     recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
     hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}
@@ -281,10 +276,7 @@ def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, "
 def motion_figures(
     trajectory: HandTrajectory, *, rate_hz: float, sides: Sequence[Side] = SIDES
 ) -> Mapping[str, float]:
-    """Peak speed and jerk of each wrist, and the share of steps in which these hands are at rest.
-
-    The jerk is the 95th percentile of third differences, which a few outliers do not decide.
-    """
+    """Peak speed and jerk (95th percentile) of each wrist, and the share of steps at rest."""
     figures: dict[str, float] = {}
     moves = np.zeros(max(len(trajectory.joints_left_rad) - 1, 0), dtype=bool)
     for side in sides:

@@ -1,7 +1,4 @@
-"""Leaves out what cannot be true in recorded poses, joints and keypoints, and refuses other units.
-
-`dextouch.streams.plausibility` finds it; stations show the same live (docs/health.md).
-"""
+"""Leaves out what cannot be true in recorded poses, joints and keypoints (docs/health.md)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,10 +24,7 @@ from services.alignment.synchronization.resampling import RefusedReason, runs_of
 
 @dataclass(frozen=True)
 class CheckedStream:
-    """A stream without its implausible samples, and from when to when they were left out.
-
-    `parts_ns` count on the host's clock.
-    """
+    """A stream without its implausible samples, and from when to when, on the host's clock."""
 
     stream: DatedStream
     parts_ns: tuple[tuple[int, int, RefusedReason], ...] = ()
@@ -39,9 +33,8 @@ class CheckedStream:
 def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
     """Check one stream, and leave out what is implausible.
 
-    Where a tracker found itself anew there will be a gap longer than `max_gap_ns`, the longest that
-    is interpolated: nothing connects its worlds before and after. Raises InvalidInputError: the
-    whole stream is implausible (`details` has `fault` and `stream`).
+    Where a tracker found itself anew, a gap is made longer than `max_gap_ns`, the longest that is
+    interpolated. Raises InvalidInputError: the whole stream is implausible (`details`).
     """
     kind, name = stream.descriptor.kind, stream.name
     if stream.implausible:
@@ -67,10 +60,7 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
 
 
 def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
-    """Refuse a head and wrists that cannot be those of one body (`dextouch.streams`).
-
-    Raises InvalidInputError: names the stream, and how it is to be read or what is exchanged.
-    """
+    """Refuse a head and wrists that cannot be those of one body; raises InvalidInputError."""
     if not all(name in streams for name in BODIES):
         return
     t_ns = streams["head"].t_ns

@@ -1,8 +1,7 @@
 """Streams of a recording on the host's clock, converted to the units of episodes, and cut to one.
 
-Stamps are read whole, values in pieces: an hour of images or pressures is never in memory at once.
-Encoded images go over as they are; they are decoded only for markers on objects, whose poses become
-streams that have samples only where the object was seen.
+Values are read in pieces: an hour of images is never in memory at once, and encoded ones are
+decoded only for markers on objects.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -95,9 +94,8 @@ class LoadedStream:
 class DatedStream:
     """One stream on the host's clock, whose values are read on demand.
 
-    `descriptor` is that of the episode; `quality` are figures for the record, `calibration`
-    matrices that the episode carries besides. `unseen` are keypoints that are not to be believed,
-    which become NaN, and `implausible` samples that were found on the way.
+    The descriptor is that of the episode, `calibration` matrices that it carries besides; keypoints
+    that are `unseen` become NaN, `implausible` samples were found on the way.
     """
 
     recording: RecordingReader
@@ -137,10 +135,7 @@ class DatedStream:
             yield Block(t_ns[low : low + rows], values)
 
     def load(self, of: Conversion = np.asarray) -> LoadedStream:
-        """All samples at once, or a function `of` them: for the streams that actions are made of.
-
-        The descriptor remains that of the samples.
-        """
+        """All samples, or a function `of` them, at once; the descriptor remains that of samples."""
         pieces = [of(piece.values) for piece in self.pieces()]
         empty = np.empty((0, *self.descriptor.shape), dtype=self.descriptor.numpy_dtype())
         values = np.concatenate(pieces) if pieces else of(empty)
@@ -162,8 +157,9 @@ class EpisodeStream:
 def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
-    Raises ClockFitError: its stamps fit no clock; InvalidInputError: calibration is missing or of
-    the wrong shape; UnknownNameError: the recording has no such stream.
+    Raises ClockFitError: its stamps fit no clock; InvalidInputError: calibration is missing or
+    wrong;
+    UnknownNameError: the recording has no such stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
     timing = time_stream(
@@ -217,10 +213,7 @@ def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStre
 
 
 def check_lens(stream: StreamDescriptor, calibration: Mapping[str, Matrix], *, where: str) -> None:
-    """Refuse matrices of a camera that are none, or measured on images of another size.
-
-    Images are never undistorted here: the episode carries `distortion_<camera>` beside K.
-    """
+    """Refuse matrices that are no camera's, or were measured on images of another size."""
     camera = stream.name.removeprefix("camera_")
     if stream.kind != "image" or camera == stream.name:
         return
@@ -411,10 +404,9 @@ def marker_streams(
     max_gap_ns: int,
     on_progress: OnProgress = lambda _: None,
 ) -> list[EpisodeStream]:
-    """Poses of the objects that have markers; objects that were never seen are omitted.
+    """Poses of objects with markers that were seen from the first to the last step, in host time.
 
-    `inside_ns` are host times of the first and the last step of the episode, `max_gap_ns` the
-    longest gap between poses of the camera.
+    `max_gap_ns` is the longest gap between poses of the camera.
     """
     listed = [one for one in _listed(objects) if one.markers]
     if objects is None or not listed:

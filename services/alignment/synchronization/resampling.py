@@ -1,7 +1,7 @@
 """Resampling of vectors and poses to a common time grid, never across a gap, and what that refuses.
 
-An episode carries the parts of its recording that are not in it as matrices, one a reason and
-stream: `refused_<reason>_<stream>_s`, rows of start and stop in seconds after its start.
+Episodes carry the parts of their recording that are left out as `refused_<reason>_<stream>_s`, rows
+of start and stop in seconds after the episode's start.
 """
 
 import re
@@ -34,10 +34,9 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class GridPlacement:
-    """Neighbouring samples and weights of each grid step in one stream.
+    """Neighbouring samples and weights (of the right one) of each grid step in one stream.
 
-    `weight` of the right neighbour is in [0, 1], but outside within `EDGE_PERIODS` of the ends (the
-    line through the last two samples goes on).
+    A weight is outside [0, 1] within `EDGE_PERIODS` of the ends: the line goes on.
     """
 
     left: Int64[np.ndarray, " n"]

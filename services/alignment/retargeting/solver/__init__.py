@@ -1,7 +1,6 @@
 """Compiled retargeting solver: its compilation by numba, and the folder that keeps compiled code.
 
-numba notices changes of the file that holds a function, not of the files whose functions it calls:
-the folder is named after the content of this whole package.
+The folder is named after the content of the package: numba would miss changes of called functions.
 """
 
 import hashlib

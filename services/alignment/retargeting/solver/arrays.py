@@ -1,7 +1,4 @@
-"""What the compiled solver reads and writes: hand, person, options, results.
-
-Tables of fixed size are records: compiled functions hand on one pointer, and strides are constants.
-"""
+"""What the compiled solver reads and writes, as records: hand, person, options, results."""
 
 from dataclasses import astuple, dataclass, fields
 from enum import IntEnum
@@ -175,11 +172,11 @@ class RetargetOptions:
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
-            weight (directions of people's bones count as points at 40 mm); at other rates in
-            proportion to the rate. 0 follows every sample exactly.
+        weight (directions of people's bones count as points at 40 mm), in proportion to the
+        rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
-        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs;
-            the default is 9.6 rad/s at 30 Hz, the rate of the slowest trackers.
+        max_step_rad: live, largest change of a joint between two outputs; the default is 9.6 rad/s
+        at 30 Hz, the rate of the slowest trackers.
         pinch_far_m: from this distance of thumb and fingertip on they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
@@ -210,10 +207,7 @@ class RetargetOptions:
             raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
 
     def tuning(self, *, is_live: bool = False) -> np.ndarray:
-        """The options as the record, shape [1], that the compiled solver reads.
-
-        Where `is_live`, motors follow: no joint goes further than `max_step_rad`.
-        """
+        """The options as the record [1] that the solver reads; `is_live`, steps are limited."""
         types = [(field.name, field.type) for field in fields(self)]
         return np.array([(*astuple(self), is_live)], dtype=[*types, ("is_live", bool)])
 

@@ -1,8 +1,8 @@
 """Entry point of the compiled solver: joint angles for every sample of a tracked hand.
 
-Every finger is a small least-squares problem in a box: points of a *virtual hand* (the robot's
-axes, the person's bones) against measured points, plus a pull towards the sample before. Thumb and
-fingers near one another are solved together, by vectors between the robot's own fingertips.
+Every finger is a least-squares problem in a box: points of a *virtual hand* (the robot's axes, the
+person's bones) against measured points, plus a pull towards the sample before. Thumb and fingers
+near one another are solved together, by vectors between the robot's own fingertips.
 """
 
 from typing import no_type_check
@@ -80,8 +80,7 @@ def read_sample(hand, person, work, keypoints, memory):
 def check_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
-    With bones of a length or bend that no finger has, or a knuckle far off, the whole finger is
-    rejected: the wrong point cannot be identified.
+    Impossible bones or a knuckle far off reject the whole finger: which point is wrong is unknown.
     """
     measured, usable = work.measured[finger], work.usable[finger]
     count, expected = 0, 0
@@ -150,10 +149,7 @@ def knuckle_error_m(hand, person, tuning, work, finger, memory):
 @compiled
 @no_type_check
 def find_pinches(hand, tuning, work, status):
-    """The thumb and all fingers near it into `members` and `is_near`; vectors and weights.
-
-    The weight goes from that of near to that of far evenly in its logarithm.
-    """
+    """Thumb and fingers near it into `members` and `is_near`; vectors and log-even weights."""
     thumb, measured, usable = hand.thumb, work.measured, work.usable
     work.is_near[:] = 0
     if thumb < 0 or status[thumb] >= IMPLAUSIBLE or not usable[thumb, 3]:
@@ -193,10 +189,7 @@ def set_box(hand, work, finger, before_rad, reach):
 @compiled
 @no_type_check
 def tip_error(work, finger, num_joints):
-    """Distance of the virtual tip from the measured one, both seen from the knuckle if it was.
-
-    Points are those before the last step, which is small enough for their slopes.
-    """
+    """Distance of the virtual tip from the measured one, before the small last step."""
     if not work.usable[finger, 3]:
         return 0.0
     squared = 0.0
@@ -304,10 +297,7 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
 @compiled
 @no_type_check
 def mark_reacquired(hand, person, work, memory, output):
-    """Fingers that the box keeps from where they are tracked are REACQUIRED until they are there.
-
-    Their tip error is that of the angles that come out.
-    """
+    """Fingers kept by the box from where they are tracked are REACQUIRED, with their tip error."""
     status, errors_m = output
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE or not memory.is_behind[finger]:
@@ -330,14 +320,10 @@ def mark_reacquired(hand, person, work, memory, output):
 @compiled_once
 @no_type_check
 def retarget_samples(tables, samples, memory, output):
-    """Follow a tracked hand through T samples.
+    """Follow a tracked hand through T samples, from the `memory` before to that of the last.
 
-    Args:
-        tables: (hand, person, tuning, scratch), records of one element each.
-        samples: (keypoints [T, K, 3] m in wrist axes, NaN or infinite where missing; elapsed_s
-            [T], since the sample before).
-        memory: `Memory`, of the sample before the first; afterwards of the last.
-        output: `Output`, filled.
+    `tables` are hand, person, tuning and scratch, records of one element each; `samples` keypoints
+    [T, K, 3] (m in wrist axes, not finite where missing) and elapsed_s [T].
     """
     keypoints, elapsed_s = samples
     hand, person, tuning, work = tables[0][0], tables[1][0], tables[2][0], tables[3][0]
@@ -384,8 +370,9 @@ def follow_point(before, now, variance_m2):
 def noise_of_bones(bones_m, keypoints, nodes):
     """Mean square of the noise's length, by how the lengths of bones differ from their mean.
 
-    Of each bone [F, 3, 3], changed in place: how often it was seen, its mean length and the mean
-    deviation. Keypoints are [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
+    Bones [F, 3, 3] are changed: how often seen, mean length and mean deviation of each. Keypoints
+    are
+    [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
     """
     total, count = 0.0, 0
     for finger in range(len(bones_m)):
@@ -425,10 +412,7 @@ def smooth_forward(keypoints, variance_m2):
 
 
 def smoothed(keypoints_m: np.ndarray, sigma_m: float) -> np.ndarray:
-    """Keypoints [T, K, 3] smoothed forwards and backwards; the mean of both has no lag.
-
-    NaN where missing; sigma is that of the tracker's noise, per axis.
-    """
+    """Keypoints [T, K, 3] smoothed by the tracker's sigma both ways; the mean has no lag."""
     passes = keypoints_m.copy(), keypoints_m[::-1].copy()
     for one in passes:
         smooth_forward(one, 3.0 * sigma_m**2)
