@@ -54,9 +54,8 @@ class JobQueue:
 
     Change jobs only while holding `lock`; a change that cannot be saved raises `StorageError` and
     leaves them as they were. `max_open` jobs may wait or run; of more than `max_kept` the oldest
-    ended
-    ones are forgotten. `problem` is why the jobs could not be opened: none are listed or accepted
-    then.
+    ended ones are forgotten. `problem` is why the jobs could not be opened: none are listed or
+    accepted then.
     """
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:

@@ -156,8 +156,7 @@ class JobRunner:
         """Submit alignments, or find those that run or are done; failed ones are submitted again.
 
         All are accepted or none. Raises NotFoundError: no such recording; InvalidInputError: it
-        lacks what
-        every episode needs; LimitExceededError: too many are waiting.
+        lacks what every episode needs; LimitExceededError: too many are waiting.
         """
         options = request.options or self._options
         if options.objects is None:
@@ -297,10 +296,8 @@ class NewRecordings:
     A recording is skipped when it has a job; when an episode made from it is in the store or its
     trash, under any options; or when it is a calibration take. One that cannot be aligned becomes a
     failed job with the reason; it is submitted again after RETRY_S if the disk was full, and one
-    that
-    cannot be read is tried again. One that comes back under the id of a deleted one is new unless
-    an
-    episode was made from its content.
+    that cannot be read is tried again. One that comes back under the id of a deleted one is new
+    unless an episode was made from its content.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:

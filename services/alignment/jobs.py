@@ -51,8 +51,7 @@ def align_recording(
 
     The episode's id follows from the recording's content and the options: doing it again, even from
     two processes at once, gives the same episode. Raises NotFoundError: no such recording, or it
-    was
-    deleted meanwhile; InvalidInputError: it lacks data that an episode needs; CorruptDataError,
+    was deleted meanwhile; InvalidInputError: it lacks data that an episode needs; CorruptDataError,
     StorageError: the store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)

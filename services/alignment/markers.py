@@ -58,8 +58,7 @@ class MarkerDetector:
     """Finds markers of a dictionary in gray images, with unbiased corners.
 
     Of OpenCV's ways to refine corners, only AprilTag's has no bias: others put objects with 30 to
-    40 px
-    a side 3 to 14 mm too far away. It is slow, so that it is given the surroundings of found
+    40 px a side 3 to 14 mm too far away. It is slow, so that it is given the surroundings of found
     markers.
     """
 

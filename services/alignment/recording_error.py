@@ -57,12 +57,10 @@ def compare_with_truth(
     """Errors of an episode against the truth episode that its mock devices replayed.
 
     `origin_in_truth_ns` is the true time of the episode's time 0. By stream are `clock_rms_ms`
-    without
-    a constant delay, `latency_ms` (calibrated plus found), `latency_error_ms` (what calibration
-    left)
-    and `num_dropped`; `taxel_iou` and `taxel_mae_kpa` are over samples that arrived (None without
-    gloves), `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg` means over the model grid. It
-    raises InvalidInputError if the two share no stream.
+    without a constant delay, `latency_ms` (calibrated plus found), `latency_error_ms` (what
+    calibration left) and `num_dropped`; `taxel_iou` and `taxel_mae_kpa` are over samples that
+    arrived (None without gloves), `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg` means
+    over the model grid. It raises InvalidInputError if the two share no stream.
     """
     origin_ns = origin_in_truth_ns
     matches = match_streams(episode, truth, origin_ns)

@@ -321,8 +321,7 @@ class CameraRig:
         """Find what each ray of a camera meets.
 
         Most rays meet the top of the table or nothing, which one division tells; only rays near
-        other
-        geoms are left to MuJoCo, with equal results.
+        other geoms are left to MuJoCo, with equal results.
         """
         T_world_camera = self.pose(simulation, camera)
         rays = np.ascontiguousarray(self.rays[camera] @ T_world_camera[:3, :3].T)

@@ -313,8 +313,7 @@ def elastic_layer(
     """Forces, of sum F, of an elastic layer at depths that are known up to a common offset c.
 
     Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M; depths are 0
-    or
-    more, one of them positive, k is the stiffness of one taxel.
+    or more, one of them positive, k is the stiffness of one taxel.
     """
     touched = depths_m > 0.0
     deepest_first = np.sort(depths_m[touched])[::-1]

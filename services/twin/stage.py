@@ -94,10 +94,8 @@ class Stage:
         """Plan the take of a seed, 0 or more: placement, variations of the motion, and noise.
 
         `noise_m`, 0 … 0.2 m, is the standard deviation of the demonstrator's error at each
-        location.
-        Unknown to the demonstrator objects are moved away (`miss`) or of other `sizes` (see
-        `dress`);
-        the head camera's home may be `varied`.
+        location. Unknown to the demonstrator objects are moved away (`miss`) or of other `sizes`
+        (see `dress`); the head camera's home may be `varied`.
         """
         if seed < 0 or not 0.0 <= noise_m <= MAX_NOISE_M:
             raise InvalidInputError(

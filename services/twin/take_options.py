@@ -48,10 +48,9 @@ class TakeOptions:
     `frozen_from_step` (0 … 80) freezes them from that step on, `motion` replaces the script, and
     `actions_of_seed` plays the demonstration of another seed, relative to this take's start.
     `mistakes` change the commands of the script, in their order; with `varied`, colours, light and
-    the
-    home of the head camera differ from take to take. Cameras record at 30 Hz, or at grid steps that
-    are multiples of `image_every` and the last three; with `training` streams, only touch, images,
-    actions, and object poses at grid steps are recorded.
+    the home of the head camera differ from take to take. Cameras record at 30 Hz, or at grid steps
+    that are multiples of `image_every` and the last three; with `training` streams, only touch,
+    images, actions, and object poses at grid steps are recorded.
     """
 
     noise_m: float = 0.0
@@ -188,8 +187,7 @@ class Mix:
     deviation, or with the levels `LADDER_M` cycled over the seeds (`ladder`). The other kinds have
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
     starts; the `MOTION_KINDS`; `other_scene` plays the actions of another seed; `mistaken` has one
-    to
-    four mistakes of `TRAINING`, `otherwise_mistaken` one of `DEVELOPMENT`.
+    to four mistakes of `TRAINING`, `otherwise_mistaken` one of `DEVELOPMENT`.
     """
 
     exact: float = 0.0

@@ -132,8 +132,7 @@ def weighted_bundle(
 
     The second series has the noise `own`, and a scale of one within `scale_sigma`. The covariance
     holds for errors as large as changes from place to place. Raises InvalidInputError: mount,
-    target
-    or clock changed along the views, or the steps do not become small.
+    target or clock changed along the views, or the steps do not become small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
@@ -180,10 +179,8 @@ def estimate_sigmas(
     """Standard deviation of each component (variance component estimation).
 
     The residual twist of view i [n, 6], which changes with the m fitted unknowns by J [n, 6, m],
-    has
-    the covariance Σ_k θ_k M_ki. Fisher scoring of the restricted likelihood finds the best θ
-    (Patterson
-    and Thompson 1971), with a log-normal prior about the declared sizes.
+    has the covariance Σ_k θ_k M_ki. Fisher scoring of the restricted likelihood finds the best θ
+    (Patterson and Thompson 1971), with a log-normal prior about the declared sizes.
     """
     M = np.stack([component.shapes for component in components])
     declared = np.log(np.square([component.sigma for component in components]))
@@ -239,9 +236,8 @@ def solve_bundle(
 
     `measurement` is of the target's poses in the mounted frame, the tracker's noise in rad and m an
     axis; `start` are X (which stays if `is_mount_known`) and Z within a few degrees and
-    centimetres;
-    `scale_sigma` is the expected deviation of the scale from one, 0 leaves it at one. Raises
-    InvalidInputError: the steps do not become small.
+    centimetres; `scale_sigma` is the expected deviation of the scale from one, 0 leaves it at one.
+    Raises InvalidInputError: the steps do not become small.
     """
     X, Z = start
     free = free_unknowns(is_mount_known=is_mount_known, is_scale_known=scale_sigma == 0)

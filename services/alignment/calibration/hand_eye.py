@@ -174,8 +174,7 @@ def solve_hand_eye(
     """Estimate the mount of a camera on a tracker from views of a fixed board.
 
     Both series are poses [n ≥ 4, 4, 4] of the same moments. With the corners (`views`) from which
-    the
-    board's poses were computed, each view is weighted by the information in its pixels.
+    the board's poses were computed, each view is weighted by the information in its pixels.
 
     Raises:
         DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
@@ -318,10 +317,8 @@ def solve_robot_base(
     """Estimate the robot's base in the tracked world, and the noise, from simultaneous poses.
 
     Both series are [n ≥ 4, 4, 4], of a tracker that the effector carries, and of the effector by
-    the
-    robot's own joints. `T_effector_tracker` is the identity where both are of the same frame, None
-    to
-    find it.
+    the robot's own joints. `T_effector_tracker` is the identity where both are of the same frame,
+    None to find it.
 
     Raises:
         DegenerateMotionError: the effector was turned too little or about one axis only (or, of a

@@ -88,8 +88,7 @@ class FoundBoards:
     """Corners of one board on photos of one size (width, height).
 
     `points_board` are [k, 3] corners of each photo on the board (m), `pixels_px` [k, 2] where they
-    are,
-    `photos` the indices of those of `num_photos` that show the board, `pattern` says how it is
+    are, `photos` the indices of those of `num_photos` that show the board, `pattern` says how it is
     printed.
     """
 
@@ -179,8 +178,7 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
 
     Photos of one place count once; places that do not fit the others are left out, at most a fifth.
     Raises InvalidInputError: the board is found in too few photos; DegenerateMotionError: the views
-    do
-    not show the focal length; LensModelError: another kind of lens, such as a fisheye, or it
+    do not show the focal length; LensModelError: another kind of lens, such as a fisheye, or it
     changed.
     """
     if len(found.photos) < MIN_VIEWS:
@@ -327,8 +325,7 @@ def edge_width_px(
     """Width over which edges of squares rise: 2.5 sigma of the blur; infinity without neighbours.
 
     Corners [n, 3] of a regular grid (m) are seen at [n, 2] pixels (middle of the first pixel 0, 0);
-    the
-    wider of the medians along the board's two axes counts.
+    the wider of the medians along the board's two axes counts.
     """
     grid = np.asarray(points_board, dtype=np.float64)[:, :2]
     separation_m = grid[None] - grid[:, None]

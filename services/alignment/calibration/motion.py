@@ -413,10 +413,8 @@ def excess_over_time(
 
     Residual twists [n, 6] are whitened; they change by J with mount, target and scale, the unknowns
     `free` of which were fitted, and by C with errors of the body's poses, whose `expected` noise is
-    in
-    rad and m an axis. Raises InvalidInputError: mount, target or the body's frame moved, or the
-    clocks
-    differ.
+    in rad and m an axis. Raises InvalidInputError: mount, target or the body's frame moved, or the
+    clocks differ.
     """
     num_places = len(residuals)
     left, fitted = residuals.ravel(), J[:, :, free].reshape(6 * num_places, -1)
@@ -477,11 +475,9 @@ def structure(
     """Test whether functions explain residuals of a fit better than chance.
 
     Independent errors leave as much in any direction of the residuals as in any other. Residuals
-    are
-    whitened; `fitted` says how they change with the unknowns that were fitted, `num_others` counts
-    fitted unknowns of which nothing is left in any of the three, `num_together` errors in turn that
-    are
-    alike, and count as one.
+    are whitened; `fitted` says how they change with the unknowns that were fitted, `num_others`
+    counts fitted unknowns of which nothing is left in any of the three, `num_together` errors in
+    turn that are alike, and count as one.
     """
     # Here, since commands that measure nothing import this module on stations without scipy.
     from scipy.special import fdtrc

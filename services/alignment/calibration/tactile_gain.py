@@ -207,9 +207,8 @@ def fit_gain(
 
     Taxels that do not answer, saturate in all presses, bend, or were pressed too little for 10 % of
     gain are refused. Raises InvalidInputError: no press, no taxel that answers, counts that fall
-    under
-    pressure, pressures that do not belong to the takes, or a glove that bends or drifts by above 10
-    %.
+    under pressure, pressures that do not belong to the takes, or a glove that bends or drifts by
+    above 10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")

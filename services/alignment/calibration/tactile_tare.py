@@ -284,14 +284,11 @@ class TactileCalibration:
         """From a recording's calibration matrices of one side.
 
         These are `tactile_<side>_tare_counts`, `…_gain_counts_per_kpa` (1 × cells; the unit of the
-        layout
-        may say it) and, if any, `…_taxel_state` (1 × cells) and `…_cells` (1 × taxels; needed by a
-        glove
-        without layout that sends other than 360 numbers). `num_cells` is that of a sample, None
-        that of
-        the `layout`, which is `dextouch_v1` if None; `stream` begins the names of a further glove.
-        It
-        raises InvalidInputError or NonFiniteError for a matrix that is missing or invalid.
+        layout may say it) and, if any, `…_taxel_state` (1 × cells) and `…_cells` (1 × taxels;
+        needed by a glove without layout that sends other than 360 numbers). `num_cells` is that of
+        a sample, None that of the `layout`, which is `dextouch_v1` if None; `stream` begins the
+        names of a further glove. It raises InvalidInputError or NonFiniteError for a matrix that is
+        missing or invalid.
         """
         glove, about = stream or f"tactile_{side}", layout or DEXTOUCH_V1
         num_cells = about.num_raw_cells if num_cells is None else num_cells

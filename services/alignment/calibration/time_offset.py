@@ -47,8 +47,7 @@ def estimate_time_offset(
     """Estimate the offset between two streams that measured the same motion.
 
     Stamps [n] and [m] are int64, strictly increasing; signals are [n] or [n, k]: angular speed, or
-    k
-    components in common axes (better). That of b may have another unit and zero.
+    k components in common axes (better). That of b may have another unit and zero.
 
     Raises:
         DegenerateMotionError: no motion, too slow, too periodic, or not the same one.
@@ -88,9 +87,8 @@ def estimate_tap_offset(
     """Offset to be added to a tracker's stamps to align it with a glove, from taps on a table.
 
     Stamps [n] and [m] are int64, strictly increasing. The tapping pad's pressure [n] is below 2 kPa
-    in
-    the air, the height [m] (m) that of a point of the hand above the table; taps are at least 0.5 s
-    apart. Raises DegenerateMotionError: no tap, or none that falls briskly onto the table;
+    in the air, the height [m] (m) that of a point of the hand above the table; taps are at least
+    0.5 s apart. Raises DegenerateMotionError: no tap, or none that falls briskly onto the table;
     InvalidInputError: stamps out of order; ShapeError, NonFiniteError: values that do not fit, or
     NaN.
     """

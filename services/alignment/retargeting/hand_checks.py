@@ -94,10 +94,8 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> fl
     """Size of a hand (1: the mean adult); refuses what is none in metres, in our order of nodes.
 
     Keypoints are in any axes, of either hand; a node that is not seen is NaN. Raises ShapeError:
-    not
-    [T ≥ 1, 25, 3]; InvalidInputError: another unit or order of nodes (if it is known, `details`
-    holds
-    `fault` and `found`), no hand, or too few nodes.
+    not [T ≥ 1, 25, 3]; InvalidInputError: another unit or order of nodes (if it is known, `details`
+    holds `fault` and `found`), no hand, or too few nodes.
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
     sizes, misfits = _compared(distances, _orders()[1])
@@ -143,10 +141,8 @@ def check_handedness(
     """The side that a hand shows, None where it shows neither; refuses the mirror image.
 
     Bones turn about an axis that points to the thumb on a right hand; if they hardly bend, the base
-    of
-    the thumb decides, which is on the palm's side of the metacarpals. Raises InvalidInputError:
-    they
-    are of the other hand; ShapeError: not [T ≥ 1, 25, 3].
+    of the thumb decides, which is on the palm's side of the metacarpals. Raises InvalidInputError:
+    they are of the other hand; ShapeError: not [T ≥ 1, 25, 3].
     """
     samples = seen_samples(keypoints_m, where=where)
     across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]

@@ -300,11 +300,9 @@ class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
     `retarget` may run in several threads at once; `step` continues from the previous sample of one
-    live
-    stream. The hand is "left" or "right" for the Wuji hand, or any one with keypoints of its side.
-    A
-    profile of None is measured from the recording (`retarget`), or each sample is used alone
-    (`step`).
+    live stream. The hand is "left" or "right" for the Wuji hand, or any one with keypoints of its
+    side. A profile of None is measured from the recording (`retarget`), or each sample is used
+    alone (`step`).
     """
 
     def __init__(
@@ -331,8 +329,7 @@ class HandRetargeter:
         """Forget all samples: the next `step` searches from several starts.
 
         The next outputs lead at the rate limit from the robot's joints [J], if given. Raises
-        ShapeError:
-        not one angle a joint; InvalidInputError: angles that are not finite.
+        ShapeError: not one angle a joint; InvalidInputError: angles that are not finite.
         """
         self._memory = self._blank()
         self._was_sent = joints_rad is not None
@@ -377,12 +374,9 @@ class HandRetargeter:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
         Keypoints are [T, 25, 3] in wrist axes (m), NaN, or False in `valid` [T, 25], where they are
-        not to
-        be used; times [T] rise (60 Hz if None). Raises ShapeError: wrong shapes; InvalidInputError:
-        times
-        that do not rise, wrong unit, or a finger that is tracked, but followed in no sample. Joints
-        of one
-        that is never tracked are at rest.
+        not to be used; times [T] rise (60 Hz if None). Raises ShapeError: wrong shapes;
+        InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
+        followed in no sample. Joints of one that is never tracked are at rest.
         """
         keypoints = checked_keypoints(keypoints_m)
         if valid is not None:

@@ -77,8 +77,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
     Keypoints are [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
     `dextouch.hands.NODES`, NaN where not seen; `where` is for the message. Raises ShapeError: other
     shapes; InvalidInputError: wrong unit, order of nodes or hand, too few nodes of the palm or
-    nodes
-    along a line, or axes that are not fixed to the wrist (`details` holds `fault`).
+    nodes along a line, or axes that are not fixed to the wrist (`details` holds `fault`).
     """
     samples = seen_samples(keypoints_m, where=where)
     # Nodes along a line have no handedness; that is said before anything that follows from it.
@@ -204,10 +203,9 @@ def hand_axes_check(
     """Keypoints of one hand of a recording in wrist axes, checked; not finite where not seen.
 
     They are as of `wrist_frame`, or turned as `T_keypoints_SIDE_wrist_SIDE` of the calibration
-    says.
-    Raises InvalidInputError: as `wrist_frame`, keypoints in other axes (`details` holds `fault`),
-    or a
-    calibration that is no rigid transform; ShapeError: not [T ≥ 1, 25, 3], or not 4 by 4.
+    says. Raises InvalidInputError: as `wrist_frame`, keypoints in other axes (`details` holds
+    `fault`), or a calibration that is no rigid transform; ShapeError: not [T ≥ 1, 25, 3], or not 4
+    by 4.
     """
     where = f"keypoints_{side}"
     T_keypoints_wrist = calibrated_transform(calibration, calibration_name(side))

@@ -57,8 +57,7 @@ def matched_points(
     """Fingertips and palm of a tracked hand and of the robot hand that follows it.
 
     Keypoints are [T, 25, 3] in wrist axes (m; NaN where missing), joints [T, 20]; the palm is
-    halfway
-    from the wrist to the middle of the finger knuckles. Raises ShapeError, NonFiniteError.
+    halfway from the wrist to the middle of the finger knuckles. Raises ShapeError, NonFiniteError.
     """
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     if keypoints.shape != (len(joints_rad), NUM_KEYPOINTS, 3):
@@ -103,9 +102,8 @@ def touch_offsets_m(
     offset(t) = (Σ k(t, s) F_i(s) dt offset_i(s) + A c) / (Σ k(t, s) F_i(s) dt + A), over samples s
     and points i, with k = exp(-|t - s| / reach), the constant offset c and its weight A: nearly
     constant during a grasp, so that nothing slips. Forces [T, 6] are on thumb … little fingertip
-    and
-    palm, 0 or more; times [T] increase. Raises ShapeError: shapes that do not fit; NonFiniteError;
-    InvalidInputError: times that do not increase, or a negative force.
+    and palm, 0 or more; times [T] increase. Raises ShapeError: shapes that do not fit;
+    NonFiniteError; InvalidInputError: times that do not increase, or a negative force.
     """
     forces, times = _checked(len(points.seen), pad_forces_n, t_s)
     # Samples are weighted by their duration, so that the result does not depend on the rate.
@@ -236,12 +234,9 @@ def transfer_by_touch(
     """Shift the wrist and move touching fingertips to the person's positions.
 
     Keypoints are in wrist axes (NaN where missing), forces on thumb … little fingertip and palm
-    (zeros
-    without a glove), times increase. Returns T_world_robot of the wrist, joint angles of the robot,
-    and
-    the shift (m) in wrist axes. Raises ShapeError: lengths that differ; InvalidInputError: no
-    fingertip
-    and no palm was ever tracked.
+    (zeros without a glove), times increase. Returns T_world_robot of the wrist, joint angles of the
+    robot, and the shift (m) in wrist axes. Raises ShapeError: lengths that differ;
+    InvalidInputError: no fingertip and no palm was ever tracked.
     """
     points = matched_points(keypoints_m, joints_rad, hand)
     offset_m = touch_offsets_m(points, pad_forces_n, t_s)

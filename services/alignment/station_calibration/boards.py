@@ -263,10 +263,8 @@ class Coverage:
     """Coverage of a camera by views of a board.
 
     `views_by_region` are numbers of views in each ninth of the image, `tilts_rad` [n, 2] angles of
-    the
-    board's normal to the viewing ray (right, down), `focal_sigma` the sigma of the focal length as
-    a
-    share of it (infinity where there is none), `todo` advice, most important first.
+    the board's normal to the viewing ray (right, down), `focal_sigma` the sigma of the focal length
+    as a share of it (infinity where there is none), `todo` advice, most important first.
     """
 
     views_by_region: Int64[np.ndarray, "3 3"]

@@ -64,9 +64,8 @@ def write_entry(
     """Write an entry of a calibration folder, measured now; other entries are kept.
 
     An entry is named as its main matrix, such as `K_head`; numbers and vectors become matrices of
-    one
-    row; the facts are details for humans, JSON. Raises NonFiniteError: NaN or infinity in a matrix;
-    CorruptDataError: an existing file cannot be read.
+    one row; the facts are details for humans, JSON. Raises NonFiniteError: NaN or infinity in a
+    matrix; CorruptDataError: an existing file cannot be read.
     """
     for name, matrix in matrices.items():
         if not np.all(np.isfinite(matrix)):

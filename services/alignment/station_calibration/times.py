@@ -43,8 +43,7 @@ def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str,
     """Measure the delays of all streams of a take that turned together, after a reference.
 
     Raises DegenerateMotionError: too little, slow or regular motion, or streams did not move
-    together;
-    InvalidInputError: fewer than two streams show how they turned.
+    together; InvalidInputError: fewer than two streams show how they turned.
     """
     where = f"take {options.take!r}"
     reader = open_take(options.take, options.store)

@@ -95,10 +95,8 @@ def build_episode(
     """Fit all clocks, find the longest stretch without a long gap, and make actions on its grid.
 
     Time 0 is the first moment at which all streams of the action are there; values of others are
-    read
-    while the episode's blocks are taken. Raises InvalidInputError: streams or calibration are
-    missing,
-    or no stretch is long enough; ClockFitError: a stream whose stamps fit no clock.
+    read while the episode's blocks are taken. Raises InvalidInputError: streams or calibration are
+    missing, or no stretch is long enough; ClockFitError: a stream whose stamps fit no clock.
     """
     check_complete(recording)
     objects = options.of_task(recording.attributes.task).objects

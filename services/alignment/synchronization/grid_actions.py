@@ -126,9 +126,8 @@ def make_actions(
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
     Human hands are retargeted. Parts that were not recorded have the identity as their pose, and
-    joints
-    at rest. `wrist` says where the robot's wrists are that stand for human ones; a finger may be
-    missing for `max_gap_ns` (of slow streams longer).
+    joints at rest. `wrist` says where the robot's wrists are that stand for human ones; a finger
+    may be missing for `max_gap_ns` (of slow streams longer).
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     absent = [name for name in ACTION_STREAMS[domain] if name not in gridded.streams]
@@ -211,8 +210,7 @@ def retarget_hands(
 
     Samples are retargeted at the tracker's rate, steps interpolated. The person's hand is
     `hand_profile_SIDE` of the calibration, else measured from the recording. Raises
-    InvalidInputError:
-    no such hand, or other axes (`hand_axes_check`, `HandRetargeter.retarget`).
+    InvalidInputError: no such hand, or other axes (`hand_axes_check`, `HandRetargeter.retarget`).
     """
     recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
     hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}

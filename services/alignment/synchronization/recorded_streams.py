@@ -158,8 +158,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
     Raises ClockFitError: its stamps fit no clock; InvalidInputError: calibration is missing or
-    wrong;
-    UnknownNameError: the recording has no such stream.
+    wrong; UnknownNameError: the recording has no such stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
     timing = time_stream(

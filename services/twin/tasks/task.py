@@ -59,8 +59,7 @@ class Task(Protocol):
         """Waypoints of the demonstrator, who assumes these poses of the objects.
 
         `draw` is the source of variations between takes that are independent of `noise`, the errors
-        at
-        the first (grasp) and second (place) location. The first waypoint has none.
+        at the first (grasp) and second (place) location. The first waypoint has none.
         """
 
     def succeeded(self, simulation: Simulation) -> bool:

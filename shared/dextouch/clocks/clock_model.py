@@ -130,8 +130,7 @@ class ClockModel:
         """Host times of unwrapped device times [n], on the host's clock at the smallest path delay.
 
         Raises InvalidInputError where the device's clock went back, so that arrivals are needed to
-        select
-        the segment, and they are missing. No sample is dated after its arrival.
+        select the segment, and they are missing. No sample is dated after its arrival.
         """
         t_device_ns = np.asarray(t_device_ns, dtype=np.int64)
         if t_host_ns is None and self.is_ambiguous:
@@ -371,8 +370,7 @@ def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np
     """Replace one or two wrong stamps in a row by whole periods from the right ones beside them.
 
     Unwrapped device stamps and arrivals are [n]. Stamps of a regular device are wrong if they are
-    not
-    whole periods from those beside them, which are so from each other. Others stay as they are.
+    not whole periods from those beside them, which are so from each other. Others stay as they are.
     """
     device, host = np.array(t_device_ns, dtype=np.int64), np.asarray(t_host_ns)
     if len(device) < MIN_SAMPLES or not (stamps := _Stamps(device)).is_regular:

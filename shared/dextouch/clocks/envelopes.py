@@ -170,8 +170,7 @@ class RunningEnvelope:
     once. Points that all lie above it for a second, in device and host time, are a step too, unless
     the stamps of a regular device kept their distance: then the host was busy. The distance of such
     stamps gives the size of a step modulo the period: the line is shifted by it at once, and
-    restarted
-    only where later points disagree.
+    restarted only where later points disagree.
 
     Args:
         resolution_ns: of the device's stamps; smaller steps are not detectable.

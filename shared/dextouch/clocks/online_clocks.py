@@ -437,10 +437,9 @@ class RoundTripClock:
 
     The forward path bounds the offset from above, the return path from below; the fastest of many
     exchanges leave a narrow band (as NTP's minimum round trip, here with drift: Zhang, Liu, Xia
-    2002).
-    The position in the band cannot be observed: sigma accounts for it. A step of the remote clock
-    by
-    more than the band restarts the estimate at once. `resolution_ns` is that of the remote stamps.
+    2002). The position in the band cannot be observed: sigma accounts for it. A step of the remote
+    clock by more than the band restarts the estimate at once. `resolution_ns` is that of the remote
+    stamps.
     """
 
     def __init__(self, *, resolution_ns: int = 1) -> None:

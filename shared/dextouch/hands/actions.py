@@ -224,8 +224,7 @@ def reanchor(
 
     The poses of that step come out as exactly the identity. Commanded actions need `anchor_action`
     [67], the *measured* action of the step relative to the same anchor. Raises InvalidInputError
-    for
-    an index outside 0 … T-1.
+    for an index outside 0 … T-1.
     """
     checked = check_actions(actions)
     if not 0 <= index < len(checked):

@@ -123,8 +123,7 @@ class HandModel:
 
     `joint_names` and joint limits [joints] are finger by finger, from the wrist out. Raises
     UnknownNameError: a side other than "left" and "right", or an unknown chain; NonFiniteError: NaN
-    or
-    infinity; InvalidInputError: any other invalid table, of the joint that the message names.
+    or infinity; InvalidInputError: any other invalid table, of the joint that the message names.
     """
 
     def __init__(self, side: str, fingers: Sequence[FingerTable], *, name: str) -> None:
@@ -177,8 +176,7 @@ class RobotHand(HandModel):
     The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion. The tables of both
     hands, which are not exact mirrors, are in `wuji_hand_2.json`: the exact values of the
     manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on PyPI), fingertips its
-    sites
-    `*_tip`. Raises UnknownNameError for a side other than "left" and "right".
+    sites `*_tip`. Raises UnknownNameError for a side other than "left" and "right".
     """
 
     def __init__(self, side: str) -> None:

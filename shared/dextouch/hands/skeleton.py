@@ -149,9 +149,8 @@ def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> Nod
 
     Chains are by our names ("pinky" is "little", the chain "hand" the wrist), joints of a chain all
     by our names, by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them. A
-    palm is
-    ignored. Raises InvalidInputError for unknown, duplicate or missing nodes that it does not
-    `may_lack`.
+    palm is ignored. Raises InvalidInputError for unknown, duplicate or missing nodes that it does
+    not `may_lack`.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)

@@ -80,8 +80,7 @@ def implausible_values(
     """What is implausible in samples [n, …] of a stream of poses, joints or keypoints.
 
     Times increase. Only the unit is checked of what is commanded. What is `of_robot` may rest
-    exactly;
-    joints and poses in a robot's base always may.
+    exactly; joints and poses in a robot's base always may.
     """
     if descriptor.kind == "pose":
         can_rest = of_robot or descriptor.frame == "base"

@@ -76,8 +76,7 @@ class TaxelFaults:
     """Sums over readings of a glove, from which faults of its taxels follow.
 
     Of each taxel there is a tare and a gain; `usable` are those to judge, None of all; `step` is
-    the
-    smallest difference of two readings.
+    the smallest difference of two readings.
     """
 
     def __init__(

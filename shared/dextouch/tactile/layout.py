@@ -181,8 +181,7 @@ class TactileLayout(LayoutDescription):
         """Normal force (N) on thumb … little finger and palm: pressure [T, taxels] times area.
 
         Only taxels in contact count (`in_contact`), so that noise of the others does not add up. It
-        raises
-        ShapeError for other shapes, NonFiniteError for NaN or infinity.
+        raises ShapeError for other shapes, NonFiniteError for NaN or infinity.
         """
         kpa = np.asarray(tactile_kpa, dtype=np.float64)
         if kpa.ndim != 2 or kpa.shape[1] != self.num_taxels:
@@ -215,8 +214,7 @@ def _dextouch_v1() -> TactileLayout:
     """Layout of our own glove, which scans 18 rows × 20 columns.
 
     Rows 0–3 hold the five fingertips side by side, rows 4–15 the palm, rows 16–17 are unused. The
-    left
-    glove is wired as the mirror image: its columns run the other way.
+    left glove is wired as the mirror image: its columns run the other way.
     """
     scan = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
 
@@ -265,8 +263,7 @@ def read_layout(path: Path | str) -> TactileLayout:
     """The layout of a glove from a JSON file (docs/stations.md#layout-of-a-glove).
 
     Raises NotFoundError, StorageError: a missing or unreadable file; LimitExceededError: more than
-    256
-    KiB; InvalidInputError: no valid layout; the message names file, field, found and expected.
+    256 KiB; InvalidInputError: no valid layout; the message names file, field, found and expected.
     """
     path = Path(path)
     data = read_bounded(path, MAX_LAYOUT_BYTES)

@@ -371,8 +371,7 @@ def noise_of_bones(bones_m, keypoints, nodes):
     """Mean square of the noise's length, by how the lengths of bones differ from their mean.
 
     Bones [F, 3, 3] are changed: how often seen, mean length and mean deviation of each. Keypoints
-    are
-    [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
+    are [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
     """
     total, count = 0.0, 0
     for finger in range(len(bones_m)):

@@ -146,8 +146,7 @@ def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
     """Load a hand from a URDF or MJCF file, without meshes, and a mapping file (docs/hands.md).
 
     Joints are in the mapping's order with the model's angles, the wrist frame is ours: fingers
-    along
-    -z, thumb side +x. Raises NotFoundError, StorageError: a missing or unreadable file;
+    along -z, thumb side +x. Raises NotFoundError, StorageError: a missing or unreadable file;
     LimitExceededError: one above the size limit; UnknownNameError: a name that is not in the model;
     InvalidInputError: other invalid content; the message names file, element, found and expected.
     """

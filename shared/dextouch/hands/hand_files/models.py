@@ -159,8 +159,7 @@ class Joint(NamedTuple):
     """A joint in the frame of its link; `limits_rad` is None without limits.
 
     `where` begins messages, `zero_rad` is the angle of the file's reference pose, `refusal` says
-    why a
-    finger cannot contain this joint, None if it can.
+    why a finger cannot contain this joint, None if it can.
     """
 
     name: str
