@@ -239,7 +239,6 @@ def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[st
 
 
 def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
-    """An episode by its id, or by that of the recording it was made from."""
     if store.exists(item_id):
         return store.open(item_id)
     return store.open(episode_id_of(store.recording(item_id), options))
@@ -272,7 +271,6 @@ def report_page(report: AlignmentReport) -> Group:
 
 
 def _unreliable(report: AlignmentReport) -> list[str]:
-    """Streams whose times may be wrong, with the reasons."""
     found = []
     for clock in report.clocks:
         texts = {
@@ -288,7 +286,6 @@ def _unreliable(report: AlignmentReport) -> list[str]:
 
 
 def _implausible(report: AlignmentReport) -> list[str]:
-    """What of the streams could not be true, and the steps that gaps left to interpolation."""
     texts = {
         "jump_samples": "samples elsewhere",
         "lasting_jumps": "leaps of its world",

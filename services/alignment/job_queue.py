@@ -296,7 +296,6 @@ class JobDatabase:
 
     @contextmanager
     def _errors(self, verb: str) -> Iterator[None]:
-        """Turn errors of SQLite into ours."""
         what = f"{verb} {self._path}"
         try:
             yield

@@ -224,7 +224,6 @@ class JobRunner:
         self.is_warm = True
 
     async def _work(self, worker: AlignmentWorker) -> None:
-        """Run one job after another on one worker."""
         while True:
             try:
                 job = await self._take(worker)
@@ -239,7 +238,6 @@ class JobRunner:
                     del self._at_work[job.alignment_id]
 
     async def _take(self, worker: AlignmentWorker) -> AlignmentJob:
-        """Start the job that has waited longest, once there is one."""
         async with self._changed:
             waiting = await self._changed.wait_for(self.queue.next)
             assert waiting is not None  # noqa: S101 - what was waited for
@@ -399,7 +397,6 @@ def _aligned(store: EpisodeStore) -> dict[str, list[str]]:
 def _has_episode(
     store: EpisodeStore, recording: RecordingReader, episode_ids: Sequence[str]
 ) -> bool:
-    """Whether one of these episodes was made from the content of this recording."""
     for episode_id in episode_ids:
         # Of the trash, or damaged.
         with suppress(DexTouchError):

@@ -183,7 +183,6 @@ class AlignmentWorker:
 
 
 def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: OnProgress) -> None:
-    """Write the samples of every stream; empty streams are omitted."""
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
         name = stream.descriptor.name

@@ -156,7 +156,6 @@ def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: in
 def _taxel_errors(
     gloves: Iterable[tuple[np.ndarray, np.ndarray]], layout: TactileLayout
 ) -> dict[str, float | None]:
-    """Errors over pressures of all gloves, each beside the true ones."""
     pairs = list(gloves)
     if not pairs:
         return {"taxel_iou": None, "taxel_mae_kpa": None}
@@ -201,7 +200,6 @@ def _placed(truth: EpisodeReader, name: str, at_ns: np.ndarray) -> tuple[np.ndar
 def _true_joints(
     truth: EpisodeReader, side: Side, at_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 20"], Bool[np.ndarray, " n"]]:
-    """The robot's joints, or those retargeted from the true human hand."""
     if "joints_measured" not in truth.streams:
         keypoints, at = _placed(truth, f"keypoints_{side}", at_ns)
         return HandRetargeter(side).retarget(vectors_on_grid(keypoints, at)).joints_rad, at.valid

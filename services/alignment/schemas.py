@@ -222,7 +222,6 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
 
 
 def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tuple[int, ...]]]:
-    """By stream and reason."""
     found: dict[str, dict[str, tuple[int, ...]]] = {}
     for name in ("tactile_left", "tactile_right"):
         states = np.array(calibration.get(f"{name}_refused_taxels", ()), dtype=np.int64).ravel()

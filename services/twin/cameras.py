@@ -282,7 +282,6 @@ class CameraRig:
         self.rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
 
     def _ray_table(self, K: np.ndarray) -> Float64[np.ndarray, "rays 3"]:
-        """Unit rays of all pixel centres, row by row, in the optical frame."""
         height, width = self.shape_px
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(height * width)], axis=1)
@@ -422,7 +421,6 @@ class CameraRig:
         return image
 
     def _is_dark(self, view: "_View", rays: np.ndarray) -> Bool[np.ndarray, " rays"]:
-        """Whether rays that meet the table meet one of its darker fields."""
         num_fields = np.zeros(len(rays), dtype=np.int64)
         for axis in (0, 1):
             met_m = view.eye_m[axis] + view.rays[rays, axis] * view.distances_m[rays]
@@ -447,7 +445,6 @@ class _View:
 
 
 def _visible_besides(model: mujoco.MjModel, table: int) -> Int64[np.ndarray, " geoms"]:
-    """Geoms that rays can meet, without the table."""
     is_visible = _VISIBLE_GROUPS[model.geom_group] == 1
     is_visible[table] = False
     return np.flatnonzero(is_visible)

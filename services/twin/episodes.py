@@ -110,7 +110,6 @@ def record(
 
 
 def _note(stage: Stage, step: int, times_s: dict[str, float]) -> None:
-    """Note the milestones that are reached for the first time at a grid step."""
     reached = stage.task.reached(stage.simulation)
     for name, holds in zip(stage.task.milestones, reached, strict=True):
         if holds:
@@ -228,7 +227,6 @@ class Recorder:
 
 
 def _sources(stage: Stage, options: TakeOptions) -> list[tuple[StreamDescriptor, Source]]:
-    """The streams of a take, each with what is sampled for it."""
     simulation, rig = stage.simulation, stage.rig
     found: list[tuple[StreamDescriptor, Source]] = [
         (

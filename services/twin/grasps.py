@@ -129,7 +129,6 @@ def _refine(
 
 @lru_cache(maxsize=8)
 def _searched(grasp: CylinderGrasp, domain: Domain) -> Float64[np.ndarray, "20"]:
-    """Joint angles that hold the cylinder, equal for left and right hands."""
     hand = twin_hand("right", domain)
     lower, upper = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     start = np.random.default_rng(10).uniform(lower, upper, size=(_NUM_FIRST, 20))

@@ -95,7 +95,6 @@ class ObjectBodies:
         self.of_body = self._nearest_object()
 
     def _chain(self, body: int) -> list[int]:
-        """A body and its ancestors up to the child of the world."""
         if body < 0:
             raise InvalidInputError(
                 f"twin scene: got objects {self._names}, expected names of bodies"
@@ -128,7 +127,6 @@ class ObjectBodies:
         return np.concatenate(spans).astype(np.int64)
 
     def _rest_poses(self, roots: list[int]) -> Float64[np.ndarray, "objects 4 4"]:
-        """T_root_object with all joints at rest."""
         data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, data)
         pairs = zip(roots, self.ids.tolist(), strict=True)
@@ -311,7 +309,6 @@ def _span(
     geom: int,
     T_object_world: Float64[np.ndarray, "4 4"],
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """Minimum and maximum coordinates of a geom in its object's frame."""
     R_world_geom = data.geom_xmat[geom].reshape(3, 3)
     T = T_object_world @ transform(R_world_geom, data.geom_xpos[geom])
     kind = int(model.geom_type[geom])
@@ -419,7 +416,6 @@ def numbers(values: Iterable[float]) -> str:
 
 
 def _tint(side: str, finger_index: int) -> str:
-    """Colour of a hand, lighter from thumb to little finger."""
     base = np.array(_HAND_COLOURS[side])
     return numbers([*(base * (0.80 + 0.06 * finger_index)).clip(0, 1), 1.0])
 

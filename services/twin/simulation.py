@@ -128,7 +128,6 @@ class Simulation:
         return pose_from_transform(Ts.reshape(-1, parts, 4, 4).swapaxes(0, 1)), joints
 
     def _sense(self) -> None:
-        """Update all derived quantities and read the tactile sensors."""
         option = self.scene.model.opt
         option.disableflags &= ~_NO_SENSORS
         mujoco.mj_forward(self.scene.model, self.data)
@@ -286,7 +285,6 @@ class TactileReader:
     def _spread(
         self, data: mujoco.MjData, pad: _Pad, contacts: Int64[np.ndarray, " contacts"]
     ) -> Float64[np.ndarray, " taxels"]:
-        """Distribute the normal force of a pad's contacts to its taxels."""
         offsets = self._skin_world_m(data, pad)[None] - data.contact.pos[contacts][:, None]
         distances = np.linalg.norm(offsets, axis=2)
         nearest = distances.argmin(axis=1)

@@ -198,7 +198,6 @@ def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
 
 
 def _retreat(row: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "81 67"]:
-    """Both hands back and up, and still from then on."""
     still = poses_from_actions(np.repeat(row[None], NUM_GRID_STEPS, axis=0), anchor)
     way = np.minimum(np.arange(NUM_GRID_STEPS) / _RETREAT_STEPS, 1.0)
     offset = transform(np.eye(3), (way * way * (3 - 2 * way))[:, None] * _RETREAT_M)

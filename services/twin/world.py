@@ -190,8 +190,6 @@ class TwinWorld:
 
 
 class _StepLog:
-    """Collects the observation of consecutive grid steps of a stage."""
-
     def __init__(self, stage: Stage, cameras: tuple[str, ...]) -> None:
         self._stage = stage
         self._grid = GridLog(stage)

@@ -221,7 +221,6 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
 def _check_constant(
     by_offset: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"], per_number: float
 ) -> None:
-    """Refuse an offset that is another one in some part of the take."""
     energies, offs_s, noise = np.empty((3, _NUM_PARTS))
     parts = (np.array_split(one, _NUM_PARTS) for one in (by_offset, left))
     for part, (moved, rest) in enumerate(zip(*parts, strict=True)):
@@ -302,7 +301,6 @@ def _adjusted_ns(
 def _chain_sigmas_ns(
     names: Sequence[str], pairs: Sequence[PairOffset], reference: str
 ) -> dict[str, float]:
-    """Standard deviation of each delay by the chain of pairs with the smallest one."""
     steps = np.zeros((len(names), len(names)))
     for pair in pairs:
         steps[names.index(pair.a), names.index(pair.b)] = float(pair.offset.sigma_ns) ** 2

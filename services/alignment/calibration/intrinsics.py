@@ -267,7 +267,6 @@ def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
 
 
 def _check_lens(fit: "LensFit", places: list[_Place], size_px: tuple[int, int]) -> None:
-    """Refuse lenses that the model does not describe, and those that changed."""
     from services.alignment.calibration.lens_fit import fisheye_rms_px
 
     image = fit.image.p_value < MAX_CHANCE and fit.image_share > MIN_MISFIT_SHARE

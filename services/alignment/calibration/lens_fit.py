@@ -118,7 +118,6 @@ def fit_lens(
 def _with_statistics(
     camera: _Camera, design: _Design, heights_m: np.ndarray, num_corners: list[int]
 ) -> LensFit:
-    """The fit with its covariance and the structure of its residuals."""
     residuals, num_others = design.residuals, 6 * len(num_corners)
     with_bend = np.column_stack([design.lens, design.bend])
     fitted = with_bend if heights_m.any() else design.lens

@@ -179,7 +179,6 @@ def filled_gain(
 
 
 def _slices(layout: TactileLayout) -> dict[str, slice]:
-    """Taxels of each pad, by its part of the hand."""
     starts = zip(layout.pads, layout.starts, strict=True)
     return {pad.part: slice(start, start + pad.num_taxels) for pad, start in starts}
 
@@ -269,7 +268,6 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
 
 
 def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:
-    """Refuse takes in which the pressure was not constant."""
     half = len(raw) // 2
     creep = np.abs(np.median(raw[:half], axis=0) - np.median(raw[half:], axis=0))
     response = np.abs(level.mean_counts - tare.level.mean_counts)
@@ -342,7 +340,6 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
 
 
 def _check_direction(points: _Points) -> None:
-    """Refuse takes without any response, or in which counts fall under pressure."""
     response = (points.counts[:-1] - points.counts[-1])[points.used[:-1]]
     answering = np.abs(response) >= MIN_MOVE_COUNTS
     if points.saturated.any() and not answering.any():
@@ -362,7 +359,6 @@ def _check_direction(points: _Points) -> None:
 
 
 def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
-    """Taxels without response in every press to which the others respond."""
     response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
     usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
     least = np.array(usual)[:, None]

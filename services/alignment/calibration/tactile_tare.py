@@ -404,7 +404,6 @@ def _cells(
 
 
 def _states(record: Record, name: str, num_cells: int) -> UInt8[np.ndarray, " cells"]:
-    """States of the raw cells; all OK in a calibration without them."""
     if name not in record:
         return np.full(num_cells, OK, dtype=np.uint8)
     states = _row(record, name, num_cells)

@@ -179,7 +179,6 @@ def _thumb_height_m(samples: np.ndarray, across: np.ndarray) -> float:
 
 
 def _mean_ratio(values: np.ndarray, scale: np.ndarray) -> float:
-    """Mean of the finite ratios; zero if there are none."""
     ratios = np.divide(values, scale, out=np.full_like(scale, np.nan), where=scale > 0)
     known = ratios[np.isfinite(ratios)]
     return float(known.mean()) if known.size else 0.0

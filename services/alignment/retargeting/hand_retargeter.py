@@ -259,7 +259,6 @@ def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray
 def _fit_knuckle(
     seen_m: np.ndarray, moved_m: np.ndarray
 ) -> tuple[Float64[np.ndarray, "3"], float, float]:
-    """Position, travel and residual (standard deviation per axis) of one knuckle."""
     if not np.isfinite(moved_m).all():
         moved_m = np.zeros_like(seen_m)
     centred = moved_m - moved_m.mean(axis=0)

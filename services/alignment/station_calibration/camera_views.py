@@ -228,7 +228,6 @@ class Session:
         self._keep(view)
 
     def _why_not(self, view: BoardView | None, photo: np.ndarray) -> str:
-        """Why a view is not kept; "" of one that is."""
         if self._live is None:
             return "no board" if view is None else "blurred, left out" * view.is_blurred
         if view is None:
@@ -241,7 +240,6 @@ class Session:
         return "" if is_new else "the board is where it was; hold it elsewhere"
 
     def _tell(self, name: str, why: str) -> None:
-        """Name a photo that is left out; of live images give a hint now and then."""
         self._num_idle += 1
         if self._live is None:
             self._say(f"{name}: {why}")
@@ -249,7 +247,6 @@ class Session:
             self._say(why)
 
     def _keep(self, view: BoardView) -> None:
-        """Add a view, redraw the picture and print advice."""
         self.views.append(view)
         self._num_idle = 0
         options = self._options
@@ -413,7 +410,6 @@ def _advice(todo: Sequence[str]) -> list[str]:
 
 
 def _bars(values: np.ndarray, labels: Sequence[str], unit: str, width: Px) -> list[str]:
-    """Horizontal bars with label and value."""
     lengths = (width - 220) * values / max(float(np.max(values, initial=0.0)), 1e-12)
     parts = []
     for index, (value, label, length) in enumerate(zip(values, labels, lengths, strict=True)):
@@ -459,7 +455,6 @@ def _at(x: Px, y: Px, parts: Sequence[str]) -> str:
 
 
 def _page(width: Px, height: Px, title: str, parts: Sequence[str]) -> str:
-    """A complete SVG document."""
     paper = _tag("rect", width=width, height=height, fill="white")
     return _tag(
         "svg",

@@ -245,7 +245,6 @@ class Guide:
         return [row for row, _ in known]
 
     def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
-        """Record a press that determines a gain on its own."""
         target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
         self._answer(Question(f"Put {target} and hold still.", f"Record {PRESS_S:g} s"))
 
@@ -335,7 +334,6 @@ def calibrate(
 
 
 def _takes(options: argparse.Namespace, guide: Guide | None) -> tuple[str, Sequence[PressRow]]:
-    """The rest take and the presses, either given or recorded now by a station."""
     if options.url is not None:
         if options.rest is not None or options.presses is not None:
             raise InvalidInputError(
@@ -352,7 +350,6 @@ def _takes(options: argparse.Namespace, guide: Guide | None) -> tuple[str, Seque
 
 
 def _tare_facts(tare: TaxelTare, say: Say) -> dict[str, object]:
-    """Print and return what a tare says."""
     level = tare.level
     median, sigma, noise = (
         float(np.median(counts))
@@ -372,7 +369,6 @@ def _tare_facts(tare: TaxelTare, say: Say) -> dict[str, object]:
 
 
 def _gain_facts(gain: TaxelGain, say: Say) -> dict[str, object]:
-    """Print and return what a gain says."""
     good = gain.state == OK
     median = float(np.median(gain.gain_counts_per_kpa[good]))
     ratio = float(np.median(gain.sigma_counts_per_kpa[good] / gain.gain_counts_per_kpa[good]))

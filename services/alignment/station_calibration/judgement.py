@@ -73,7 +73,6 @@ def missing_names(matrices: Mapping[str, Matrix]) -> list[str]:
 
 
 def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
-    """Whether a matrix is metadata of another one."""
     if name.endswith("calibrated_at_unix_s") or "_sigma_" in name:
         return True
     side = name.removeprefix("tactile_").split("_")[0]
@@ -126,7 +125,6 @@ def _where_from(name: str) -> str:
 
 
 def _sigma(name: str, matrices: Mapping[str, Matrix]) -> Sigma:
-    """Description of the sigma, and problems with it."""
     prefix = f"{entry_of(name)}_sigma_"
     found = {
         key.removeprefix(prefix): np.array(m)

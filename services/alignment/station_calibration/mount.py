@@ -162,7 +162,6 @@ def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[st
 
 
 def _read_views(options: argparse.Namespace, say: Say) -> PosedViews:
-    """Read poses from the file, and boards from the photos or from the same file."""
     if options.poses.suffix.lower() == ".json":
         trackers, boards = np.swapaxes(read_pairs(options.poses, POSES_HELP), 0, 1)
         names = tuple(f"view {index}" for index in range(len(trackers)))
@@ -381,7 +380,6 @@ class MountSession:
             replace_file(self._folder / POSES_FILE, text.getvalue().encode())
 
     def _read(self, board: str) -> None:
-        """Read the places of an ended session, or begin one."""
         path = self._folder / BOARD_FILE
         if path.is_file() and (kept_board := path.read_text(encoding="utf-8")) != board:
             raise InvalidInputError(

@@ -368,7 +368,6 @@ class TakeRecorder:
         self._request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
 
     def _await_upload(self, name: str) -> str:
-        """Wait for the upload and return the take's id in the store."""
         if self._is_practice:
             raise NotFoundError(
                 f"take {name!r}: not in {self._spool.resolve()}, and takes of practice devices are "

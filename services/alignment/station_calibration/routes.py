@@ -148,8 +148,6 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
 
 
 def _add_run(router: APIRouter, runs: CalibrationRuns) -> None:
-    """Routes of the run that is on."""
-
     @router.get("/run")
     async def get_calibration_run() -> RunStatus | None:
         """The run that is on, or the last one; null before the first."""
@@ -264,7 +262,6 @@ def _is_path_delay(name: str) -> bool:
 
 
 def _can_turn(streams: Sequence[str]) -> bool:
-    """Whether two trackers or more can be shaken together."""
     return sum(name in TRACKERS for name in streams) > 1
 
 
@@ -282,7 +279,6 @@ def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:
 
 
 def _wanted(streams: Sequence[str]) -> list[str]:
-    """Names of the calibrations that these streams need or gain by."""
     names = [] if any(name == "camera_head" for name in streams) else ["K_head"]
     for stream in streams:
         kind, _, subject = stream.partition("_")
@@ -332,7 +328,6 @@ def _item(
 
 
 def _words(name: str, place: StationLocation) -> tuple[str, str, RunRequest | None]:
-    """Title, next step and guided run of a calibration."""
     for pattern, title, step, kind in KINDS:
         if matched := re.fullmatch(pattern, name):
             subject = matched[1] if matched.groups() else ""

@@ -316,7 +316,6 @@ class GuidedRun:
                 )
 
     def _shake(self, name: str) -> str:
-        """Record a take in which everything is shaken, and return it."""
         self._count_down("Take everything in hand; recording begins in", LEAD_S)
         for _ in range(round(LEAD_S / TICK_S)):
             self._wait(TICK_S)

@@ -447,7 +447,6 @@ def _listed(objects: SceneObjects | None) -> tuple[SceneObject, ...]:
 def _camera_poses(
     head: DatedStream, image_ns: np.ndarray, wanted: np.ndarray, max_gap_ns: int
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 4 4"]]:
-    """Those of the wanted images at which the camera's pose is known, and the poses."""
     loaded = head.load()
     finite = np.isfinite(loaded.values).all(axis=1)
     period_ns = head.descriptor.period_ns()

@@ -198,7 +198,6 @@ def interpolated_fingers(
 
 
 def _rows_s(t_ns: np.ndarray, steps: np.ndarray) -> list[tuple[float, float]]:
-    """Start and stop of each stretch of these steps, in seconds."""
     step_ns = int(t_ns[1] - t_ns[0]) if len(t_ns) > 1 else 0
     return [
         (t_ns[start] / NS_PER_S, (t_ns[stop - 1] + step_ns) / NS_PER_S)

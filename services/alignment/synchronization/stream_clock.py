@@ -113,7 +113,6 @@ def time_stream(
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
-    """Reasons why the times may be wrong, if any."""
     skew_limit_ppm, lateness_limit_ns = MAX_RATE_ERROR_PPM, max(period_ns, MIN_LATENESS_NS)
     if dated.method == "device":
         skew_limit_ppm, lateness_limit_ns = MAX_SKEW_PPM, MAX_STAMPED_LATENESS_NS

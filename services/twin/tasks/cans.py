@@ -279,7 +279,6 @@ class RegraspCan:
         return bool(heights_m.size and heights_m.mean() < 0.0)
 
     def _is_set_down(self, simulation: Simulation) -> bool:
-        """Whether the can stands upright on the table, outside the stand."""
         T_world_can = transform_from_pose(simulation.object_poses()[_CAN])
         aside_m = np.abs(T_world_can[:2, 3] - simulation.object_poses()[_STAND, :2]).max()
         return bool(

@@ -54,7 +54,6 @@ def _yaw_rad(T: Float64[np.ndarray, "4 4"]) -> float:
 
 
 def _is_carried(simulation: Simulation, shoe_index: int) -> bool:
-    """Whether a hand holds a boot clear of table and rack."""
     height_m = simulation.object_poses()[shoe_index, 2]
     return bool(
         simulation.hand_touches(shoe_index)

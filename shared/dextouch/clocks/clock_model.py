@@ -267,7 +267,6 @@ def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
 def _fit_segment(
     device: np.ndarray, host: np.ndarray, points: np.ndarray, slope: float | None
 ) -> ClockSegment:
-    """Fit one segment to a subset of its samples that includes its first and last one."""
     first = points[0]
     x, y, reference_ns = _offsets(device[points], host[points])
     knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
@@ -490,7 +489,6 @@ class _Levels:
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """First and last index of every run above the threshold."""
     above = np.concatenate([[False], change > threshold, [False]])
     edges = np.flatnonzero(np.diff(above.astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]

@@ -543,7 +543,6 @@ class RoundTripClock:
         return high.at(x_s), -low.at(x_s), age_s
 
     def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
-        """Whether an exchange lies entirely outside the band of the others."""
         slope, uncertainty = self._slope()
         band_high_ns, band_low_ns, age_s = self._band(x_s, slope)
         slack_ns = 2 * uncertainty * age_s + self._resolution_ns

@@ -249,7 +249,6 @@ def _check_wrists(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
-    """A person's wrists are within reach of the head, but not in the same place."""
     apart_m = {name: bodies.apart_m(name, "head") for name in WRISTS}
     hands_m = bodies.apart_m(*WRISTS)
     near = min(*apart_m.values(), hands_m)
@@ -280,7 +279,6 @@ def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_sides(bodies: _Bodies) -> ImplausibleBody | None:
-    """Hands cross now and then, hardly all the time."""
     if bodies.upright() < RIGHT_SHARE or not (aside_m := bodies.crossed()):
         return None
     text = (

@@ -247,7 +247,6 @@ def _finger_table(
 def _links_between(
     model: ModelFile, bases: dict[str, np.ndarray], tip: str, where: str
 ) -> tuple[str, list[str]]:
-    """The base link of a tip, and the links from there to the tip."""
     links: list[str] = []
     link = tip
     while link not in bases:
