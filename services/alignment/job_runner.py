@@ -59,12 +59,10 @@ class AlignmentMetrics:
         text = "For how long the oldest waiting alignment has waited; 0 without one."
         oldest = Gauge("dextouch_alignment_oldest_waiting_seconds", text, registry=registry)
         oldest.set_function(queue.oldest_waiting_s)
-        name, text = "dextouch_alignments_ended", "Alignments that ended."
-        self._ended = Counter(name, text, ("state",), registry=registry)
-        name, text = (
-            "dextouch_alignment_seconds",
-            "Duration of the last attempt of a done alignment.",
-        )
+        text = "Alignments that ended."
+        self._ended = Counter("dextouch_alignments_ended", text, ("state",), registry=registry)
+        name = "dextouch_alignment_seconds"
+        text = "Duration of the last attempt of a done alignment."
         self._seconds = Histogram(name, text, buckets=SECONDS, registry=registry)
         for state in ENDED:
             self._ended.labels(state)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import Distortion, invert
 from dextouch.geometry.rotations import vector_from_rotation
 from services.alignment.calibration.bundle import (
@@ -383,9 +384,8 @@ def _check_places(Ts_base_effector: np.ndarray) -> None:
     )
 
 
-@dataclass(frozen=True)
-class Gauge:
-    """One figure in words, the value that it has to reach, and the share of the way (0 to 1)."""
+class GaugeView(FrozenModel):
+    """A figure of a mount's run, what it has to reach, and the share of the way (0 to 1)."""
 
     title: str
     value: str
@@ -403,7 +403,7 @@ class MountProgress:
     """
 
     num_places: int
-    gauges: tuple[Gauge, ...]
+    gauges: tuple[GaugeView, ...]
     todo: tuple[str, ...]
     result: HandEyeResult | None = None
     problem: str = ""
@@ -430,17 +430,19 @@ def mount_progress(
     Arguments are those of `solve_hand_eye`, in the order of time, and may be empty. Raises
     ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
-    num_places = _num_places(Ts_world_tracker, Ts_camera_board)
-    spreads_rad = turn_spreads(Ts_camera_board)
+    num_places = len(Ts_world_tracker)
+    if num_places >= MIN_VIEWS:
+        names = ("Ts_world_tracker", "Ts_camera_board")
+        series = Series(TASK, "tracker", Ts_world_tracker, Ts_camera_board, names)
+        num_places = int(place_labels(series, min_places=1).max()) + 1
+    spreads_rad, wanted = turn_spreads(Ts_camera_board), f"{np.rad2deg(WANTED_SPREAD_RAD):.0f}°"
     motion = [
-        _turn_gauge(title, float(spread))
+        _gauge(title, f"{np.rad2deg(spread):.0f}°", wanted, spread / WANTED_SPREAD_RAD)
         for (title, _), spread in zip(TURNS, spreads_rad, strict=True)
     ]
     distances_m = np.linalg.norm(np.reshape(Ts_camera_board, (-1, 4, 4))[:, :3, 3], axis=1)
     motion.append(_distance_gauge(distances_m))
-    places = Gauge(
-        "Places", str(num_places), str(WANTED_PLACES), min(1.0, num_places / WANTED_PLACES)
-    )
+    places = _gauge("Places", str(num_places), str(WANTED_PLACES), num_places / WANTED_PLACES)
     result, problem = None, ""
     if num_places >= MIN_VIEWS:
         try:
@@ -453,14 +455,6 @@ def mount_progress(
     accuracy = _accuracy_gauges(result)
     todo = _todo(num_places, spreads_rad, motion[-1], result, problem)
     return MountProgress(num_places, (places, *motion, *accuracy), tuple(todo), result, problem)
-
-
-def _num_places(Ts_world_tracker: np.ndarray, Ts_camera_board: np.ndarray) -> int:
-    if len(Ts_world_tracker) < MIN_VIEWS:
-        return len(Ts_world_tracker)
-    names = ("Ts_world_tracker", "Ts_camera_board")
-    series = Series(TASK, "tracker", Ts_world_tracker, Ts_camera_board, names)
-    return int(place_labels(series, min_places=1).max()) + 1
 
 
 def camera_turns(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "pairs 3"]:
@@ -483,42 +477,34 @@ def turn_spreads(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "3"]:
     return 1 / np.sqrt(np.diag(inverse))
 
 
-def _turn_gauge(title: str, spread_rad: float) -> Gauge:
-    return Gauge(
-        title,
-        f"{np.rad2deg(spread_rad):.0f}°",
-        f"{np.rad2deg(WANTED_SPREAD_RAD):.0f}°",
-        min(1.0, float(spread_rad / WANTED_SPREAD_RAD)),
-    )
+def _gauge(title: str, value: str, wanted: str, share: float) -> GaugeView:
+    return GaugeView(title=title, value=value, wanted=wanted, share=min(1.0, float(share)))
 
 
-def _distance_gauge(distances_m: np.ndarray) -> Gauge:
-    wanted = f"{WANTED_DISTANCE_RATIO:g} to 1"
-    if len(distances_m) == 0:
-        return Gauge("Farthest to nearest", "unknown", wanted, 0.0)
-    near_m, far_m = float(distances_m.min()), float(distances_m.max())
-    share = np.log(far_m / near_m) / np.log(WANTED_DISTANCE_RATIO)
-    return Gauge(
-        "Farthest to nearest", f"{far_m / near_m:.1f} to 1", wanted, min(1.0, float(share))
-    )
+def _distance_gauge(distances_m: np.ndarray) -> GaugeView:
+    value, share = "unknown", 0.0
+    if len(distances_m):
+        ratio = float(distances_m.max()) / float(distances_m.min())
+        value, share = f"{ratio:.1f} to 1", np.log(ratio) / np.log(WANTED_DISTANCE_RATIO)
+    return _gauge("Farthest to nearest", value, f"{WANTED_DISTANCE_RATIO:g} to 1", share)
 
 
-def _accuracy_gauges(result: HandEyeResult | None) -> tuple[Gauge, Gauge]:
-    turn = f"± {np.rad2deg(WANTED_ROTATION_RAD):.2f}°"
-    shift = f"± {WANTED_TRANSLATION_M * 1e3:.1f} mm"
-    if result is None:
-        return Gauge("Direction", "unknown", turn, 0.0), Gauge("Position", "unknown", shift, 0.0)
-    rad, m = result.sigma_rotation_rad, result.sigma_translation_m
+def _accuracy_gauges(result: HandEyeResult | None) -> tuple[GaugeView, GaugeView]:
+    turn, shift, turn_share, shift_share = "unknown", "unknown", 0.0, 0.0
+    if result is not None:
+        rad, m = result.sigma_rotation_rad, result.sigma_translation_m
+        turn, turn_share = f"± {np.rad2deg(rad):.2f}°", WANTED_ROTATION_RAD / rad
+        shift, shift_share = f"± {m * 1e3:.1f} mm", WANTED_TRANSLATION_M / m
     return (
-        Gauge("Direction", f"± {np.rad2deg(rad):.2f}°", turn, min(1.0, WANTED_ROTATION_RAD / rad)),
-        Gauge("Position", f"± {m * 1e3:.1f} mm", shift, min(1.0, WANTED_TRANSLATION_M / m)),
+        _gauge("Direction", turn, f"± {np.rad2deg(WANTED_ROTATION_RAD):.2f}°", turn_share),
+        _gauge("Position", shift, f"± {WANTED_TRANSLATION_M * 1e3:.1f} mm", shift_share),
     )
 
 
 def _todo(
     num_places: int,
     spreads_rad: np.ndarray,
-    distance: Gauge,
+    distance: GaugeView,
     result: HandEyeResult | None,
     problem: str,
 ) -> list[str]:

@@ -103,11 +103,6 @@ class PosedViews:
         return mount_progress(self.Ts_world_tracker, self.Ts_camera_board, views=self.corners)
 
 
-def mount_name(camera: str) -> str:
-    """Name of the matrix of a camera's mount."""
-    return f"T_tracker_{TRACKERS[camera]}_camera_{camera}"
-
-
 def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Calibrate the mount of one camera on its tracker.
 
@@ -153,7 +148,8 @@ def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[st
         "sigma_board_scale": result.sigma_board_scale,
     }
     sigma = (result.sigma_rotation_rad, result.sigma_translation_m)
-    known = write_pose(options.to, mount_name(options.camera), X, sigma, facts)
+    name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
+    known = write_pose(options.to, name, X, sigma, facts)
     say(
         f"{known}; the board scatters by {rms_mm:.1f} mm RMS, and is {result.board_scale:.4f} ± "
         f"{result.sigma_board_scale:.4f} times as large as entered"

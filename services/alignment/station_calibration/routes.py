@@ -35,6 +35,7 @@ ItemState = Literal["good", "due", "missing", "optional", "simulated"]
 COMMAND: Final = "dextouch station calibrate"
 # Row of the delays of all trackers and cameras, before any of them is measured.
 PATH_DELAYS: Final = "path_delays"
+TURN_TOGETHER: Final = "Turn all trackers and cameras together for ten seconds."
 # Pattern of a name; title, next step and kind of guided run.
 KINDS: Final = (
     (
@@ -87,18 +88,8 @@ KINDS: Final = (
         "--take TAKE {to}",
         "",
     ),
-    (
-        r"([a-z0-9_]+)_latency_ns",
-        "Latency of {0}",
-        "Turn all trackers and cameras together for ten seconds.",
-        "time",
-    ),
-    (
-        PATH_DELAYS,
-        "Path delays",
-        "Turn all trackers and cameras together for ten seconds.",
-        "time",
-    ),
+    (r"([a-z0-9_]+)_latency_ns", "Latency of {0}", TURN_TOGETHER, "time"),
+    (PATH_DELAYS, "Path delays", TURN_TOGETHER, "time"),
 )
 # Fact of an entry that is its residual: how it is written, and what it tells.
 RESIDUALS: Final = {
@@ -240,7 +231,8 @@ def overview(place: StationLocation) -> CalibrationOverview:
     known = {finding.name: finding for finding in judge(matrices)}
     details = _details(place.folder)
     wanted = _wanted(streams)
-    if not any(map(_is_path_delay, known)) and _can_turn(streams):
+    # Two trackers or more can be shaken together.
+    if not any(map(_is_path_delay, known)) and sum(name in TRACKERS for name in streams) > 1:
         wanted.append(PATH_DELAYS)
     names = [*wanted, *(name for name in known if name not in wanted)]
     items = [_item(name, known.get(name), details, place) for name in names]
@@ -259,10 +251,6 @@ def _is_path_delay(name: str) -> bool:
     """Whether this is what a shake measures; delays of gloves are not."""
     stream = name.removesuffix("_latency_ns")
     return stream != name and (stream in TRACKERS or stream.startswith("camera_"))
-
-
-def _can_turn(streams: Sequence[str]) -> bool:
-    return sum(name in TRACKERS for name in streams) > 1
 
 
 def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:

@@ -6,6 +6,7 @@ from pydantic import AwareDatetime, Field
 
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel, example
+from services.alignment.calibration.hand_eye import GaugeView
 
 Order = Literal["take", "drop"]
 RunState = Literal["running", "asking", "done", "failed", "cancelled"]
@@ -65,15 +66,6 @@ class CameraRunView(ImageView):
     num_wanted: int
     focal_sigma: float | None = None
     focal_sigma_wanted: float
-
-
-class GaugeView(FrozenModel):
-    """A figure of a mount's run, what it has to reach, and the share of the way (0 to 1)."""
-
-    title: str
-    value: str
-    wanted: str
-    share: float
 
 
 class MountRunView(ImageView):

@@ -4,7 +4,7 @@ import argparse
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -46,7 +46,6 @@ from services.alignment.station_calibration.run_status import (
     CameraRunView,
     Choice,
     Countdown,
-    GaugeView,
     MountRunView,
     Order,
     Outline,
@@ -413,7 +412,7 @@ def _mount_view(index: int, session: MountSession) -> MountRunView:
         is_tracked=session.is_tracked,
         is_still=session.is_still,
         places=tuple(place not in left_out for place in range(session.num_kept)),
-        gauges=tuple(GaugeView(**asdict(gauge)) for gauge in progress.gauges),
+        gauges=progress.gauges,
         problem=progress.problem,
         can_finish=progress.result is not None,
     )

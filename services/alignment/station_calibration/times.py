@@ -170,19 +170,18 @@ def _written(
         latency_ns = number_of(subtracted, f"{entry}_ns") + delay.offset_ns + correction_ns
         reference_sigma_ns = number_of(known, f"{reference}_latency_sigma_ns")
         sigma_ns = float(np.hypot(delay.sigma_ns, reference_sigma_ns))
+        rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
         facts: dict[str, object] = {
             "stream": name,
             "reference": reference,
             "reference_latency_ms": reference_ms,
             "method": "common turning",
             "take": options.take,
-            "latency_ms": latency_ns * 1e-6,
-            "sigma_ms": sigma_ns * 1e-6,
+            **rows[name],
             "loop_sigmas": found.loop_sigmas,
         }
         matrices = {f"{entry}_ns": float(latency_ns), f"{entry}_sigma_ns": sigma_ns}
         write_entry(options.to, entry, matrices, facts)
-        rows[name] = {"latency_ms": latency_ns * 1e-6, "sigma_ms": sigma_ns * 1e-6}
         say(f"{entry:32} {latency_ns * 1e-6:8.2f} ± {sigma_ns * 1e-6:.2f} ms")
     say(
         f"relative to {reference}, which has {reference_ms:.2f} ms; "
