@@ -36,7 +36,7 @@ from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
 from dextouch.tactile import DEXTOUCH_V1, PADS, in_contact
 from dextouch.tactile.layout import SIDES, Side, split_pads
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.wrist_transfer import (
+from services.alignment.retargeting.wrist import (
     MatchedPoints,
     anchored_joints,
     constant_offset_m,

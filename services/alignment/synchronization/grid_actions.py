@@ -14,8 +14,7 @@ from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import FINGERS, SIDES, Side
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_retargeter import calibrated_profile
-from services.alignment.retargeting.wrist_frame import hand_axes_check
-from services.alignment.retargeting.wrist_transfer import NUM_PADS, transfer_by_touch
+from services.alignment.retargeting.wrist import NUM_PADS, hand_axes_check, transfer_by_touch
 from services.alignment.settings import WristChoice
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (

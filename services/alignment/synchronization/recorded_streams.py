@@ -40,7 +40,7 @@ from services.alignment.calibration.tactile_tare import (
     taxel_faults,
     unusable_taxels,
 )
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     to_wrist_axes,

@@ -11,7 +11,7 @@ from dextouch.errors import InvalidInputError
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.calibration.time_offset import TimeOffset, estimate_tap_offset
 from services.alignment.retargeting.hand_retargeter import profile_name
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrate_wrist,
     calibration_name,
     calibration_record,
