@@ -14,12 +14,14 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
 from dextouch.serving import RequireScope
 from services.alignment.retargeting.hand_retargeter import profile_name
-from services.alignment.station_calibration.judgement import Finding, entry_of, judge
 from services.alignment.station_calibration.mount import num_kept_places
 from services.alignment.station_calibration.record import (
     DETAILS_FILE,
     MATRICES_FILE,
     TRACKERS,
+    Finding,
+    entry_of,
+    judge,
     read_matrices,
 )
 from services.alignment.station_calibration.run_status import Answer, RunRequest, RunStatus
