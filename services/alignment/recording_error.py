@@ -35,7 +35,7 @@ CLEARLY_BETTER = 0.5
 
 @dataclass(frozen=True)
 class Match:
-    """Correspondence of the samples of a stream with the true ones; `offset_ns` is minus true time.
+    """Matched samples of a stream and the true ones; `offset_ns` is episode minus true time.
 
     `num_dropped` true samples between the first and the last pair have none.
     """

@@ -179,9 +179,9 @@ def solve_hand_eye(
 
     Raises:
         DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
-        uncertainty of the mount exceeds half a degree or 10 mm.
+            uncertainty of the mount exceeds half a degree or 10 mm.
         InvalidInputError: too few views, a board of another size than was entered, or views that
-        contradict each other (an inverted series is named).
+            contradict each other (an inverted series is named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, board = checked_poses(
@@ -323,9 +323,9 @@ def solve_robot_base(
 
     Raises:
         DegenerateMotionError: the effector was turned too little or about one axis only (or, of a
-        known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
+            known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
         InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series is
-        named).
+            named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, effector = checked_poses(

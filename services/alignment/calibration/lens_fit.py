@@ -41,7 +41,7 @@ class LensFit(NamedTuple):
 
     Attributes:
         covariance: of fx fy cx cy k1 k2 p1 p2 k3, for errors as large as those along smooth
-        functions of image, board and time, if larger than between neighbouring corners.
+            functions of image, board and time, if larger than between neighbouring corners.
         board_bend_m: largest distance of a corner from a plane.
         image: structure over the image; `drift`: over the order of the photos.
         misfit_px: RMS of the residuals that `image` explains, both axes together.

@@ -81,8 +81,8 @@ class TaxelGain:
 
     Attributes:
         sigma_counts_per_kpa: includes errors of the pressures, creep while a press lies, and a bend
-        over pressure or a drift from press to press; of a single pressure the largest bend that is
-        tolerated.
+            over pressure or a drift from press to press; of a single pressure the largest bend that
+            is tolerated.
         state: index into `tactile_tare.STATES`.
         residual_kpa: [press, taxels] what each press is off the line, 0 where not used.
     """

@@ -172,11 +172,11 @@ class RetargetOptions:
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
-        weight (directions of people's bones count as points at 40 mm), in proportion to the
-        rate. 0 follows every sample exactly.
+            weight (directions of people's bones count as points at 40 mm), in proportion to the
+            rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
         max_step_rad: live, largest change of a joint between two outputs; the default is 9.6 rad/s
-        at 30 Hz, the rate of the slowest trackers.
+            at 30 Hz, the rate of the slowest trackers.
         pinch_far_m: from this distance of thumb and fingertip on they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
