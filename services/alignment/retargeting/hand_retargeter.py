@@ -345,12 +345,10 @@ class HandRetargeter:
         """Joint angles of the next sample (T = 1), live; untracked fingers hold their angles.
 
         Keypoints are [25, 3] in wrist axes (m), NaN where missing, `elapsed_s` after the sample
-        before. No
-        joint goes further than `velocity_limit_rad_s` allows in the time elapsed, nor than
-        `max_step_rad`: a finger that is found again is REACQUIRED until it has caught up. Only the
-        first
-        output after the start or `reset` is where the hand is. Raises ShapeError: wrong shape;
-        InvalidInputError: elapsed time not positive and finite.
+        before. No joint goes further than `velocity_limit_rad_s` allows in the time elapsed, nor
+        than `max_step_rad`: a finger that is found again is REACQUIRED until it has caught up. Only
+        the first output after the start or `reset` is where the hand is. Raises ShapeError: wrong
+        shape; InvalidInputError: elapsed time not positive and finite.
         """
         keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
         if keypoints.shape != (NUM_KEYPOINTS, 3):
