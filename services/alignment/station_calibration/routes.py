@@ -24,11 +24,13 @@ from services.alignment.station_calibration.record import (
     judge,
     read_matrices,
 )
-from services.alignment.station_calibration.run_status import Answer, RunRequest, RunStatus
 from services.alignment.station_calibration.runs import (
     EVERYTHING,
     SIDES,
+    Answer,
     CalibrationRuns,
+    RunRequest,
+    RunStatus,
     StationLocation,
 )
 

@@ -24,7 +24,7 @@ from services.alignment.calibration.tactile_tare import (
 from services.alignment.command_line import report_line
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization.plausible_streams import check_bodies
+from services.alignment.synchronization.episode_builder import check_bodies
 from services.alignment.synchronization.recorded_streams import date_stream
 from services.alignment.synchronization.stream_clock import time_stream
 from tests.unit.alignment import recordings
