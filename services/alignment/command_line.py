@@ -31,7 +31,7 @@ from services.alignment.retargeting.hand_retargeter import calibrated_profile
 from services.alignment.schemas import AlignmentReport, report_of
 from services.alignment.settings import AlignmentOptions, AlignmentSettings, align_parser
 from services.alignment.synchronization import Progress
-from services.alignment.synchronization.resampling import RefusedPart
+from services.alignment.synchronization.resampling import RefusedPart, RefusedReason
 
 NS_PER_S = 1e9
 # The recording, and how far it is.
@@ -43,10 +43,13 @@ EXIT_REFUSED = 3
 PAGE_WIDTH = 110
 # Taxels for each reason, and refused parts, that a page lists; the report has all.
 MAX_LISTED = 12
-WHY = {
+WHY: Mapping[RefusedReason, str] = {
     "late_start": "began later than the others",
     "early_end": "ended earlier than the others",
     "gap": "no samples",
+    "jump": "samples elsewhere",
+    "frozen": "frozen samples",
+    "limits": "samples beyond limits",
     "shorter": "a longer stretch without a gap was taken",
 }
 
