@@ -173,10 +173,7 @@ class _Print:
 
 
 class Markers:
-    """The markers of a task's objects, drawn into images that show the scene without them.
-
-    `is_white` has the cells of every marker by its id, row by row from its upper left.
-    """
+    """Markers of a task's objects to draw into images; `is_white` has the cells of each by id."""
 
     def __init__(
         self, objects: SceneObjects, is_white: Mapping[int, Bool[np.ndarray, "n n"]]
@@ -317,11 +314,7 @@ class CameraRig:
         return view.geoms.reshape(self.shape_px), depth_m.reshape(self.shape_px)
 
     def _cast(self, simulation: Simulation, camera: str) -> "_View":
-        """Find what each ray of a camera meets.
-
-        Most rays meet the top of the table or nothing, which one division tells; only rays near
-        other geoms are left to MuJoCo, with equal results.
-        """
+        """What each ray of a camera meets; MuJoCo casts those near other geoms than the table."""
         T_world_camera = self.pose(simulation, camera)
         rays = np.ascontiguousarray(self.rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])

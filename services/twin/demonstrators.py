@@ -1,7 +1,4 @@
-"""Scripted demonstrators: smooth commands on the model grid from waypoints of both hands.
-
-Motions off the script are random, so that their outcome must be learned from the state.
-"""
+"""Scripted demonstrators: smooth commands from waypoints of both hands, and other motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -128,10 +125,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 
 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
-    """Commands of a whole take: smoothstep between waypoints, constant before and after them.
-
-    Raises InvalidInputError for times that do not increase.
-    """
+    """Commands of a take: smoothstep between waypoints, whose times increase, constant beside."""
     times = np.array([waypoint.time_s for waypoint in waypoints])
     if len(times) < 2 or (np.diff(times) <= 0).any():
         raise InvalidInputError(

@@ -68,10 +68,7 @@ class TruthEpisode:
 def record(
     stage: Stage, seed: int, options: TakeOptions, *, played: PlayedActions | None = None
 ) -> TruthEpisode:
-    """Record one take; equal stage, seed, options and actions give equal bytes.
-
-    The options determine the commands, unless actions are `played`.
-    """
+    """Record a take, deterministically; `played` actions replace those of the options."""
     sizes = options.sizes
     plan = stage.plan(
         seed, noise_m=options.noise_m, miss=options.miss, varied=options.varied, sizes=sizes

@@ -62,10 +62,7 @@ class Mistake:
 def with_mistakes(
     commands: HandTrajectory, mistakes: Sequence[Mistake], scene: MotionScene, seed: int
 ) -> HandTrajectory:
-    """Commands with all mistakes, in their order; equal arguments give equal commands.
-
-    The first command and the motion of the head stay as they are.
-    """
+    """Commands with all mistakes in order, deterministic; the first command and the head stay."""
     for mistake in mistakes:
         kind = zlib.crc32(mistake.kind.encode())
         draw = np.random.default_rng([seed, _STREAM, kind])

@@ -68,10 +68,7 @@ mujoco.set_mju_user_warning(_log_warning)
 
 
 class ObjectBodies:
-    """Access to poses and speeds of a task's objects in MuJoCo's arrays.
-
-    Raises InvalidInputError for a name without a body, or a body that is neither free nor fixed.
-    """
+    """Poses and speeds of objects; raises InvalidInputError for one neither free nor fixed."""
 
     def __init__(self, model: mujoco.MjModel, names: tuple[str, ...]) -> None:
         self._model = model
@@ -143,10 +140,7 @@ class ObjectBodies:
         return owner
 
     def place(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
-        """Set the pose of every object; joints of fixed objects keep their rest position.
-
-        Raises InvalidInputError for contradictory poses of the parts of a fixed object.
-        """
+        """Set all poses, joints at rest; raises InvalidInputError for contradictory parts."""
         data.qpos[self._free_qpos] = poses[self.is_free]
         placed: dict[int, np.ndarray] = {}
         for index in np.flatnonzero(~self.is_free):
@@ -174,11 +168,7 @@ class ObjectBodies:
         return poses
 
     def restore(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
-        """Set the pose of every object, with joints where they must be for it.
-
-        Raises InvalidInputError: an object on several joints, or on a body that is no object
-        itself.
-        """
+        """Set all poses, joints as needed; raises InvalidInputError where that is not unique."""
         data.qpos[self._free_qpos] = poses[self.is_free]
         Ts = transform_from_pose(poses)
         roots: dict[int, np.ndarray] = {}
@@ -284,10 +274,7 @@ def compile_scene(domain: Domain, *, objects: str, object_names: tuple[str, ...]
 
 
 def object_boxes_m(scene: Scene) -> Float64[np.ndarray, "objects 6"]:
-    """Centre x y z and half sizes x y z of each object's box in its own frame (m).
-
-    Unnamed parts of an object are included with their joints at rest; meshes by their hull.
-    """
+    """Centre and half sizes x y z of each object's box in its frame (m), parts at rest included."""
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(scene.model, data)
     boxes = np.zeros((len(scene.object_names), 6))
@@ -396,10 +383,7 @@ class Geometry:
     def on_the_same_level(
         self, poses: Float64[np.ndarray, "objects 7"], sizes: Sizes, boxes_m: np.ndarray
     ) -> Float64[np.ndarray, "objects 7"]:
-        """Poses, planned for usual sizes, with the lowest point of every resized object as before.
-
-        `boxes_m` are middle and half sizes of the usual boxes in the objects' frames.
-        """
+        """Poses with the lowest point of resized objects, of usual `boxes_m`, as planned."""
         placed = np.array(poses)
         up = transform_from_pose(placed)[:, 2, :3]
         low_m = [
@@ -527,10 +511,7 @@ def _sensors(hand: TwinHand) -> str:
 
 
 def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
-    """MJCF of table, shelf behind the viewer for removed objects, hands (left first) and objects.
-
-    `objects` are MJCF bodies with geoms of class "object".
-    """
+    """MJCF of table, shelf behind the viewer, hands (left first) and bodies of class "object"."""
     bodies = "".join(_hand(hand) for hand in hands)
     return (
         '<mujoco model="dextouch_twin"><compiler angle="radian" autolimits="true"/>'

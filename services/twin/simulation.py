@@ -60,10 +60,7 @@ class Simulation:
     def place(
         self, command: Command, object_poses: Float64[np.ndarray, "objects 7"], *, settle_s: float
     ) -> None:
-        """Set hands and objects, let objects settle, and restart at step 0.
-
-        The hands rest exactly at the command, so measured equals commanded at the start.
-        """
+        """Set hands, exactly at the command, and objects, let these settle, restart at step 0."""
         mujoco.mj_resetData(self.scene.model, self.data)
         self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
         self._bodies.place(self.data, object_poses)
@@ -267,10 +264,7 @@ class TactileReader:
     def read(
         self, data: mujoco.MjData
     ) -> tuple[Float32[np.ndarray, "2 320"], Float64[np.ndarray, "2 6"]]:
-        """Pressures (kPa) and pad forces (N: five tips, palm), left then right.
-
-        `data` must be consistent (after `mj_forward` with sensors enabled).
-        """
+        """Pressures (kPa) and pad forces (N: tips, palm), left, right, after `mj_forward`."""
         forces_n = np.zeros((len(SIDES), NUM_TAXELS))
         pad_forces_n = np.zeros((len(SIDES), len(FINGERS) + 1))
         pressed = self._pad_of_geom[data.contact.geom[: data.ncon]].max(axis=1)

@@ -126,10 +126,7 @@ class Stage:
         return self.anchor()
 
     def dress(self, seed: int, *, varied: bool, sizes: Sizes = USUAL) -> None:
-        """Give a take its appearance: that of the task, or one drawn from the seed.
-
-        Objects get their sizes, until the next take.
-        """
+        """Give a take the task's appearance or one of the seed, and its objects their sizes."""
         self._geometry.resize(sizes)
         look, scene = self.rig.own_appearance, self.simulation.scene
         if varied:
@@ -166,10 +163,7 @@ def mistake_name(mistake: Mistake) -> str:
 
 
 def mistake_of(policy: str) -> Mistake | None:
-    """The mistake that a policy is named by; None for other names.
-
-    Raises UnknownNameError: no such kind of mistake; InvalidInputError: a strength outside 0 … 1.
-    """
+    """The mistake that a policy is named by, None for other names; raises as `Mistake`."""
     match = _MISTAKE.fullmatch(policy)
     return None if match is None else Mistake(match[1], float(match[2]))
 
@@ -177,8 +171,7 @@ def mistake_of(policy: str) -> Mistake | None:
 def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
     """Open-loop commands of a policy, steps 1 … 80, relative to the start's poses.
 
-    Raises UnknownNameError: no such policy, or no such kind of mistake; InvalidInputError: a
-    strength of a mistake outside 0 … 1.
+    Raises UnknownNameError: no such policy; others as `Mistake`.
     """
     level, mistake = _SCRIPT.fullmatch(policy), mistake_of(policy)
     if level is None and mistake is None and policy not in FAILING:

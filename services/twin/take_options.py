@@ -222,10 +222,7 @@ class Mix:
             )
 
     def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
-        """Copy with another share of misses, or of takes that stop (half) or never start.
-
-        Raises InvalidInputError for shares outside 0 … 1, or none left for other kinds.
-        """
+        """Copy with other shares, 0 … 1 in all, of misses, or takes that stop or never start."""
         given = {} if miss is None else {"miss": miss}
         if still is not None:
             given |= {"frozen": 0.5 * still, "hold": 0.5 * still}
@@ -253,10 +250,7 @@ MIXES: Final[dict[str, Mix]] = {
 
 
 def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
-    """Options of the take of a task and seed; deterministic.
-
-    Raises InvalidInputError for a negative seed.
-    """
+    """Options of the take of a task and a seed, 0 or more; deterministic."""
     if seed < 0:
         raise InvalidInputError(f"training data: got seed {seed}, expected 0 or more")
     draw = np.random.default_rng([seed, zlib.crc32(task.encode())])

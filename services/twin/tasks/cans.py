@@ -1,7 +1,4 @@
-"""Tasks with a can: four that start alike, and one in which it is grasped a second time.
-
-The first observation of a seed is the same in the four: only the instruction tells what to do.
-"""
+"""Tasks with a can: four that differ by instruction alone at first, and one of two grasps."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -168,10 +165,7 @@ class CanTask:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched; lifted by 3 cm; then raised by 8 cm and held, or over the mat, on it, released.
-
-        The whole can must stand on the mat.
-        """
+        """Touched; lifted by 3 cm; then raised by 8 cm and held, or over, on the mat, released."""
         touched = simulation.hand_touches(0)
         height_m = simulation.object_poses()[0, 2] - _HALF_LENGTH_M
         lifted = bool(touched and height_m > _LIFTED_M and not simulation.touches_table(0))

@@ -189,10 +189,7 @@ class PlaceShoes:
         return all(_in_place(simulation)) and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """A boot touched; one, then both lifted or placed; one, then both placed; released.
-
-        A boot in its place counts as lifted, so that boots may be carried one after the other.
-        """
+        """A boot touched; one, both lifted or placed; one, both placed; released."""
         placed = _in_place(simulation)
         taken = [
             done or _is_carried(simulation, shoe)

@@ -66,10 +66,7 @@ class Task(Protocol):
         """Whether objects are in pose, at rest and, unless they are to be held, untouched."""
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Whether the condition of each milestone holds now; the last one is `succeeded`.
-
-        Contacts of the simulation must be current, as at every grid step.
-        """
+        """Whether each milestone's condition holds at a grid step; the last is `succeeded`."""
 
 
 def yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:

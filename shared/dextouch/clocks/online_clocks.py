@@ -81,10 +81,7 @@ def unwrap_counter(
 
 
 def count_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> int:
-    """Number of samples that are missing from a stream's sequence [n]; none where it restarts.
-
-    The device's counter has 8 … 64 bits (64 never wraps in practice).
-    """
+    """Samples missing from a sequence [n] of 8 … 64 bits; none where the device restarts."""
     if not 8 <= bits <= 64:
         raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
     numbers = np.asarray(sequence, dtype=np.int64)
@@ -130,11 +127,7 @@ class OnlineClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """How much later than estimated the last sample may have been taken; 0 if it came promptly.
-
-        `update` takes lateness for a delay, for ten seconds, though the device's timer may have
-        stopped.
-        """
+        """How much later than estimated the last sample may be; 0 if it came promptly."""
         return self._envelope.uncertainty_ns
 
     def update(
@@ -277,10 +270,7 @@ class CountingClock:
         )
 
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
-        """Add one arrival on the host's monotonic clock; returns the samples decided by it.
-
-        Raises InvalidInputError if it precedes the last arrival.
-        """
+        """Add an arrival, not before the last one; returns the samples decided by it."""
         if self._waiting and t_host_ns < self._waiting[-1]:
             raise InvalidInputError(
                 f"counting clock: got an arrival at {t_host_ns} ns after one at "
@@ -454,10 +444,7 @@ class RoundTripClock:
         self.num_exchanges = 0
 
     def add(self, exchange: RoundTrip) -> None:
-        """Add one exchange, in order of the requests.
-
-        Raises InvalidInputError for a reply before its request, or out of order.
-        """
+        """Add an exchange, in order; raises InvalidInputError for a reply before its request."""
         if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
             raise InvalidInputError(
                 f"round trip: got a question at {exchange.sent_ns} ns and its answer at "

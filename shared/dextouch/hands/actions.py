@@ -82,11 +82,7 @@ def action_names(*, has_robot_joints: bool = True) -> list[str]:
 
 
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
-    """Validate actions and return them as float64 [T, 67].
-
-    Raises ShapeError unless they are [T ≥ 1, 67], NonFiniteError for NaN or infinity, with the
-    place.
-    """
+    """Actions as float64 [T ≥ 1, 67]; raises ShapeError, or NonFiniteError with the place."""
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
         raise ShapeError(f"{where}: got shape {checked.shape}, expected [T ≥ 1, {ACTION_DIM}]")

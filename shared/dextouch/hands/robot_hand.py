@@ -184,10 +184,7 @@ class RobotHand(HandModel):
 
 
 def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 2 5 4 3"]:
-    """`RobotHand.chain_points_m` of both hands, in little more time than of one.
-
-    Joint angles [T, 2, 20] are finite, left before right.
-    """
+    """`RobotHand.chain_points_m` of finite angles [T, 2, 20] of both hands, left before right."""
     chains = _both_hands()
     angles_rad = np.asarray(joints_rad, dtype=np.float64).reshape(-1, *chains.axes.shape[:-1])
     return chains.points_m(chains.frames(angles_rad))

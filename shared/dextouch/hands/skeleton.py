@@ -66,10 +66,7 @@ def solver_indices(chain: str) -> list[int]:
 
 @lru_cache(maxsize=2)
 def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
-    """The 25 keypoints of the mean hand, flat, in wrist axes, metres; read-only.
-
-    Raises UnknownNameError for a side other than "left" and "right".
-    """
+    """Keypoints of the mean hand, flat, in wrist axes (m); raises UnknownNameError for a side."""
     if side not in ("left", "right"):
         raise UnknownNameError("side", side, ["left", "right"])
     points = np.zeros((NUM_KEYPOINTS, 3))
@@ -128,10 +125,7 @@ class NodeOrder:
     absent: tuple[Node, ...]
 
     def keypoints(self, points: np.ndarray) -> Float64[np.ndarray, "*batch 25 3"]:
-        """Reorder a tracker's points [..., n, 3] to our keypoints; NaN where absent.
-
-        Raises ShapeError for another number of points than nodes.
-        """
+        """Our keypoints of a tracker's points [..., n, 3], NaN where absent; raises ShapeError."""
         array = np.asarray(points, dtype=np.float64)
         if array.shape[-2:] != (len(self.places), 3):
             raise ShapeError(

@@ -113,10 +113,7 @@ def contact_mae(
     measured: Measured = None,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> float:
-    """Mean absolute error in kPa over the taxels in true contact.
-
-    NaN when no taxel is in true contact.
-    """
+    """Mean absolute error in kPa over the taxels in true contact; NaN if none is."""
     a, b = _pair(predicted_kpa, true_kpa, "contact MAE", measured, layout)
     touched = in_contact(b)
     return float(np.mean(np.abs(a - b)[touched])) if touched.any() else float("nan")

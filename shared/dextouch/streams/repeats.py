@@ -273,10 +273,7 @@ def _rests(equal: Bool[np.ndarray, " n"]) -> bool:
 def _frozen(
     rows: np.ndarray, is_next: np.ndarray, *, is_noisy: bool | None, may_lock: bool
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Rows that repeat the one before for long: where the device moved, and where it rested.
-
-    At rest, only devices that are noisy otherwise are meant.
-    """
+    """Rows that repeat the one before for long: where the device moved, and where noise rests."""
     frozen, harmless = np.zeros((2, len(rows)), dtype=bool)
     equal = (rows[1:] == rows[:-1]).all(axis=1)
     long = _runs(equal, MIN_FROZEN_STEPS)

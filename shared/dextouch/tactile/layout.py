@@ -51,10 +51,7 @@ _EMPTY = np.array((247, 247, 245), dtype=np.uint8)
 
 
 class TactileLayout(LayoutDescription):
-    """Layout of a tactile glove, with what it means for arrays of readings.
-
-    Taxels are those of one hand in anatomical order, the last axis of arrays.
-    """
+    """Layout of a tactile glove for arrays whose last axis are taxels in anatomical order."""
 
     @classmethod
     def of(cls, description: LayoutDescription | None) -> "TactileLayout | None":
@@ -69,10 +66,7 @@ class TactileLayout(LayoutDescription):
 
     @cached_property
     def nominal_kpa_per_unit(self) -> Float64[np.ndarray, " taxels"] | None:
-        """Pressure of one unit of each taxel's reading; None where only calibration knows it.
-
-        Read-only.
-        """
+        """Pressure of a unit of each taxel, None if only calibration knows it; read-only."""
         if self.unit == NEWTON:
             return _read_only(1.0 / (_PASCAL_PER_KPA * self.areas_m2))
         scale = KPA_PER_UNIT.get(self.unit, self.kpa_per_unit)
@@ -86,19 +80,13 @@ class TactileLayout(LayoutDescription):
         }
 
     def raw_indices(self, side: Side) -> Int64[np.ndarray, " taxels"]:
-        """Raw cell of each taxel; read-only.
-
-        Raises UnknownNameError: unknown side.
-        """
+        """Raw cell of each taxel, read-only; raises UnknownNameError for another side."""
         if side not in SIDES:
             raise UnknownNameError("side", side, list(SIDES))
         return self._indices[side]
 
     def check(self, taxels: np.ndarray, *, what: str = "taxels") -> np.ndarray:
-        """The array, whose last axis must be the taxels of one hand.
-
-        Raises ShapeError: it is not.
-        """
+        """The array; raises ShapeError unless its last axis is the taxels of one hand."""
         taxels = np.asarray(taxels)
         if taxels.shape[-1:] != (self.num_taxels,):
             raise ShapeError(
@@ -108,10 +96,7 @@ class TactileLayout(LayoutDescription):
         return taxels
 
     def select(self, raw: np.ndarray, *, side: Side) -> np.ndarray:
-        """Taxels in anatomical order of raw readings [..., cells]; dtype is kept.
-
-        Raises ShapeError: another number of cells; UnknownNameError: unknown side.
-        """
+        """Taxels, dtype kept, of raw readings [..., cells]; raises ShapeError, UnknownNameError."""
         raw = np.asarray(raw)
         if raw.shape[-1:] != (self.num_raw_cells,):
             raise ShapeError(
@@ -120,10 +105,7 @@ class TactileLayout(LayoutDescription):
         return raw[..., self.raw_indices(side)]
 
     def expand(self, taxels: np.ndarray, *, side: Side) -> np.ndarray:
-        """Raw readings [..., cells] from taxels; cells without a taxel are zero.
-
-        Raises ShapeError: another number of taxels; UnknownNameError: unknown side.
-        """
+        """Raw readings of taxels, other cells zero; raises ShapeError, UnknownNameError."""
         taxels = self.check(taxels)
         raw = np.zeros((*taxels.shape[:-1], self.num_raw_cells), dtype=taxels.dtype)
         raw[..., self.raw_indices(side)] = taxels
@@ -143,10 +125,7 @@ class TactileLayout(LayoutDescription):
         return stacks
 
     def join(self, stacks: Sequence[np.ndarray]) -> np.ndarray:
-        """Taxels from stacks as of `split`.
-
-        Raises ShapeError: stacks of other pads.
-        """
+        """Taxels from stacks as of `split`; raises ShapeError for stacks of other pads."""
         expected = [(count, *shape) for count, shape in self._stacks]
         if [stack.shape[-3:] for stack in stacks] != expected:
             raise ShapeError(
@@ -274,10 +253,7 @@ def read_layout(path: Path | str) -> TactileLayout:
 
 
 def common_layout(layouts: Sequence[TactileLayout], *, what: str) -> TactileLayout:
-    """The one layout of several streams, `DEXTOUCH_V1` of none; `what` names them in the message.
-
-    Raises InvalidInputError: they are not all the same.
-    """
+    """The one layout of several streams, `DEXTOUCH_V1` of none; raises InvalidInputError."""
     kinds = {layout.fingerprint: layout for layout in layouts}
     if len(kinds) > 1:
         raise InvalidInputError(
@@ -320,10 +296,7 @@ def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
-    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16].
-
-    Raises ShapeError: other shapes.
-    """
+    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16]; or ShapeError."""
     palm = np.asarray(palm)
     if palm.shape[-2:] != PALM_SHAPE:
         raise ShapeError(f"palm: got shape {palm.shape}, expected [..., 15, 16]")

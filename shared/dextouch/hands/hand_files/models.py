@@ -179,10 +179,7 @@ class Link(NamedTuple):
 
 
 class UrdfModel:
-    """The links of a URDF, which must be a tree without unprocessed xacro.
-
-    Links are read when asked for, so that only those of fingers must be valid.
-    """
+    """The links of a URDF, a tree without unprocessed xacro, which are read when asked for."""
 
     def __init__(self, root: Element) -> None:
         self.source = root.source.rpartition(" line ")[0]
