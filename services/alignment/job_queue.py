@@ -102,10 +102,7 @@ class JobQueue:
         limit: int,
         recording_ids: Collection[str] = (),
     ) -> AlignmentList:
-        """Some of the jobs, of one state or of these recordings, oldest first, after an id.
-
-        Raises NotFoundError: there is no job `after`.
-        """
+        """Some jobs, oldest first, after an id; raises NotFoundError if there is no such job."""
         self._require_open()
         jobs = [
             (position, job)
@@ -151,10 +148,7 @@ class JobQueue:
         return known is not None and known.state == "running" and known.started_at == job.started_at
 
     async def add(self, jobs: Sequence[AlignmentJob]) -> None:
-        """Append new jobs; those that wait, run or are done stay as they are.
-
-        Raises LimitExceededError: too many would be open; none is added.
-        """
+        """Append jobs that are new or failed; raises LimitExceededError if too many are open."""
         known = {key for key, job in self._jobs.items() if job.state not in {"failed", "cancelled"}}
         new = {job.alignment_id: job for job in jobs if job.alignment_id not in known}
         num_open = sum(job.state not in ENDED for job in self._jobs.values())

@@ -75,10 +75,7 @@ class AlignmentMetrics:
 
 
 class JobRunner:
-    """The alignments of one store, which run between `start` and `close`, in one event loop.
-
-    `queue` holds the jobs, which are kept in `jobs_folder` and resumed after a restart.
-    """
+    """The alignments of a store between `start` and `close`; jobs in `jobs_folder` resume."""
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
@@ -170,10 +167,7 @@ class JobRunner:
         return tuple(self.queue.get(alignment_id) for alignment_id in ids.values())
 
     async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
-        """Keep a failed job of a recording that cannot be aligned, so that its reason is listed.
-
-        Raises NotFoundError: no such recording; LimitExceededError: too many are waiting.
-        """
+        """Keep a failed job with its reason; raises NotFoundError or LimitExceededError."""
         recording = await asyncio.to_thread(self._store.recording, recording_id)
         alignment_id = episode_id_of(recording, self._options)
         job = AlignmentJob.new(alignment_id, recording_id, self._options)
@@ -190,10 +184,7 @@ class JobRunner:
         return self.queue.get(alignment_id)
 
     async def cancel(self, alignment_id: str) -> AlignmentJob:
-        """Cancel an alignment that waits or runs; nothing of it is written.
-
-        Raises NotFoundError: not known here; ConflictError: it is done or has failed.
-        """
+        """Cancel a job that waits or runs; raises NotFoundError, or ConflictError if done."""
         async with self._changed:
             job = self.queue.get(alignment_id)
             if job.state in {"done", "failed"}:
@@ -322,10 +313,7 @@ class NewRecordings:
             await asyncio.sleep(period_s)
 
     async def look(self) -> None:
-        """Submit new recordings; a recording that finds no room in the queue is left for next time.
-
-        Raises StorageError: the store cannot be listed, or jobs cannot be kept.
-        """
+        """Submit new recordings as far as the queue has room; raises StorageError."""
         for job in self._jobs.queue.out_of_space(for_s=RETRY_S):
             again = AlignmentRequest(recording_id=job.recording_id, options=job.options)
             with suppress(InvalidInputError, LimitExceededError, NotFoundError):

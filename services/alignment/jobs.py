@@ -78,10 +78,7 @@ def align_recording(
 
 
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
-    """Check that a recording has what an episode needs; returns the id of its episode.
-
-    Raises NotFoundError: no such recording; InvalidInputError: streams or calibration are missing.
-    """
+    """Id of the episode of a recording; raises NotFoundError, or InvalidInputError without data."""
     recording = store.recording(recording_id)
     check_complete(recording)
     return episode_id_of(recording, options)
@@ -90,10 +87,7 @@ def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOp
 def check_recordings(
     store: EpisodeStore, recording_ids: Sequence[str], options: AlignmentOptions
 ) -> dict[str, str]:
-    """Check several recordings; returns the id of each one's episode.
-
-    Raises as `check_recording`; of several, the message names all that are refused.
-    """
+    """Ids of the episodes of several; raises as `check_recording`, naming all that are refused."""
     episodes: dict[str, str] = {}
     refused: dict[str, DexTouchError] = {}
     for recording_id in recording_ids:
@@ -152,10 +146,7 @@ class AlignmentWorker:
     def run(
         self, recording_id: str, options: AlignmentOptions, on_progress: OnProgress
     ) -> AlignmentReport:
-        """Align a finished recording; its progress is told a few times a second.
-
-        Raises UnavailableError: the process was killed; others as `align_recording`.
-        """
+        """Align a recording; raises UnavailableError if killed, else as `align_recording`."""
         with self._in_use:
             self.start()
             child = self._child

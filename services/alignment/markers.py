@@ -108,10 +108,7 @@ def _detected(
 
 
 class MarkerTracker:
-    """Finds the objects of one task in the images of a camera.
-
-    `K` is in px, pixel centres at half-integers; the distortion k1 k2 p1 p2 k3.
-    """
+    """Finds a task's objects in images of a camera; K in px, pixel centres at half-integers."""
 
     def __init__(
         self,
@@ -247,10 +244,7 @@ def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate |
 
 
 def marker_sheet(objects: SceneObjects) -> str:
-    """SVG with the markers of all objects, to cut out, on A4 pages below one another.
-
-    Raises InvalidInputError: there is no marker, or one is larger than the page.
-    """
+    """SVG with all markers on A4 pages; raises InvalidInputError for none, or one too large."""
     printed = {
         (one.name, marker.id, marker.size_m): marker
         for listed in objects.tasks.values()

@@ -116,10 +116,7 @@ def match_streams(
 def match_samples(
     mine: StreamData, true: StreamData, origin_ns: int, reach_ns: int, *, period_ns: int
 ) -> Match:
-    """Match every sample with its true one, near in time and of similar values.
-
-    Shifts by whole periods up to `reach_ns` are tried too, and used if values match clearly better.
-    """
+    """Match samples with true ones, shifted by periods up to `reach_ns` where clearly better."""
     num = round(reach_ns / period_ns)
     shifts_ns = [origin_ns + period_ns * shift for shift in sorted(range(-num, num + 1), key=abs)]
     differences = np.array([_difference(mine, true, shift_ns, period_ns) for shift_ns in shifts_ns])

@@ -286,10 +286,7 @@ def free_unknowns(*, is_mount_known: bool, is_scale_known: bool) -> np.ndarray:
 def predicted_jacobians(
     Ts: np.ndarray, X_B: np.ndarray, scale: float
 ) -> tuple[Float64[np.ndarray, "n 6 13"], Float64[np.ndarray, "n 6 6"]]:
-    """Jacobians of the measured poses by X, Z and log scale, and by D.
-
-    `Ts` are the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z, `X_B` are X · B.
-    """
+    """Jacobians of predicted poses `Ts` (`X_B` = X · Ts) by X, Z and log scale, and by D."""
     J = np.zeros((len(Ts), 6, 13))
     J[:, :, :6] = -adjoint(invert(Ts))
     J[:, :, 6:12] = np.eye(6)

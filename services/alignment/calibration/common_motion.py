@@ -1,7 +1,4 @@
-"""Path delays of all streams that were shaken together: trackers, cameras, hands in the world.
-
-The turn between the axes (Kabsch) and the offset in time of every two streams are estimated.
-"""
+"""Path delays of all streams that were shaken together: trackers, cameras, hands in the world."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -298,10 +298,7 @@ def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.
 
 @dataclass(frozen=True)
 class RobotBaseResult(PoseEstimate):
-    """Pose of the robot's base in the tracked world, and how well it is known.
-
-    `T_effector_tracker` is as given, or found; the RMS are how far the pairs are off.
-    """
+    """Pose of the robot's base, how well it is known, and how far pairs are off (RMS)."""
 
     T_world_base: Float64[np.ndarray, "4 4"]
     T_effector_tracker: Float64[np.ndarray, "4 4"]
@@ -425,11 +422,7 @@ def mount_progress(
     *,
     views: BoardViews | None = None,
 ) -> MountProgress:
-    """Solve for the mount and say what is missing.
-
-    Arguments are those of `solve_hand_eye`, in the order of time, and may be empty. Raises
-    ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
-    """
+    """Solve as `solve_hand_eye`, if there are enough views yet, and say what is missing."""
     num_places = len(Ts_world_tracker)
     if num_places >= MIN_VIEWS:
         names = ("Ts_world_tracker", "Ts_camera_board")
@@ -465,10 +458,7 @@ def camera_turns(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "pairs 3"]:
 
 
 def turn_spreads(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "3"]:
-    """RMS of the camera's turns about each of its axes alone (rad), over pairs of views.
-
-    Of the covariance C of the turns this is 1 / sqrt((C⁻¹)_ii): oblique axes do not count.
-    """
+    """RMS of the camera's turns about each axis alone (rad): 1 / sqrt((C⁻¹)_ii) of covariance C."""
     if len(Ts_camera_board) < 2:
         return np.zeros(3)
     turns_rad = camera_turns(Ts_camera_board)

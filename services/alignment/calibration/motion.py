@@ -83,10 +83,7 @@ class Series(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Series of the views that agree, the mount X and the target's pose Z that they determine.
-
-    `views` are their indices, `left_out` those of the others.
-    """
+    """Series of the agreeing views, their indices, X and Z, and indices of views left out."""
 
     series: Series
     views: np.ndarray
@@ -102,10 +99,7 @@ class Agreement(NamedTuple):
 
 
 def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "n 4 4"]]:
-    """Validate series of poses: float64 [n, 4, 4], all of one length, at least four, rigid.
-
-    Raises ShapeError, NonFiniteError or InvalidInputError.
-    """
+    """Series as float64 [n ≥ 4, 4, 4]; raises ShapeError, NonFiniteError, InvalidInputError."""
     arrays = {name: np.asarray(poses, dtype=np.float64) for name, poses in series.items()}
     shapes = [array.shape for array in arrays.values()]
     if len(set(shapes)) != 1 or len(shapes[0]) != 3 or shapes[0][1:] != (4, 4):
@@ -252,10 +246,7 @@ def view_errors(
 
 
 def check_sides(series: Series, errors: np.ndarray) -> None:
-    """Refuse a series that fits much better when one side is inverted, and name the side.
-
-    Of two sides that fit (both inverted agree again), that of the shorter mount is the likelier.
-    """
+    """Refuse and name a side whose inverse fits much better, of two that of the shorter mount."""
     body, target = series.Ts_world_body, series.Ts_mounted_target
     limit = INVERTED_SHARE * _rms(errors)
     fits = []

@@ -117,10 +117,7 @@ def estimate_tap_offset(
 def checked_signal(
     what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """Seconds after a reference [1], and values [n] or [n, k] as [n, k].
-
-    Raises InvalidInputError: fewer than two stamps, or out of order; ShapeError, NonFiniteError.
-    """
+    """Seconds after a reference, and values [n, k]; refuses NaN and stamps that go back."""
     t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(signal, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or t_ns.shape != values.shape[:1]:

@@ -1,7 +1,4 @@
-"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand, by its profile.
-
-Bone lengths and knuckles are measured once a person, since tracked points wobble by millimetres.
-"""
+"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -105,10 +102,7 @@ class HandProfile:
         return bool(np.median(self.travel) >= RIGID_TRAVEL)
 
     def to_rows(self) -> Float64[np.ndarray, "5 9"]:
-        """As a matrix for a recording's calibration.
-
-        Columns: 3 bones, 3 knuckle coordinates, travel, knuckle sigma, the tracker's noise (m).
-        """
+        """Rows: 3 bones, 3 knuckle coordinates, travel, knuckle sigma, the tracker's noise (m)."""
         noise_m = np.full(NUM_FINGERS, self.point_sigma_m)
         columns = self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m, noise_m
         return np.column_stack(columns).astype(np.float64)

@@ -345,10 +345,7 @@ def _bends_rad(samples: np.ndarray) -> Float64[np.ndarray, "time 4"]:
 
 @dataclass(frozen=True)
 class MatchedPoints:
-    """Positions of thumb … little fingertip and palm of both hands, each in its own wrist frame.
-
-    The robot's are at the retargeted joint angles; a person's that is not `seen` is zero.
-    """
+    """Fingertips and palm of both hands in their wrist frames; a person's not `seen` are zero."""
 
     human_m: Float64[np.ndarray, "time 6 3"]
     robot_m: Float64[np.ndarray, "time 6 3"]
@@ -494,10 +491,7 @@ def anchored_joints(
 
 
 def touch_shares(pad_forces_n: np.ndarray, t_s: np.ndarray) -> Float64[np.ndarray, "time 5"]:
-    """Share of the distance that each fingertip is moved: 0 without contact, near 1 with it.
-
-    Arguments and errors as `touch_offsets_m`.
-    """
+    """Share of the distance that each tip is moved; arguments as `touch_offsets_m`."""
     forces, times = _checked(len(t_s), pad_forces_n, t_s)
     near = np.maximum(*_decaying(forces[:, :NUM_FINGERS], times, np.maximum))
     return near / (near + HALF_FORCE_N)

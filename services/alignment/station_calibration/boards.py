@@ -92,10 +92,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos of one size: views of the board, and the names of those left out.
-
-    `without_board` includes photos in which the board seems to be printed in another way.
-    """
+    """Photos of one size: views of the board, and names of those without this print of it."""
 
     views: tuple[BoardView, ...]
     without_board: tuple[str, ...]
@@ -173,10 +170,7 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
 
 
 def read_photos(paths: Sequence[Path], board: Board) -> Photos:
-    """Read photos and find the board in each; its print is the one with most corners.
-
-    Raises CorruptDataError: a file that cannot be decoded; InvalidInputError: unequal sizes.
-    """
+    """Find the board in photos of one size; raises CorruptDataError or InvalidInputError."""
     seen: list[BoardView] = []
     size: tuple[int, ...] = ()
     for path in progress(paths, "looking for the board", len(paths)):

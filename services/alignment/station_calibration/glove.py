@@ -182,10 +182,7 @@ def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> flo
 
 
 class Guide:
-    """Leads an operator, who lays the glove down and presses it while a station records takes.
-
-    An invalid take is explained and repeated.
-    """
+    """Leads an operator through rest and presses; an invalid take is explained and repeated."""
 
     def __init__(
         self,

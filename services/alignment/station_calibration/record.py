@@ -109,10 +109,7 @@ def write_entry(
 def write_pose(
     folder: Path, name: str, T: np.ndarray, sigma: tuple[float, float], facts: dict[str, object]
 ) -> str:
-    """Write a transform [4, 4] as an entry and say how well it is known.
-
-    `sigma` is of its rotation (rad) and translation (m); the facts are extended by it.
-    """
+    """Write a transform [4, 4] as an entry and say its sigma (rad, m), also in the facts."""
     rad, m = sigma
     facts |= {"sigma_rotation_deg": float(np.rad2deg(rad)), "sigma_translation_mm": m * 1e3}
     write_entry(folder, name, {name: T, f"{name}_sigma_rad": rad, f"{name}_sigma_m": m}, facts)
@@ -277,10 +274,7 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
 
 
 def read_pairs(path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
-    """Pairs of 4x4 matrices from a JSON file, at least one.
-
-    Raises NotFoundError: no such file; InvalidInputError: no JSON of numbers; ShapeError: no pairs.
-    """
+    """Pairs of 4x4 matrices of a JSON file; raises NotFoundError, InvalidInputError, ShapeError."""
     try:
         pairs = np.array(json.loads(_existing(path, expected).read_bytes()), dtype=np.float64)
     except json.JSONDecodeError as error:
@@ -311,10 +305,7 @@ def _existing(path: Path, expected: str) -> Path:
 
 
 class Question(NamedTuple):
-    """Question to an operator; the answer starts `action`, or is a text if it `takes_text`.
-
-    `choices` are other answers, each with what it does.
-    """
+    """Question to an operator; an answer starts `action`, is a text, or one of `choices`."""
 
     text: str
     action: str

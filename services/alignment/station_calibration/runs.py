@@ -205,10 +205,7 @@ class StationLocation:
         return HttpLink(self.url, api_key=self.key)
 
     def visited(self) -> "VisitedStation":
-        """The place, or that of practice devices while they run, and the station's streams.
-
-        Simulated devices have the folder `practice`.
-        """
+        """The place (of practice devices while they are on), and the station's streams."""
         with closing(self.link()) as link:
             reply = link.request("GET", "/v1/practice")
             practice = PracticeStatus.model_validate_json(reply.body, extra="ignore").state
@@ -277,10 +274,7 @@ class GuidedRun:
         return self._status
 
     def answer(self, text: str) -> RunStatus:
-        """Answer the question of the run.
-
-        Raises ConflictError: it asks nothing; InvalidInputError: a text that is no answer to it.
-        """
+        """Answer the question of the run; raises ConflictError without, or InvalidInputError."""
         with self._lock:
             asked = self._status
             if asked.state != "asking":
@@ -543,10 +537,7 @@ class CalibrationRuns:
         self._lock = threading.Lock()
 
     def start(self, request: RunRequest) -> RunStatus:
-        """Begin a run.
-
-        Raises ConflictError: one is on; InvalidInputError: no such board, subject or station.
-        """
+        """Begin a run; raises ConflictError while one is on, InvalidInputError for its subject."""
         subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(request.kind, tuple(TRACKERS))
         if request.subject not in subjects:
             raise InvalidInputError(
@@ -569,10 +560,7 @@ class CalibrationRuns:
             return self._run.status
 
     def switch_practice(self, *, is_on: bool) -> None:
-        """Start or stop the practice devices of the station.
-
-        Raises ConflictError: a run is on, or the station has real devices.
-        """
+        """Start or stop practice devices; raises ConflictError at real ones, or in a run."""
         with self._lock:
             if self._run is not None and self._run.status.state not in ENDED:
                 raise ConflictError(

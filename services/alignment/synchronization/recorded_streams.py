@@ -144,10 +144,7 @@ class DatedStream:
 
 @dataclass
 class EpisodeStream:
-    """One stream of an episode, whose samples are produced while they are written.
-
-    `blocks` are in order, with times of the episode; `quality` is complete when all were taken.
-    """
+    """A stream of an episode, produced while it is written, when `quality` becomes complete."""
 
     descriptor: StreamDescriptor
     blocks: Iterator[Block]
@@ -194,10 +191,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
 
 
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
-    """The samples of the episode's time, with the neighbours that its ends need.
-
-    `origin_ns` is the host time of time 0; `last_ns`, of the last step, counts from there.
-    """
+    """Samples from host time `origin_ns` on for `last_ns`, with the neighbours of the ends."""
     margin_ns = round(EDGE_PERIODS * stream.descriptor.period_ns())
     edges_ns = [origin_ns - margin_ns, origin_ns + last_ns + margin_ns]
     first = int(np.searchsorted(stream.t_ns, edges_ns[0], side="left"))
@@ -360,10 +354,7 @@ def with_tracked_objects(
     objects: SceneObjects | None,
     calibration: Mapping[str, Matrix],
 ) -> dict[str, DatedStream]:
-    """The streams, those of trackers on objects moved to the objects.
-
-    Raises InvalidInputError: a stream that is needed is missing, or an object has two sources.
-    """
+    """The streams, those of trackers on objects moved to these; raises InvalidInputError."""
     changed = dict(streams)
     for one in _listed(objects):
         stream = streams.get(one.stream)
@@ -403,10 +394,7 @@ def marker_streams(
     max_gap_ns: int,
     on_progress: OnProgress = lambda _: None,
 ) -> list[EpisodeStream]:
-    """Poses of objects with markers that were seen from the first to the last step, in host time.
-
-    `max_gap_ns` is the longest gap between poses of the camera.
-    """
+    """Poses of the objects with markers that the head camera saw between two host times."""
     listed = [one for one in _listed(objects) if one.markers]
     if objects is None or not listed:
         return []

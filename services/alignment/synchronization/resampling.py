@@ -34,10 +34,7 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class GridPlacement:
-    """Neighbouring samples and weights (of the right one) of each grid step in one stream.
-
-    A weight is outside [0, 1] within `EDGE_PERIODS` of the ends: the line goes on.
-    """
+    """Left neighbour and weight of the right one of grid steps; beyond 0 … 1 near the ends."""
 
     left: Int64[np.ndarray, " n"]
     weight: Float64[np.ndarray, " n"]
@@ -132,10 +129,7 @@ class RefusedPart(FrozenModel):
 def refused_edges(
     first_ns: Mapping[str, int], last_ns: Mapping[str, int], start_ns: int
 ) -> list[RefusedPart]:
-    """Ends of a recording, started at `start_ns`, that not all streams cover.
-
-    `first_ns` and `last_ns` are of the samples of each stream that actions are made of.
-    """
+    """Ends of a recording, which began at `start_ns`, that not all of these streams cover."""
     latest = max(first_ns, key=lambda name: first_ns[name])
     earliest = min(last_ns, key=lambda name: last_ns[name])
     return [
@@ -168,10 +162,7 @@ def refused_stretches(
 
 
 def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> dict[str, Matrix]:
-    """When each stream was missing at steps of the episode, as it carries that.
-
-    `t_ns` are times of the steps on the episode's clock; rows are start and stop in seconds.
-    """
+    """Start and stop (s) of the steps at which each stream was missing, as matrices."""
     rows = {name: _rows_s(t_ns, ~mine) for name, mine in valid.items()}
     return {
         f"interpolated_{name}_s": matrix_rows(np.array(runs)) for name, runs in rows.items() if runs
@@ -181,10 +172,7 @@ def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> 
 def interpolated_fingers(
     t_ns: np.ndarray, unseen: Mapping[Side, Bool[np.ndarray, "n 5"]]
 ) -> dict[str, Matrix]:
-    """When each finger was missing at steps of the episode: start, stop (s), and the finger.
-
-    Fingers that no step has are absent parts of the episode instead.
-    """
+    """Start, stop (s) and number of fingers that are missing at some, but not all steps."""
     found = {}
     for side, of_hand in unseen.items():
         rows = [
@@ -210,10 +198,7 @@ def with_causes(
     left_out_ns: Mapping[str, Iterable[tuple[int, int, RefusedReason]]],
     start_ns: int,
 ) -> list[RefusedPart]:
-    """The refused parts with those of each stream that cannot be true, in place of its gaps there.
-
-    `left_out_ns` are on the clock of `start_ns`, the recording's start.
-    """
+    """The refused parts, with those of samples that cannot be true in place of their gaps."""
     causes = [
         _part(begin_ns, end_ns, start_ns, reason, name)
         for name, mine in left_out_ns.items()

@@ -48,10 +48,7 @@ MIN_CUT_SHARE = 0.01
 
 @dataclass(frozen=True)
 class TimedStream:
-    """Strictly increasing times on the host's clock, with the report of the clock fit.
-
-    `kept` are indices of the samples that have a time of their own; duplicates are dropped.
-    """
+    """Increasing times of samples `kept` (not repeated) on the host's clock, and their report."""
 
     kept: Int64[np.ndarray, " n"]
     t_host_ns: Int64[np.ndarray, " n"]
@@ -159,11 +156,7 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
 def _keeps_unit(
     device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int, *, may_change: bool
 ) -> bool:
-    """Refuse stamps of another unit, by blocks of samples: the clock may step between them.
-
-    Returns:
-        False where the unit is another one for a part of the time, and `may_change`.
-    """
+    """Refuse stamps of another unit; False where only a part has one, and `may_change`."""
     edges = np.arange(0, len(device_ns), MIN_COUNTED_SAMPLES)
     if len(edges) < 2:
         return True

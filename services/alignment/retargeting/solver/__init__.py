@@ -16,11 +16,7 @@ ROOT_UID = 0
 
 
 def folder_of_code(base: Path) -> Path | None:
-    """Folder, below a base that is made if needed, for the compiled code of this version.
-
-    Code in it is run without a question: None where no other user is kept from writing to it, or
-    this one is.
-    """
+    """Folder below a base for this version's compiled code; None if others may write to it."""
     code = b"".join(path.read_bytes() for path in sorted(PACKAGE.glob("*.py")))
     try:
         # What a link leads to is checked and used, wherever the link leads later.

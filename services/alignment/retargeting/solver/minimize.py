@@ -184,10 +184,7 @@ def weigh_bones(work, finger, ease):
 @compiled
 @no_type_check
 def ease_bones(work, finger, ease):
-    """Let bones that the robot cannot turn as the person's weigh less in the next sample.
-
-    A pseudo-Huber loss by reweighting (Holland and Welsch 1977): linear beyond `BONE_BEND_RAD`.
-    """
+    """Let bones that the robot cannot turn so weigh less: pseudo-Huber beyond `BONE_BEND_RAD`."""
     measured, usable, point = work.measured[finger], work.usable[finger], work.point[finger]
     base = -1
     for index in range(NUM_POINTS):
