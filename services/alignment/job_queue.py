@@ -68,8 +68,7 @@ class JobQueue:
     async def open(self, folder: Path) -> list[AlignmentJob]:
         """Load the jobs kept in a folder; returns those that were running when it was left.
 
-        Raises ConflictError: another service uses the folder; CorruptDataError: the jobs on disk
-        are damaged; StorageError: they cannot be read or written.
+        Raises ConflictError: another service uses it; CorruptDataError; StorageError.
         """
         try:
             self._database, self._jobs = await asyncio.to_thread(_open_jobs, folder)

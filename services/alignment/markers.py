@@ -1,7 +1,7 @@
 """Markers on objects: poses of the objects in images, and sheets of markers to print.
 
-A single square has two poses that look almost alike (Schweighofer and Pinz, 2006; IPPE gives both).
-Other markers decide, or a clearly smaller error, or the pose in neighbouring images.
+A single square has two poses that look almost alike (Schweighofer and Pinz, 2006): other markers,
+a clearly smaller error, or neighbouring images decide.
 """
 
 from collections.abc import Iterator, Sequence

@@ -171,10 +171,9 @@ def _turn_between(
 
 
 def pair_offset(a: Turning, b: Turning) -> TimeOffset:
-    """Offset to be added to b's times to align it with a, of streams that turn together.
+    """Offset and turn between the axes of streams that turn together, to be added to b's times.
 
-    Offset and turn between their axes are fitted together (Gauss–Newton). Raises
-    DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or the offset changes.
+    Raises DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or it changes.
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])

@@ -1,7 +1,6 @@
 """Where a camera sits on its tracker, and a robot's base in the tracked world, with sigmas.
 
-A tracker on a robot's effector says T_world_tracker = T_world_base · T_base_effector ·
-T_effector_tracker: the base is in the place of the board.
+A robot says T_world_tracker = T_world_base · T_base_effector · T_effector_tracker.
 """
 
 from collections.abc import Sequence

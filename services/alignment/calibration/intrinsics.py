@@ -1,7 +1,4 @@
-"""Camera intrinsics from photos of a flat board: detected corners, blur, and calibration.
-
-Blur of 6 px shifts all corners by half a pixel, which the board's pose absorbs: only edges show it.
-"""
+"""Camera intrinsics from photos of a flat board: detected corners, blur, and calibration."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

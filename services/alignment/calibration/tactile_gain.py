@@ -54,10 +54,9 @@ MAX_FAULTY = 0.25
 
 @dataclass(frozen=True)
 class TaxelPress:
-    """A take [T ≥ 60, cells] under a known pressure on some taxels.
+    """A take [T ≥ 60, cells] under a pressure above 0 kPa on some taxels, with its sigma.
 
-    The pressure is above 0 kPa, its sigma 0 or more. Raises InvalidInputError: another pressure, or
-    no taxel; NonFiniteError: NaN or infinity in the pressure.
+    Raises InvalidInputError: another pressure, or no taxel; NonFiniteError: NaN or infinity.
     """
 
     pressure_kpa: float
@@ -142,8 +141,7 @@ def calibrate_glove(
 ) -> GloveCalibration:
     """Gain and fault map of a glove, beside its tare; without presses the tare alone.
 
-    Raises InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is faulty or was
-    not pressed.
+    Raises InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is not OK.
     """
     if not presses:
         return GloveCalibration(tare, None)

@@ -94,10 +94,9 @@ class TaxelTare:
 def measure_tare(
     rest_counts: np.ndarray, *, side: Side, layout: TactileLayout = DEXTOUCH_V1
 ) -> TaxelTare:
-    """Zero of every cell from a take [T ≥ 60, cells] without contact, raw counts in scan order.
+    """Zero of every cell from raw counts [T ≥ 60, cells] without contact, in scan order.
 
-    Raises InvalidInputError: too short, or the glove was touched or still settling; ShapeError,
-    NonFiniteError: no [T, cells], or NaN.
+    Raises InvalidInputError: too short, touched or settling; ShapeError; NonFiniteError.
     """
     counts = checked_counts(rest_counts, what=f"rest take of the {side} glove", layout=layout)
     level = steady_level(counts)

@@ -1,8 +1,4 @@
-"""Time offset between two streams, from common motion or from taps on a table.
-
-Signals of the same motion are correlated coarsely; then b's cubic spline is fitted to a by
-Gauss–Newton. In a tap the tracker's height falls on a line and stops: its bend is the touch.
-"""
+"""Time offset between two streams, from common motion or from taps on a table."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,4 @@
-"""Checks that tracked keypoints are the expected human hand in metres, in our order of nodes.
-
-Distances that no posture changes reveal unit and order; where fingers curl, left from right.
-"""
+"""Checks that tracked keypoints are the expected human hand in metres, in our order of nodes."""
 
 from functools import lru_cache
 from itertools import combinations, permutations, product

@@ -106,8 +106,7 @@ class PosedViews:
 def calibrate_mount(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Calibrate the mount of one camera on its tracker.
 
-    Raises DegenerateMotionError: the tracker was rotated too little (names the axis);
-    InvalidInputError: poses and photos do not match, or contradict each other.
+    Raises DegenerateMotionError: the tracker turned too little; InvalidInputError: contradictions.
     """
     views = _read_views(options, say)
     trackers, boards = views.Ts_world_tracker, views.Ts_camera_board

@@ -1,7 +1,4 @@
-"""Calibration folder, its age and accuracy, and inputs: CSV rows, poses, streams of takes.
-
-Named matrices for recordings are in `calibration.json`; sigma and time of one are matrices, too.
-"""
+"""Calibration folder, its age and accuracy, and inputs: CSV rows, poses, streams of takes."""
 
 import codecs
 import csv

@@ -42,8 +42,7 @@ MIN_CAMERA_HZ: Final = 15.0
 def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Measure the delays of all streams of a take that turned together, after a reference.
 
-    Raises DegenerateMotionError: too little, slow or regular motion, or streams did not move
-    together; InvalidInputError: fewer than two streams show how they turned.
+    Raises DegenerateMotionError: unsuitable motion; InvalidInputError: fewer than two streams.
     """
     where = f"take {options.take!r}"
     reader = open_take(options.take, options.store)

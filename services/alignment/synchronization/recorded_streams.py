@@ -1,8 +1,4 @@
-"""Streams of a recording on the host's clock, converted to the units of episodes, and cut to one.
-
-Values are read in pieces: an hour of images is never in memory at once, and encoded ones are
-decoded only for markers on objects.
-"""
+"""Streams of a recording on the host's clock, converted piece by piece, and cut to one episode."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -154,8 +150,7 @@ class EpisodeStream:
 def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
-    Raises ClockFitError: its stamps fit no clock; InvalidInputError: calibration is missing or
-    wrong; UnknownNameError: the recording has no such stream.
+    Raises ClockFitError; InvalidInputError: a wrong calibration; UnknownNameError: no stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
     timing = time_stream(

@@ -1,7 +1,6 @@
 """Resampling of vectors and poses to a common time grid, never across a gap, and what that refuses.
 
-Episodes carry the parts of their recording that are left out as `refused_<reason>_<stream>_s`, rows
-of start and stop in seconds after the episode's start.
+Episodes carry what is left out as `refused_<reason>_<stream>_s`: rows of start and stop (s).
 """
 
 import re
@@ -54,10 +53,7 @@ def stream_gap_ns(max_gap_ns: int, period_ns: int) -> int:
 def place_on_grid(
     t_ns: np.ndarray, grid_ns: np.ndarray, *, period_ns: int, max_gap_ns: int
 ) -> GridPlacement:
-    """Neighbours and weights of grid times among samples with increasing times and a period.
-
-    Fewer than two make every step invalid; two further apart than `max_gap_ns` are not connected.
-    """
+    """Neighbours and weights of grid times; invalid across `max_gap_ns`, or of one sample."""
     t_ns, grid_ns = np.asarray(t_ns, dtype=np.int64), np.asarray(grid_ns, dtype=np.int64)
     if t_ns.size < 2:
         nowhere = np.zeros(grid_ns.size, dtype=np.int64)

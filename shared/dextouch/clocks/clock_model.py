@@ -194,10 +194,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
 
 
 def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
-    """Least arrival minus fitted time within five seconds (ten periods), the largest of the take.
-
-    Some samples come promptly even on a busy path; only after a wrong fit all of them are late.
-    """
+    """Least lateness within five seconds (ten periods), the largest of the take."""
     if len(host) < MIN_PROMPT_SAMPLES:
         return 0.0
     second_ns = max(PROMPT_S * 1e9, MIN_PROMPT_SAMPLES * float(np.median(np.diff(host))))

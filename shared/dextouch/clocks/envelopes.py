@@ -78,10 +78,7 @@ class Line(NamedTuple):
 
 
 class LowerHull:
-    """Incremental lower convex hull of points in order of x; old points can be removed.
-
-    Holds at most `MAX_VERTICES` vertices: beyond that every second inner one is dropped.
-    """
+    """Incremental lower convex hull, at most `MAX_VERTICES`; old points can be removed."""
 
     def __init__(self) -> None:
         self._vertices: deque[tuple[float, float]] = deque()
@@ -359,10 +356,7 @@ class RunningEnvelope:
 
 
 class Rhythm:
-    """Regularity of a timer-driven device's stamps: whole periods apart, even with lost samples.
-
-    Only a jump of its clock, or a restart of the timer, gives an irregular distance.
-    """
+    """Regularity of a timer's stamps: whole periods apart, but where it jumps or restarts."""
 
     def __init__(self) -> None:
         self._distances: list[float] = []

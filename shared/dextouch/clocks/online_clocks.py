@@ -166,10 +166,7 @@ class OnlineClock:
 
 
 class DeviceCounter:
-    """Continuous device time of stamps or sequence numbers, in multiples of `resolution_ns`.
-
-    The first sample decides: stamps, unless they are coarser than a quarter of the period.
-    """
+    """Continuous device time of stamps or, where these are coarse, of sequence numbers."""
 
     def __init__(self, descriptor: StreamDescriptor | None) -> None:
         self._descriptor = descriptor
@@ -352,10 +349,7 @@ class CountedTake:
 
 
 def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
-    """Estimate the sample times of a steady device from its arrivals [n] alone, which are in order.
-
-    The nominal period is accurate within a few percent. Raises InvalidInputError as `advance`.
-    """
+    """Sample times of a steady device (nominal period within percents) from arrivals [n] alone."""
     clock = CountingClock(period_ns)
     counted: list[CountedSample] = []
     for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
@@ -373,10 +367,7 @@ def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """One exchange: request sent and reply received on the local clock, the rest on the remote.
-
-    A device that only reports its time has two equal remote stamps.
-    """
+    """One exchange: request sent and reply received here, the rest, or one stamp, remotely."""
 
     sent_ns: int
     remote_received_ns: int
@@ -501,10 +492,7 @@ class RoundTripClock:
     def latency(
         self, *, t_remote_ns: int, t_estimated_ns: int, skew: KnownSkew | None = None
     ) -> PathLatency:
-        """Path latency that is still contained in a device's corrected times.
-
-        It comes from a sample's device time, and its time by `OnlineClock` or `fit_clock`.
-        """
+        """Latency in a sample's time by `OnlineClock` or `fit_clock`, from its device time."""
         offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns
         return PathLatency(t_estimated_ns - true_ns, offset.sigma_ns)

@@ -59,10 +59,7 @@ class FingerTable(NamedTuple):
 
 @dataclass(frozen=True)
 class _Chains:
-    """Hinges of the fingers of one hand or, with a further first axis, of several alike.
-
-    Fingers are padded to the longest one; `is_joint` is the mask of existing hinges.
-    """
+    """Hinges, padded to the longest finger, of one hand or, with a first axis, of several."""
 
     is_joint: Bool[np.ndarray, "*hands fingers hinges"]
     offsets: Float64[np.ndarray, "*hands fingers hinges 4 4"]

@@ -57,10 +57,7 @@ def chain_indices(chain: str) -> list[int]:
 
 
 def solver_indices(chain: str) -> list[int]:
-    """The four keypoints of a chain that a 4-joint finger can follow: MCP, PIP, DIP, tip.
-
-    For the thumb: metacarpal (CMC), proximal (MCP), distal (IP), tip.
-    """
+    """Keypoints that a 4-joint finger follows: MCP, PIP, DIP, tip (thumb: CMC, MCP, IP, tip)."""
     return chain_indices(chain)[-4:]
 
 

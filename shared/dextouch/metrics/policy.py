@@ -1,7 +1,4 @@
-"""Agreement between policy scores in reality and in imagination: correlations, MMRV, bias.
-
-Arguments are keyword-only, since MMRV is not symmetric. Undefined values are NaN.
-"""
+"""Agreement between policy scores in reality and in imagination; NaN where undefined."""
 
 from typing import Final
 

@@ -66,10 +66,7 @@ def psnr(
     peak_kpa: float = PEAK_KPA,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> float:
-    """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
-
-    Pooled, since samples of an untouched hand are mostly exact: the cap would dominate a mean.
-    """
+    """10 log10(peak² / MSE) in dB, at most 100, of the pooled MSE, as most samples are exact."""
     a, b = _pair(predicted_kpa, true_kpa, "PSNR", measured, layout)
     return float(decibels(np.float64(_mean((a - b) ** 2, measured)), peak=peak_kpa))
 

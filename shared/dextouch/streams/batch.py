@@ -139,10 +139,7 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
 
 
 def frame_body(stream_name: str, body: bytes, num_samples: int, *, number: int) -> bytes:
-    """Put the header of the wire before a body, for example of a spool; raises as `encode_batch`.
-
-    The body is not looked at: the store checks it.
-    """
+    """Put the wire's header before a body, which the store checks; raises as `encode_batch`."""
     _check_count(stream_name, num_samples)
     if not 0 <= number < 1 << 32:
         raise InvalidInputError(f"{stream_name}: got batch number {number}, expected 0 … 2^32 - 1")

@@ -242,10 +242,7 @@ def _extent(poses: np.ndarray) -> tuple[float, float]:
 def lasting_jumps(
     t_ns: Int64[np.ndarray, " n"], poses: np.ndarray, *, period_ns: int
 ) -> Int64[np.ndarray, " jumps"]:
-    """Numbers of the samples from which on a tracker's world is another: it found itself anew.
-
-    Poses [n, 7] were all seen, at increasing times, and are without outliers.
-    """
+    """Samples from which on a tracker's world is another, of poses [n, 7] without outliers."""
     if len(poses) < 2:
         return np.zeros(0, dtype=np.int64)
     return np.flatnonzero(_leaps(t_ns, np.asarray(poses, dtype=np.float64), period_ns)) + 1
@@ -327,10 +324,7 @@ def _unit(distance_m: float, speed_m_s: float | None) -> str | None:
 
 
 def _leaps(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.ndarray, " steps"]:
-    """Steps that are too fast, or further than those before and after lead at any acceleration.
-
-    A hand that hits something goes on at the speed before, the one after, or one between.
-    """
+    """Steps that are too fast, or further than those beside lead at any acceleration."""
     leaps = _is_fast(*_speeds(t_ns, poses, period_ns))
     if len(poses) < MIN_STEPS:
         return leaps

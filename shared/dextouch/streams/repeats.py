@@ -233,10 +233,7 @@ def still_parts(
 def _noise_of(
     steps: Float64[np.ndarray, "n parts size"], rounding: float
 ) -> Float64[np.ndarray, " parts"]:
-    """Usual length of second differences where a part is least noisy; 0 of parts without noise.
-
-    Rounded values may rest: they have none, either.
-    """
+    """Usual length of second differences where a part is least noisy; 0 of rounded values."""
     bends = np.diff(steps, axis=0)
     lengths = np.linalg.norm(bends, axis=-1)
     num_blocks, num_parts = len(bends) // NOISE_BLOCK, steps.shape[1]

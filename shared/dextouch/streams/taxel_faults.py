@@ -216,10 +216,7 @@ class TaxelFaults:
         }
 
     def _ended(self) -> Bool[np.ndarray, " taxels"]:
-        """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.
-
-        A stream that is frozen as a whole, and readings at full scale, are none of these.
-        """
+        """Taxels that keep a reading to the end which no pressure gives, or lost their noise."""
         last = np.concatenate(self._keys[-2:])[-2:]
         if len(last) == 2 and last[0] == last[1]:
             return np.zeros(len(self._last), dtype=bool)
