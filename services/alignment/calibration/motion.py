@@ -1,11 +1,9 @@
 """Twists, closed-form calibration of two sensors that move together, and what they must show.
 
 With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
-= Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by
-R_X alone (Park and Martin 1994), which gives the rotation; the translation is linear.
-
-A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(twist) turns T in its
-own frame about its own origin and shifts it along its own axes.
+= Z; two give A X = X B for their motions (Park and Martin 1994). A twist is [..., 6]: rotation
+vector in rad, then translation in m. T · move(twist) turns T in its own frame about its own origin
+and shifts it along its own axes.
 """
 
 from typing import Final, NamedTuple
@@ -442,8 +440,7 @@ class Structure(NamedTuple):
         p_value: how probable so large a ratio is for independent Gaussian errors.
         explained: sum of squares that they explain.
         rest: mean square of what they do not, by each of its `freedom` degrees of freedom.
-        coefficients: of the functions, by least squares.
-        remaining: residuals that they do not explain.
+        coefficients: of the functions; `remaining` are the residuals that they do not explain.
     """
 
     ratio: float

@@ -240,8 +240,7 @@ class TactileCalibration:
     """counts = tare + gain · pressure for each taxel, in anatomical order, of a glove.
 
     Attributes:
-        num_cells: numbers that the glove sends in each sample.
-        cells: raw cell of each taxel, −1 where the glove has none.
+        cells: raw cell, of `num_cells` in a sample, of each taxel, −1 where the glove has none.
         tare_counts: in the unit of the readings, whose smallest difference is `step`.
         gain_counts_per_kpa: above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.

@@ -235,11 +235,9 @@ def station_sightings(
 
 
 class MountSession:
-    """Growing set of places, written to a folder as they are kept.
+    """Growing set of places, photos of the board and tracker's poses, as `hand-eye` reads them.
 
-    A place is a photo of the board and the tracker's pose at it, as the command `hand-eye` reads
-    them,
-    so that an ended session can be continued (`is_resumed`); else its places are put aside. Raises
+    An ended session can be continued (`is_resumed`), else its places are put aside. Raises
     NotFoundError: no lens yet; InvalidInputError: an ambiguous board, or another one than before.
 
     Attributes:

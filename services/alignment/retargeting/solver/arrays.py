@@ -215,14 +215,10 @@ class RetargetOptions:
 class Memory(NamedTuple):
     """State that one sample leaves for the next, changed in place.
 
-    Attributes:
-        joints_rad: [F, 6], previous result.
-        alone_rad: [F, 6], what fingers would do if there were no pinch.
-        unsolved_s: [F] since a finger was solved; infinite if it never was.
-        is_behind: [F] whether a finger that was lost is still on its way to where it is tracked.
-        points_m: [F, 4, 3], smoothed; NaN if never seen.
-        bones_m: [F, 3, 3], of `noise_of_bones`.
-        ease: [F, 3], of `ease_bones`.
+    `joints_rad` [F, 6] are the previous result, `alone_rad` what it would be without pinches,
+    `unsolved_s` [F] infinite for fingers never solved, `is_behind` those on the way to where they
+    are tracked again, `points_m` [F, 4, 3] smoothed, NaN if never seen; others as in `solve`,
+    `minimize`.
     """
 
     joints_rad: np.ndarray
