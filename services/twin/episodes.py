@@ -335,12 +335,7 @@ class GridLog:
 
     def trajectory(self) -> HandTrajectory:
         """Trajectory of all recorded steps."""
-        Ts = transform_from_pose(np.stack(self._wrists))
-        joints = np.stack(self._joints)
-        return HandTrajectory(
-            Ts[:, 0],
-            Ts[:, 1],
-            joints[:, 0],
-            joints[:, 1],
-            transform_from_pose(np.stack(self._heads)),
-        )
+        left, right = np.swapaxes(transform_from_pose(np.stack(self._wrists)), 0, 1)
+        joints_left, joints_right = np.swapaxes(np.stack(self._joints), 0, 1)
+        head = transform_from_pose(np.stack(self._heads))
+        return HandTrajectory(left, right, joints_left, joints_right, head)

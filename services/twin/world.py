@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from typing import Any, Final, Literal
@@ -133,13 +133,8 @@ class TwinWorld:
             reached.update((name, 1.0) for name, holds in held if holds)
             if selector.steps == "all" or row == len(actions) - 1:
                 log.draw()
-        after = TwinState(
-            state.task,
-            state.seed,
-            state.step + len(actions),
-            stage.simulation.state(),
-            state.anchor,
-        )
+        physics = stage.simulation.state()
+        after = replace(state, step=state.step + len(actions), physics=physics)
         seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
         info = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
         return SteppedRollout(after, seen, info)

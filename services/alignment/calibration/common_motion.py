@@ -69,10 +69,9 @@ class PairOffset:
 
 @dataclass(frozen=True)
 class SharedTimes:
-    """Delays of streams after a reference, which has 0.
+    """Delays of streams after a reference, which has 0, and the pairs of streams they come from.
 
-    `pairs` are the measured offsets, `unusable` says why others are not, `loop_sigmas` is the
-    largest error of a loop of three of them, in standard deviations; 0 without a loop.
+    `unusable` says why pairs are missing; `loop_sigmas` is the largest error of a loop of three.
     """
 
     reference: str

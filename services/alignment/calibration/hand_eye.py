@@ -102,8 +102,7 @@ class HandEyeResult(PoseEstimate):
 class BoardViews:
     """Detected corners of a board in several views, and the camera's K and distortion.
 
-    `points_board` are [k ≥ 4, 3] corners of each view in board coordinates (m), `pixels_px` [k, 2]
-    where they were seen; the distortion is k1 k2 p1 p2 k3.
+    `points_board` are [k ≥ 4, 3] corners of each view (m), `pixels_px` [k, 2] where they were seen.
     """
 
     points_board: Sequence[np.ndarray]

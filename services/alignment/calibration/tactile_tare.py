@@ -66,8 +66,7 @@ MAX_ZERO_KPA = 100.0
 class Level:
     """Constant level of each cell over a take: mean of the readings without accidental contact.
 
-    `sigma_counts` is of that mean: noise, slow noise and the rounding to whole counts;
-    `noise_counts` the standard deviation of one reading; `clipped` the share of excluded readings.
+    `sigma_counts` is of that mean, `noise_counts` of one reading, `clipped` the share left out.
     """
 
     mean_counts: Float64[np.ndarray, " cells"]

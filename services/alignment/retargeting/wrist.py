@@ -472,10 +472,9 @@ def anchored_joints(
     offset_m: np.ndarray,
     shares: np.ndarray,
 ) -> Float64[np.ndarray, "time 20"]:
-    """Joint angles, inside the limits, that move fingertips in contact to the human positions.
+    """Joint angles [T, 20], inside the limits, that move fingertips in contact to the person's.
 
-    Retargeted angles are [T, 20], `offset_m` [T, 3] that of the robot's wrist (`touch_offsets_m`),
-    `shares` [T, 5] of the distance that each tip is moved.
+    They are moved by `shares` [T, 5] of the distance; the robot's wrist by `offset_m` [T, 3].
     """
     joints = np.array(joints_rad, dtype=np.float64)
     share = np.where(points.seen[:, :NUM_FINGERS], shares, 0.0)

@@ -62,10 +62,9 @@ TILTS = {
 
 @dataclass(frozen=True)
 class BoardView:
-    """Corners of the board detected in one photo.
+    """Corners of the board, whose print is `pattern`, in one photo; `is_blurred` ones are left out.
 
-    `points_board` are positions on the board (m), `pixels` follow OpenCV: the centre of the first
-    pixel is 0, 0. `pattern` is the board's print. `is_blurred` photos must be excluded.
+    `points_board` are in m, `pixels` follow OpenCV: the centre of the first pixel is 0, 0.
     """
 
     name: str

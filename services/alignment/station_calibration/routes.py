@@ -282,11 +282,8 @@ def _wanted(streams: Sequence[str]) -> list[str]:
             names += [f"T_tracker_{tracker}_camera_{subject}"] if tracker else []
         elif kind == "keypoints":
             names.append(profile_name(subject))
-    return sorted(names, key=lambda name: ("tactile", "K_", "T_", "hand").index(_group(name)))
-
-
-def _group(name: str) -> str:
-    return next(group for group in ("tactile", "K_", "T_", "hand") if name.startswith(group))
+    groups = ("tactile", "K_", "T_", "hand")
+    return sorted(names, key=lambda name: [not name.startswith(group) for group in groups])
 
 
 def _item(

@@ -56,8 +56,7 @@ PRACTICE = "practice"
 TIME_TASK, SHAKE_S, LEAD_S = "calibrate-time", 10.0, 3.0
 SIDES, EVERYTHING = ("left", "right"), "all"
 
-# Below the address of a station, that of its practice devices.
-PRACTICE_PATH = "/practice"
+PRACTICE_PATH = "/practice"  # of practice devices, below the address of their station
 _NO_QUESTION: dict[str, object] = {
     "question": "",
     "action": "",

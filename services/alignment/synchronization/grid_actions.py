@@ -71,8 +71,7 @@ class GriddedStreams:
 class GridActions:
     """Actions on the grid; `commanded` is None where nothing was commanded.
 
-    `absent` are the parts of actions that no step has, `unseen_fingers` the steps of each side at
-    which a finger was in a gap of its own.
+    `absent` parts have no step, `unseen_fingers` are steps at which a finger was in a gap.
     """
 
     anchor: AnchorPoses

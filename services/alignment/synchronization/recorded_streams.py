@@ -88,10 +88,9 @@ class LoadedStream:
 
 @dataclass(frozen=True)
 class DatedStream:
-    """One stream on the host's clock, whose values are read on demand.
+    """One stream on the host's clock, as in the episode, whose values are read on demand.
 
-    The descriptor is that of the episode, `calibration` matrices that it carries besides; keypoints
-    that are `unseen` become NaN, `implausible` samples were found on the way.
+    Keypoints that are `unseen` become NaN, `implausible` samples were found on the way.
     """
 
     recording: RecordingReader
