@@ -125,7 +125,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 
 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
-    """Commands of a take: smoothstep between waypoints, whose times increase, constant beside."""
+    """Commands of a take: smoothstep between waypoints at increasing times, else constant."""
     times = np.array([waypoint.time_s for waypoint in waypoints])
     if len(times) < 2 or (np.diff(times) <= 0).any():
         raise InvalidInputError(

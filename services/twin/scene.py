@@ -383,7 +383,7 @@ class Geometry:
     def on_the_same_level(
         self, poses: Float64[np.ndarray, "objects 7"], sizes: Sizes, boxes_m: np.ndarray
     ) -> Float64[np.ndarray, "objects 7"]:
-        """Poses with the lowest point of resized objects, of usual `boxes_m`, as planned."""
+        """Poses that keep the lowest point of each resized object, usually `boxes_m`."""
         placed = np.array(poses)
         up = transform_from_pose(placed)[:, 2, :3]
         low_m = [

@@ -222,7 +222,7 @@ class Mix:
             )
 
     def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
-        """Copy with other shares, 0 … 1 in all, of misses, or takes that stop or never start."""
+        """Copy with another share, 0 … 1, of misses, or of takes that stop or never start."""
         given = {} if miss is None else {"miss": miss}
         if still is not None:
             given |= {"frozen": 0.5 * still, "hold": 0.5 * still}

@@ -117,7 +117,7 @@ class TwinWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
-        """See `World`; the hands and the head follow. Reports milestones that were reached."""
+        """See `World`; hands and head follow the actions. Reports milestones reached."""
         del seed
         commands = poses_from_actions(actions, state.anchor, where="world twin: actions")
         stage = self.stage(state.task)
@@ -229,7 +229,7 @@ def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
 
 
 def serve(arguments: list[str]) -> None:
-    """Serve both over HTTP until SIGINT or SIGTERM; raises InvalidInputError for settings."""
+    """Serve both over HTTP until SIGINT or SIGTERM; raises InvalidInputError for bad settings."""
     load = partial(load_settings, TwinServiceSettings, arguments)
     settings = load()
     serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin", load=load)

@@ -420,7 +420,7 @@ def mount_progress(
     *,
     views: BoardViews | None = None,
 ) -> MountProgress:
-    """Solve as `solve_hand_eye`, if there are enough views yet, and say what is missing."""
+    """Solve as `solve_hand_eye`, once there are enough views, and say what is missing."""
     num_places = len(Ts_world_tracker)
     if num_places >= MIN_VIEWS:
         names = ("Ts_world_tracker", "Ts_camera_board")

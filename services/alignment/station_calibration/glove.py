@@ -282,7 +282,7 @@ class Guide:
 def record_takes(
     options: argparse.Namespace, guide: Guide | None = None
 ) -> tuple[str, list[PressRow]]:
-    """Lead an operator through rest and presses; returns and keeps the rest take and them."""
+    """Lead an operator through rest and presses; returns the rest take and the presses."""
     if guide is None:
         link = HttpLink(options.url, api_key=options.key)
         recorder = TakeRecorder(link.request, TASK, spool=options.spool, store=options.store)

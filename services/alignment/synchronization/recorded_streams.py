@@ -139,7 +139,7 @@ class DatedStream:
 
 @dataclass
 class EpisodeStream:
-    """A stream of an episode, produced while it is written, when `quality` becomes complete."""
+    """A stream of an episode, produced while it is written; then `quality` is complete."""
 
     descriptor: StreamDescriptor
     blocks: Iterator[Block]

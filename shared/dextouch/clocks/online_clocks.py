@@ -367,7 +367,7 @@ def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """One exchange: request sent and reply received here, the rest, or one stamp, remotely."""
+    """One request with its reply; the remote stamps are equal where a device has only one."""
 
     sent_ns: int
     remote_received_ns: int
@@ -492,7 +492,7 @@ class RoundTripClock:
     def latency(
         self, *, t_remote_ns: int, t_estimated_ns: int, skew: KnownSkew | None = None
     ) -> PathLatency:
-        """Latency in a sample's time by `OnlineClock` or `fit_clock`, from its device time."""
+        """Path latency still contained in a sample's time by `OnlineClock` or `fit_clock`."""
         offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns
         return PathLatency(t_estimated_ns - true_ns, offset.sigma_ns)

@@ -93,7 +93,7 @@ def pose_from_transform(T: np.ndarray) -> Float64[np.ndarray, "*batch 7"]:
 
 
 def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64[np.ndarray, "3 3"]:
-    """K of an ideal camera whose first pixel spans 0 … 1: the principal point is the middle."""
+    """K of an ideal camera with square pixels; the first one spans 0 … 1, so cx = width / 2."""
     focal_px = 0.5 * height_px / np.tan(0.5 * fovy_rad)
     return np.array(
         [[focal_px, 0.0, 0.5 * width_px], [0.0, focal_px, 0.5 * height_px], [0.0, 0.0, 1.0]]

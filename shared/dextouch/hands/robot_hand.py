@@ -59,7 +59,7 @@ class FingerTable(NamedTuple):
 
 @dataclass(frozen=True)
 class _Chains:
-    """Hinges, padded to the longest finger, of one hand or, with a first axis, of several."""
+    """Hinges of one hand's fingers, or several hands', padded to the longest finger."""
 
     is_joint: Bool[np.ndarray, "*hands fingers hinges"]
     offsets: Float64[np.ndarray, "*hands fingers hinges 4 4"]

@@ -161,7 +161,7 @@ class _Bodies:
         return float((sees & (head[:, 2, 1] < -np.cos(MAX_VIEW_RAD))).mean())
 
     def crossed(self) -> float:
-        """By how much (m) the left wrist is right, by x of the head, of the other always; or 0."""
+        """How far (m) the left wrist always is right, by the head's x, of the other; or 0."""
         apart_m = self.at_m(WRISTS[0]) - self.at_m(WRISTS[1])
         aside_m = (apart_m * self.transforms("head")[:, :3, 0]).sum(axis=1)
         always = float((aside_m > MIN_ASIDE_M).mean()) >= ALWAYS_SHARE

@@ -184,7 +184,7 @@ def weigh_bones(work, finger, ease):
 @compiled
 @no_type_check
 def ease_bones(work, finger, ease):
-    """Let bones that the robot cannot turn so weigh less: pseudo-Huber beyond `BONE_BEND_RAD`."""
+    """Give less weight to bones that the robot cannot turn so (pseudo-Huber, `BONE_BEND_RAD`)."""
     measured, usable, point = work.measured[finger], work.usable[finger], work.point[finger]
     base = -1
     for index in range(NUM_POINTS):
