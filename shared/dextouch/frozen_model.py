@@ -1,15 +1,12 @@
-"""Base of pydantic models that are immutable and refuse unknown fields, and files of them."""
+"""Base of pydantic models that are immutable and refuse unknown fields, as almost all of ours."""
 
 import inspect
 import re
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
-
-from dextouch.errors import InvalidInputError, LimitExceededError, NotFoundError, StorageError
 
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n      +.*)*)", re.MULTILINE)
 
@@ -48,24 +45,6 @@ def attribute_docs(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
 def example(**fields: Any) -> ConfigDict:  # noqa: ANN401 - JSON
     """Configuration of a model whose JSON schema shows an example with these fields."""
     return ConfigDict(json_schema_extra={"examples": [fields]})
-
-
-def read_bounded(path: Path, max_bytes: int, *, hint: str = "") -> bytes:
-    """Read a regular file of limited size; `hint` ends the message about a larger one."""
-    try:
-        if not path.exists():
-            raise NotFoundError(f"{path}: no such file")
-        if not path.is_file():
-            raise InvalidInputError(f"{path}: got a folder or device, expected a regular file")
-        with path.open("rb") as file:
-            data = file.read(max_bytes + 1)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(data) > max_bytes:
-        raise LimitExceededError(
-            f"{path}: got more than {max_bytes} bytes, expected at most that{hint}"
-        )
-    return data
 
 
 def first_problem(error: ValidationError) -> str:

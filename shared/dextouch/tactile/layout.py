@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from pydantic import ValidationError
 
+from dextouch.data_folder import read_bounded
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.frozen_model import first_problem, read_bounded
+from dextouch.frozen_model import first_problem
 from dextouch.tactile.description import (
     KPA_PER_UNIT,
     NEWTON,

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
+from dextouch.data_folder import read_bounded
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.frozen_model import FrozenModel, first_problem, read_bounded
+from dextouch.frozen_model import FrozenModel, first_problem
 from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.hands.hand_files.models import (

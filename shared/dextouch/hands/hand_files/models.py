@@ -15,13 +15,13 @@ from xml.parsers import expat
 
 import numpy as np
 
+from dextouch.data_folder import read_bounded
 from dextouch.errors import (
     DegenerateRotationError,
     InvalidInputError,
     LimitExceededError,
     UnknownNameError,
 )
-from dextouch.frozen_model import read_bounded
 from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
 from dextouch.hands.robot_hand import Vector3
