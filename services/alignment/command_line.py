@@ -66,13 +66,13 @@ def main(argv: Sequence[str]) -> int:
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     if parsed.all == bool(parsed.recordings):
         raise InvalidInputError("run: expected either ID … or --all; see run --help")
-    wanted, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
+    recording_ids, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
     if parsed.all:
-        wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
+        recording_ids, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
-    batch = parsed.store, wanted, settings.wanted_options
-    with _bars(console, len(wanted)) as on_progress:
+    batch = parsed.store, recording_ids, settings.wanted_options
+    with _bars(console, len(recording_ids)) as on_progress:
         if parsed.ray is None:
             outcomes = align_batch(*batch, num_workers=parsed.workers, on_progress=on_progress)
         else:
@@ -94,17 +94,17 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress]:
     """A bar for each recording at work and one for all; without a terminal, lines."""
     lines = ProgressLines("align", has_bar=console.is_terminal)
-    shown: dict[str, TaskID] = {}
+    tasks: dict[str, TaskID] = {}
     shares: dict[str, float] = {}
     with Bars(console=console, disable=not console.is_terminal, transient=True) as bars:
         whole = bars.add_task(f"{num_recordings} recordings", total=max(num_recordings, 1))
 
         def on_progress(recording_id: str, progress: Progress) -> None:
-            if recording_id not in shown:
-                shown[recording_id] = bars.add_task(recording_id, total=1.0)
+            if recording_id not in tasks:
+                tasks[recording_id] = bars.add_task(recording_id, total=1.0)
             where = f"{recording_id} {progress.stage} {progress.stream or ''}"
             shares[recording_id] = progress.share
-            bars.update(shown[recording_id], completed=progress.share, description=where)
+            bars.update(tasks[recording_id], completed=progress.share, description=where)
             bars.update(whole, completed=sum(shares.values()))
             num_done = sum(share >= 1 for share in list(shares.values()))
             share = f"{progress.share:.0%}"
@@ -231,14 +231,14 @@ def _align_one(store_url: str, options: AlignmentOptions, recording_id: str) -> 
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
     """Recordings without an episode under these options: ids to align, and what is refused."""
-    wanted, refused = list[str](), list[Outcome]()
+    recording_ids, refused = list[str](), list[Outcome]()
     for recording_id in store.list(kind="recording"):
         try:
             if not store.exists(check_recording(store, recording_id, options)):
-                wanted.append(recording_id)
+                recording_ids.append(recording_id)
         except DexTouchError as error:
             refused.append((recording_id, error))
-    return wanted, refused
+    return recording_ids, refused
 
 
 def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:

@@ -110,12 +110,12 @@ class JobQueue:
             and (not recording_ids or job.recording_id in recording_ids)
         ]
         last = -1 if after is None else list(self._jobs).index(self.get(after).alignment_id)
-        rest = [job for position, job in jobs if position > last]
-        shown = rest[:limit]
+        remaining = [job for position, job in jobs if position > last]
+        page = remaining[:limit]
         return AlignmentList(
-            alignments=tuple(job.with_eta() for job in shown),
+            alignments=tuple(job.with_eta() for job in page),
             num_matching=len(jobs),
-            next_after=shown[-1].alignment_id if len(rest) > limit else None,
+            next_after=page[-1].alignment_id if len(remaining) > limit else None,
         )
 
     def num_jobs(self, state: JobState) -> int:
@@ -236,8 +236,8 @@ class JobDatabase:
         with self._errors("read"), self._guard:
             rows = self._connection.execute(select).fetchall()
         jobs = {}
-        for place, crc32c, body in rows:
-            where = f"{self._path}, job {place}"
+        for position, crc32c, body in rows:
+            where = f"{self._path}, job {position}"
             # A table of others may hold anything, such as nothing at all.
             if not isinstance(body, bytes) or google_crc32c.value(body) != crc32c:
                 raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")

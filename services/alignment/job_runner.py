@@ -333,14 +333,14 @@ class NewRecordings:
 
     def _new(self, listed: Sequence[str]) -> list[str]:
         """Recordings neither submitted nor skipped before, nor found unreadable just now."""
-        there = set(listed)
-        self._deleted |= self._seen - there
-        self._seen &= there
-        self._seen |= (self._jobs.queue.recording_ids & there) - self._deleted
-        self._unreadable = {k: found for k, found in self._unreadable.items() if k in there}
+        listed_ids = set(listed)
+        self._deleted |= self._seen - listed_ids
+        self._seen &= listed_ids
+        self._seen |= (self._jobs.queue.recording_ids & listed_ids) - self._deleted
+        self._unreadable = {k: found for k, found in self._unreadable.items() if k in listed_ids}
         since_s = time.monotonic() - RETRY_S
-        just_now = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}
-        return [item for item in listed if item not in self._seen | just_now]
+        unreadable = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}
+        return [item for item in listed if item not in self._seen | unreadable]
 
     async def _ask(self, recording_id: str, episode_ids: Sequence[str]) -> bool:
         """Submit a recording unless it is to be skipped; False if it cannot be read."""

@@ -201,8 +201,8 @@ def _decided(seen: Sequence[tuple[int, list[_Candidate]]]) -> TrackedObject:
         step = 1 if order.step > 0 else -1
         for index in order:
             near = chosen[index - step]
-            apart_ns = abs(seen[index][0] - seen[index - step][0])
-            if chosen[index] is None and near is not None and apart_ns <= _MAX_APART_NS:
+            gap_ns = abs(seen[index][0] - seen[index - step][0])
+            if chosen[index] is None and near is not None and gap_ns <= _MAX_APART_NS:
                 chosen[index] = _nearest(seen[index][1], near)
     taken = [(t_ns, one) for (t_ns, _), one in zip(seen, chosen, strict=True) if one is not None]
     taken = [one for index, one in enumerate(taken) if not _jumps(taken, index)]

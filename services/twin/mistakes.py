@@ -229,8 +229,8 @@ def _tempo(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
 
 def _pause(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     first, length = draw.uniform(5, 60), 2.0 * MODEL_RATE_HZ * strength
-    waited = np.clip(_STEPS - first, 0, length)
-    return take.at(_both(_STEPS - waited))
+    delay = np.clip(_STEPS - first, 0, length)
+    return take.at(_both(_STEPS - delay))
 
 
 def _finger_time(take: _Take, strength: float, draw: Draw) -> HandTrajectory:

@@ -191,9 +191,9 @@ def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
 
 
 def _retreat(row: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "81 67"]:
-    still = poses_from_actions(np.repeat(row[None], NUM_GRID_STEPS, axis=0), anchor)
+    at_rest = poses_from_actions(np.repeat(row[None], NUM_GRID_STEPS, axis=0), anchor)
     way = np.minimum(np.arange(NUM_GRID_STEPS) / _RETREAT_STEPS, 1.0)
     offset = transform(np.eye(3), (way * way * (3 - 2 * way))[:, None] * _RETREAT_M)
-    left, right = offset @ still.Ts_world_wrist_left, offset @ still.Ts_world_wrist_right
-    moved = replace(still, Ts_world_wrist_left=left, Ts_world_wrist_right=right)
+    left, right = offset @ at_rest.Ts_world_wrist_left, offset @ at_rest.Ts_world_wrist_right
+    moved = replace(at_rest, Ts_world_wrist_left=left, Ts_world_wrist_right=right)
     return actions_from_poses(moved, anchor)

@@ -146,8 +146,8 @@ def _turn_between(
     if corners is None or len(corners) < _LEAST_CORNERS:
         return None
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.zeros_like(corners))
-    again, back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, np.zeros_like(corners))
-    off_px = np.linalg.norm((again - corners)[:, 0], axis=1)
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, np.zeros_like(corners))
+    off_px = np.linalg.norm((returned - corners)[:, 0], axis=1)
     kept = (found[:, 0] > 0) & (back[:, 0] > 0) & (off_px <= _RETURN_PX)
     if np.count_nonzero(kept) < _LEAST_CORNERS:
         return None
@@ -255,14 +255,14 @@ def shared_times(turnings: Mapping[str, Turning], reference: str) -> SharedTimes
             unusable[a, b] = error.message
     names = list(turnings)
     sigmas_ns = _chain_sigmas_ns(names, pairs, reference)
-    lone = [name for name in names if not np.isfinite(sigmas_ns[name])]
-    if lone:
-        reasons = [text for pair, text in unusable.items() if lone[0] in pair]
+    isolated = [name for name in names if not np.isfinite(sigmas_ns[name])]
+    if isolated:
+        reasons = [text for pair, text in unusable.items() if isolated[0] in pair]
         raise DegenerateMotionError(
-            f"times: {', '.join(lone)} turned like no stream that leads to {reference!r} "
+            f"times: {', '.join(isolated)} turned like no stream that leads to {reference!r} "
             f"({reasons[0]}); hold everything together rigidly and shake it briskly about all axes "
             "for ten seconds, or leave the stream out with --streams",
-            streams=lone,
+            streams=isolated,
         )
     loop_sigmas = _check_loops(names, pairs)
     delays_ns, misses_ns = _adjusted_ns(names, pairs, reference)

@@ -196,7 +196,7 @@ def solve_hand_eye(
     agreed = agreeing_views(series)
     if views is None:
         placed = agreed._replace(series=mean_series(agreed.series, place_labels(agreed.series)))
-        own = board_components(placed.predicted, noise)
+        own_noise = board_components(placed.predicted, noise)
     else:
         one_pixel = views.only(agreed.views).measurement(1.0)
         polished = polish(one_pixel, agreed.series.Ts_mounted_target)
@@ -205,8 +205,8 @@ def solve_hand_eye(
         placed = agreed._replace(series=mean_series(agreed.series, labels))
         information = np.zeros((labels.max() + 1, 6, 6))
         np.add.at(information, labels, one_pixel(polished).information)
-        own = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
-    bundle, sigmas = weighted_bundle(placed, noise, own, scale_sigma=noise.board_scale)
+        own_noise = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
+    bundle, sigmas = weighted_bundle(placed, noise, own_noise, scale_sigma=noise.board_scale)
     _check_scale(bundle, noise.board_scale, names)
     result = HandEyeResult(
         covariance=bundle.covariance[:6, :6],

@@ -286,8 +286,8 @@ def _creep(press: TaxelPress, tare: TaxelTare) -> float:
         tare.select(np.median(part, axis=0) - tare.level.mean_counts)
         for part in np.array_split(np.asarray(press.counts, dtype=np.float64), 2)
     )
-    answering = press.taxels & (first > MIN_MOVE_COUNTS)
-    return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
+    responding = press.taxels & (first > MIN_MOVE_COUNTS)
+    return float(np.median(second[responding] / first[responding] - 1)) if responding.any() else 0.0
 
 
 def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, " taxels"]:
@@ -339,17 +339,17 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
 
 def _check_direction(points: _Points) -> None:
     response = (points.counts[:-1] - points.counts[-1])[points.used[:-1]]
-    answering = np.abs(response) >= MIN_MOVE_COUNTS
-    if points.saturated.any() and not answering.any():
+    responding = np.abs(response) >= MIN_MOVE_COUNTS
+    if points.saturated.any() and not responding.any():
         raise InvalidInputError(
             "gain: every pressed taxel is at full scale; press less, or lower the glove's gain"
         )
-    if not answering.any():
+    if not responding.any():
         raise InvalidInputError(
             f"gain: no pressed taxel moved by {MIN_MOVE_COUNTS:g} counts or more; check that the "
             "presses are those of this glove and side, and that the glove is connected"
         )
-    if (response[answering] < 0).mean() > 0.5:
+    if (response[responding] < 0).mean() > 0.5:
         raise InvalidInputError(
             "gain: counts fall under pressure; the rest take and a pressed take are probably "
             "exchanged, or this glove counts downwards and needs a decoder that inverts it"

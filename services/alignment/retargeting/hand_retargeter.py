@@ -391,9 +391,9 @@ class HandRetargeter:
         if not result.solved.any():
             is_tracked[:] = True
         fingers = zip(self.hand.fingers, is_tracked & ~result.solved.any(axis=0), strict=True)
-        if never := [finger.chain for finger, is_other in fingers if is_other]:
+        if lost := [finger.chain for finger, is_other in fingers if is_other]:
             raise InvalidInputError(
-                f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "
+                f"keypoints of the {self.hand.side} hand: {', '.join(lost)} followed in no sample "
                 "(bones or knuckles are not those of the profile, or nodes are missing); expected "
                 "every finger that is tracked at least once"
             )

@@ -223,30 +223,30 @@ class Guide:
             f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}."
         )
         known: list[tuple[PressRow, TaxelPress]] = []
-        while words := self._answer(NEXT).strip():
-            if words == "drop":
+        while answer := self._answer(NEXT).strip():
+            if answer == "drop":
                 known = known[:-1]
                 self.say(f"{len(known)} presses are left")
                 continue
             try:
-                wanted = parse_press(words, self._options.pressure_sigma)
+                typed = parse_press(answer, self._options.pressure_sigma)
             except (InvalidInputError, UnknownNameError) as error:
                 self.say(error.message)
                 continue
             try:
-                known.append(self._press(wanted, tare))
+                known.append(self._press(typed, tare))
             except InvalidInputError as error:
                 self.say(f"Not used: {error.message}")
                 continue
             self.say(self._known_so_far(tare, [press for _, press in known]))
         return [row for row, _ in known]
 
-    def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
-        target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+    def _press(self, pressure: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
+        target = f"{pressure.pressure_kpa:.4g} kPa on {pressure.pads}"
         self._answer(Question(f"Put {target} and hold still.", f"Record {PRESS_S:g} s"))
 
         def check(take: str) -> tuple[PressRow, TaxelPress]:
-            row = wanted.model_copy(update={"take": take})
+            row = pressure.model_copy(update={"take": take})
             press = press_of(row, self._options)
             fit_gain(tare, [press], full_scale_counts=self._full_scale(tare))
             return row, press

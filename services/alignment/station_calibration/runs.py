@@ -275,14 +275,14 @@ class GuidedRun:
     def answer(self, text: str) -> RunStatus:
         """Answer the question of the run; raises ConflictError without, or InvalidInputError."""
         with self._lock:
-            asked = self._status
-            if asked.state != "asking":
-                raise ConflictError(f"calibration run: {asked.state}, it asks nothing")
-            known = ("", *(choice.answer for choice in asked.choices))
-            if not asked.takes_text and text not in known:
+            status = self._status
+            if status.state != "asking":
+                raise ConflictError(f"calibration run: {status.state}, it asks nothing")
+            known = ("", *(choice.answer for choice in status.choices))
+            if not status.takes_text and text not in known:
                 raise InvalidInputError(
                     f"calibration run: got the answer {text!r}, expected one of {list(known)}; an "
-                    f"empty one starts {asked.action!r}"
+                    f"empty one starts {status.action!r}"
                 )
             self._set(state="running", **_NO_QUESTION)
             self._answers.put(text)

@@ -49,16 +49,16 @@ def measure_times(options: argparse.Namespace, *, say: Say = print) -> dict[str,
     cameras = dict(reader.attributes.calibration)
     if (options.to / MATRICES_FILE).exists():
         cameras |= read_matrices(options.to)
-    wanted = None
+    selected = None
     if options.streams is not None:
-        wanted = [name.strip() for name in options.streams.split(",")]
-    unknown = sorted(set(wanted or ()) - set(reader.streams))
+        selected = [name.strip() for name in options.streams.split(",")]
+    unknown = sorted(set(selected or ()) - set(reader.streams))
     if unknown:
         raise NotFoundError(f"{where}: has no {', '.join(unknown)}, only {sorted(reader.streams)}")
     turnings: dict[str, Turning] = {}
     left_out: dict[str, str] = {}
     for name in reader.streams:
-        if wanted is not None and name not in wanted:
+        if selected is not None and name not in selected:
             continue
         found = _turning(reader, name, cameras, where)
         if isinstance(found, str):

@@ -326,10 +326,10 @@ def _find_stretch(
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes, streams = recording.attributes, {n: one.stream for n, one in checked.items()}
     where = f"recording {attributes.recording_id!r}"
-    wanted = [*ACTION_STREAMS[attributes.domain], *commanded_streams(streams)]
+    names_of_action = [*ACTION_STREAMS[attributes.domain], *commanded_streams(streams)]
     if attributes.domain == "human" and options.wrist == "touch":
-        wanted += TOUCH_STREAMS
-    names = [name for name in wanted if name in streams]
+        names_of_action += TOUCH_STREAMS
+    names = [name for name in names_of_action if name in streams]
     parts = {}
     for number, name in enumerate(names):
         on_progress(progress_within("placing", number / len(names), name))

@@ -399,24 +399,26 @@ def marker_streams(
     calibration = recording.attributes.calibration
     K = np.array(calibration["K_head"])
     tracker = MarkerTracker(listed, objects.dictionary, K, distortion_of(calibration, "head"))
-    wanted = np.flatnonzero(
+    selected = np.flatnonzero(
         (camera.t_ns >= inside_ns[0] - period_ns) & (camera.t_ns <= inside_ns[1] + period_ns)
     )
-    places, Ts = _camera_poses(streams["head"], camera.t_ns, wanted, max_gap_ns)
+    places, Ts = _camera_poses(streams["head"], camera.t_ns, selected, max_gap_ns)
     for low in range(0, len(places), _DECODED_AT_ONCE):
         part = places[low : low + _DECODED_AT_ONCE]
         kept = camera.timing.kept[part]
         damaged = recording.damaged_images(HEAD_CAMERA, kept)
         whole = np.isin(kept, damaged, invert=True)
         images = recording.images_at(HEAD_CAMERA, kept[whole])
-        here = Ts[low : low + _DECODED_AT_ONCE][whole]
-        for t_ns, image, T in zip(camera.t_ns[part[whole]].tolist(), images, here, strict=True):
+        Ts_of_images = Ts[low : low + _DECODED_AT_ONCE][whole]
+        for t_ns, image, T in zip(
+            camera.t_ns[part[whole]].tolist(), images, Ts_of_images, strict=True
+        ):
             tracker.add(t_ns - inside_ns[0], image, T)
         on_progress(progress_within("objects", low / len(places), HEAD_CAMERA))
     tracked = tracker.tracked()
     rate_hz = camera.descriptor.nominal_rate_hz
     return [
-        _stream(one, tracked[one.name], rate_hz, camera.t_ns[wanted] - inside_ns[0])
+        _stream(one, tracked[one.name], rate_hz, camera.t_ns[selected] - inside_ns[0])
         for one in listed
         if len(tracked[one.name].t_ns)
     ]
@@ -427,21 +429,21 @@ def _listed(objects: SceneObjects | None) -> tuple[SceneObject, ...]:
 
 
 def _camera_poses(
-    head: DatedStream, image_ns: np.ndarray, wanted: np.ndarray, max_gap_ns: int
+    head: DatedStream, image_ns: np.ndarray, selected: np.ndarray, max_gap_ns: int
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 4 4"]]:
     loaded = head.load()
     finite = np.isfinite(loaded.values).all(axis=1)
     period_ns = head.descriptor.period_ns()
     at = place_on_grid(
         loaded.t_ns[finite],
-        image_ns[wanted],
+        image_ns[selected],
         period_ns=period_ns,
         max_gap_ns=stream_gap_ns(max_gap_ns, period_ns),
     )
     if not at.valid.any():
         return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
     Ts = poses_on_grid(loaded.values[finite], at)
-    return wanted[at.valid], Ts[at.valid]
+    return selected[at.valid], Ts[at.valid]
 
 
 def _stream(

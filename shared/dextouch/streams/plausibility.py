@@ -90,7 +90,7 @@ def implausible_values(
         # Gloves whose sensors are coarse rest, too.
         found = list(implausible_repeats(values, what="keypoints", may_lock=True))
         if values.shape[1:] == (NUM_KEYPOINTS, 3):
-            found += _standing_nodes(values, found)
+            found += _frozen_nodes(values, found)
     elif descriptor.kind == "robot_state" and descriptor.unit == "rad":
         lower_rad, upper_rad = _limits_rad()
         if values.shape[1:] != lower_rad.shape:
@@ -149,7 +149,7 @@ def implausible_poses(
     follows = np.diff(seen_ns) < 1.5 * period_ns
     repeats = list(implausible_repeats(seen, can_rest=can_rest, follows=follows))
     if not can_rest:
-        repeats += _standing(seen, repeats)
+        repeats += _frozen_axes(seen, repeats)
     found += [replace(one, samples=spread(one.samples, known, len(values))) for one in repeats]
     new = known[~np.any([one.samples[known] for one in found], axis=0)] if found else known
     jumps = spread(_outliers(np.asarray(t_ns)[new], values[new], period_ns), new, len(values))
@@ -185,7 +185,7 @@ def _implausible_size(
     return None
 
 
-def _standing_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+def _frozen_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
     """Fingers that repeat what they were, and nodes that stand still though they are noisy."""
     moved, rested = np.zeros((2, *keypoints.shape[:2]), dtype=bool)
     for chain in CHAINS:
@@ -206,7 +206,7 @@ def _standing_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterat
             )
 
 
-def _standing(poses: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+def _frozen_axes(poses: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
     """One axis or the rotation stands still while the others move, or all of it does nearly."""
     flips = (poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0
     turns = poses[:, 3:] * np.cumprod(np.append(1, 1 - 2 * flips))[:, None]

@@ -220,7 +220,7 @@ def still_parts(
         still, harmless = np.zeros((2, len(parts)), dtype=bool)
         for start, stop in _runs(lengths[:, part] < STILL_SHARE * noise[part], MIN_STILL_STEPS):
             goes_on = stop + 1 < len(parts) and (
-                _apart(parts[stop, part], parts[stop + 1, part]) <= MIN_CATCH_UP
+                _distance(parts[stop, part], parts[stop + 1, part]) <= MIN_CATCH_UP
             )
             # What is rounded rests exactly, and goes on where it was.
             if not goes_on or (lengths[start:stop, part] > rounding).any():
@@ -281,7 +281,7 @@ def _frozen(
     for start, stop in long:
         kept = slice(start + 1, stop + 1)
         # What goes on where it was has lost nothing; of what ends so, nobody knows.
-        is_off = stop + 1 == len(rows) or _apart(rows[stop], rows[stop + 1]) > MIN_CATCH_UP
+        is_off = stop + 1 == len(rows) or _distance(rows[stop], rows[stop + 1]) > MIN_CATCH_UP
         is_lost = is_noisy and is_off and not may_lock
         frozen[kept] = is_lost or _catches_up(rows, is_next, start, stop)
         harmless[kept] = is_noisy and not frozen[stop]
@@ -316,7 +316,7 @@ def _is_noisy(rows: np.ndarray, equal: np.ndarray) -> bool:
     return len(cosines) >= MIN_STEPS / 3 and bool(np.median(cosines) < MAX_NOISE_COSINE)
 
 
-def _apart(some: np.ndarray, other: np.ndarray) -> float:
+def _distance(some: np.ndarray, other: np.ndarray) -> float:
     return float(np.linalg.norm(other.astype(np.float64) - some))
 
 
