@@ -167,14 +167,12 @@ def fisheye_rms_px(
         | cv2.fisheye.CALIB_FIX_SKEW
         | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
     )
-    boards, corners = (
+    boards, seen = (
         [np.asarray(one, dtype=np.float64)[None] for one in series]
         for series in (points_board, pixels)
     )
     try:
-        rms_px, *_ = cv2.fisheye.calibrate(
-            boards, corners, size_px, guess, np.zeros(4), flags=flags
-        )
+        rms_px, *_ = cv2.fisheye.calibrate(boards, seen, size_px, guess, np.zeros(4), flags=flags)
     except cv2.error:
         return float("inf")
     return float(rms_px)
@@ -188,10 +186,10 @@ def _calibrated(
 ) -> _Camera:
     K, distortion = (np.eye(3), np.zeros(NUM_DISTORTION)) if start is None else start[:2]
     flags = 0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS
-    boards, corners = ([one.astype(np.float32) for one in series] for series in (points, pixels))
+    boards, seen = ([one.astype(np.float32) for one in series] for series in (points, pixels))
     try:
         _, K, distortion, turns, shifts, _, _, by_photo = cv2.calibrateCameraExtended(
-            boards, corners, size_px, K.copy(), distortion.copy(), flags=flags
+            boards, seen, size_px, K.copy(), distortion.copy(), flags=flags
         )
     except cv2.error as error:
         raise InvalidInputError(

@@ -409,10 +409,8 @@ def marker_streams(
         damaged = recording.damaged_images(HEAD_CAMERA, kept)
         whole = np.isin(kept, damaged, invert=True)
         images = recording.images_at(HEAD_CAMERA, kept[whole])
-        Ts_of_images = Ts[low : low + _DECODED_AT_ONCE][whole]
-        for t_ns, image, T in zip(
-            camera.t_ns[part[whole]].tolist(), images, Ts_of_images, strict=True
-        ):
+        poses = Ts[low : low + _DECODED_AT_ONCE][whole]
+        for t_ns, image, T in zip(camera.t_ns[part[whole]].tolist(), images, poses, strict=True):
             tracker.add(t_ns - inside_ns[0], image, T)
         on_progress(progress_within("objects", low / len(places), HEAD_CAMERA))
     tracked = tracker.tracked()
