@@ -22,8 +22,8 @@ from dextouch.metrics.tactile import contact_f1
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, CopyFirstWorld, World
-from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
+from services.twin.stage import script_name, scripted_actions
 from services.twin.tasks import TASK_NAMES
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint

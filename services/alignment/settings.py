@@ -155,11 +155,7 @@ class AlignmentSettings(ServiceSettings):
 
     @cached_property
     def wanted_options(self) -> AlignmentOptions:
-        """The options, with the objects of the file.
-
-        Raises:
-            NotFoundError, InvalidInputError: as `SceneObjects.load`.
-        """
+        """The options, with the objects of the file; raises as `SceneObjects.load`."""
         if self.objects is None:
             return self.options
         return self.options.model_copy(update={"objects": SceneObjects.load(self.objects)})

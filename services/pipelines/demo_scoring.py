@@ -20,7 +20,7 @@ from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data
 from services.pipelines.parsers import TASKS, DemoPlan
 from services.pipelines.study import demonstrator
-from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
+from services.twin.stage import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.command_line import run_train
 from services.world_model.settings import default_checkpoint

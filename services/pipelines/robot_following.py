@@ -17,7 +17,7 @@ from services.alignment.retargeting import (
     warm_up,
 )
 from services.alignment.retargeting.hand_retargeter import calibrated_profile
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     hand_axes_check,

@@ -46,7 +46,7 @@ from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of
-from services.twin.scripted_actions import scripted_actions
+from services.twin.stage import scripted_actions
 from services.world_model.checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.settings import default_checkpoint
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dextouch.episodes import EpisodeStore
-from dextouch.tactile.layout import taxel_areas_m2
+from dextouch.tactile.layout import DEXTOUCH_V1
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -106,7 +106,7 @@ def test_it_looks_before_it_feels(shipped, tmp_path):
         for episode in recorded(tmp_path, miss=True)
         for start in range(0, 65, 8)
     ]
-    areas = taxel_areas_m2()
+    areas = DEXTOUCH_V1.areas_m2
     truth_n = np.stack([(w.tactile_kpa * 1e3) @ areas for w in windows]).max(axis=1)
     future = predict_all(shipped.model, [w.request for w in windows])
     felt_n = ((future.tactile_kpa * 1e3) @ areas).max(axis=1)

@@ -13,7 +13,7 @@ from services.alignment.calibration.hand_eye import solve_robot_base
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.calibration.time_offset import TimeOffset, estimate_tap_offset
 from services.alignment.retargeting.hand_retargeter import profile_name
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrate_wrist,
     calibration_name,
     calibration_record,

@@ -18,7 +18,7 @@ from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.alignment.retargeting.hand_retargeter import calibrated_profile, measure_profile
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     hand_axes_check,

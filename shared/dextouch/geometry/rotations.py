@@ -32,11 +32,8 @@ def _matrices(rows: Sequence[Sequence[npt.ArrayLike]]) -> Float64[np.ndarray, "*
 def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
     """First two columns of rotation matrices [..., 3, 3] (Zhou et al. 2019, CVPR), as [..., 6].
 
-    The identity gives (1, 0, 0, 0, 1, 0).
-
-    Raises:
-        ShapeError: the last two axes are not 3×3.
-        NonFiniteError: NaN or infinity.
+    The identity gives (1, 0, 0, 0, 1, 0). Raises ShapeError: the last two axes are not 3×3;
+    NonFiniteError: NaN or infinity.
     """
     checked = _checked(R, (3, 3), "rotation matrix")
     return np.concatenate([checked[..., :, 0], checked[..., :, 1]], axis=-1)
@@ -45,12 +42,9 @@ def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
 def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
     """Rotation matrices [..., 3, 3] from two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    The columns [..., 6] are linearly independent, of any positive length.
-
-    Raises:
-        DegenerateRotationError: a column is zero or both are parallel.
-        ShapeError: the last axis is not 6.
-        NonFiniteError: NaN or infinity.
+    The columns [..., 6] are linearly independent, of any positive length. Raises
+    DegenerateRotationError: a column is zero or both are parallel; ShapeError: the last axis is not
+    6; NonFiniteError: NaN or infinity.
     """
     checked = _checked(columns, (6,), "6-D rotation")
     first, second = checked[..., :3], checked[..., 3:]
@@ -80,10 +74,7 @@ def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
 
 
 def rotation_from_quaternion(q_wxyz: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices from quaternions [..., 4] (w, x, y, z) of any positive length.
-
-    Raises DegenerateRotationError for one that is (nearly) zero, and as `rotation_to_6d`.
-    """
+    """Rotations of quaternions [..., 4] (w, x, y, z); DegenerateRotationError near zero."""
     q = _checked(q_wxyz, (4,), "quaternion")
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if (norm < 1e-9).any():

@@ -1,9 +1,7 @@
 """A batch of samples as bytes, the same in a spool's log, on the wire and in the store's upload.
 
-The body of a batch is its samples end to end, so that bodies end to end are a body, too. A sample
-is t_host_ns, t_device_ns and sequence as int64, then its values, or of an encoded image its length
-as u32 and its bytes. On the wire a header comes first. All numbers are little endian. See
-docs/wire_format.md.
+A body is samples end to end: t_host_ns, t_device_ns and sequence as int64, then the values, or the
+length (u32) and bytes of an encoded image; little endian. See docs/wire_format.md.
 """
 
 import struct
@@ -73,10 +71,8 @@ def decode_body(
 ) -> SampleBatch:
     """The batch in a body, whose stamps and images are not checked; arrays may be read-only.
 
-    `body` is of `encode_body`, or several end to end; `where` says in errors where it lies.
-
-    Raises:
-        CorruptDataError: the size of the body is not that of so many samples of the stream.
+    `body` is of `encode_body`, or several end to end; `where` says in errors where it lies. Raises
+    CorruptDataError: the size of the body is not that of so many samples of the stream.
     """
     if descriptor.unit in ENCODED_UNITS:
         ends = sample_ends(descriptor, body, num_samples, where=where)
@@ -135,21 +131,15 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
     """Encode 1 … MAX_BATCH_SAMPLES samples for the wire; equal batches give equal bytes.
 
     Values of `jpeg` and `h264` streams are bytes. `number` is that of the batch within its stream,
-    from 0.
-
-    Raises:
-        InvalidInputError: an empty batch, or one of another stream.
-        LimitExceededError: more samples or bytes than one batch may hold.
+    from 0. Raises InvalidInputError: an empty batch, or one of another stream; LimitExceededError:
+    more samples or bytes than one batch may hold.
     """
     check_batch(descriptor, batch)
     return frame_body(descriptor.name, encode_body(descriptor, batch), len(batch), number=number)
 
 
 def frame_body(stream_name: str, body: bytes, num_samples: int, *, number: int) -> bytes:
-    """Put the header of the wire before a body, for example of a spool; raises as `encode_batch`.
-
-    The body is not looked at: the store checks it.
-    """
+    """Put the wire's header before a body, which the store checks; raises as `encode_batch`."""
     _check_count(stream_name, num_samples)
     if not 0 <= number < 1 << 32:
         raise InvalidInputError(f"{stream_name}: got batch number {number}, expected 0 … 2^32 - 1")
@@ -173,10 +163,8 @@ def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> S
 def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> EncodedBatch:
     """Validate bytes of an untrusted source as the expected batch of a stream.
 
-    Raises:
-        PacketError: not a batch of this version, or damaged in transit.
-        LimitExceededError: larger than allowed.
-        InvalidInputError: a batch of another stream or number, or with wrong contents.
+    Raises PacketError: not a batch of this version, or damaged; LimitExceededError: too large;
+    InvalidInputError: a batch of another stream or number, or with wrong contents.
     """
     if len(data) > MAX_BATCH_BYTES:
         raise LimitExceededError(

@@ -1,8 +1,4 @@
-"""Checks whether poses of a head and two wrists can be those of one body.
-
-A single stream does not show feet for metres, mirrored axes or exchanged trackers; head and hands
-together do. Stations apply the checks to the last seconds, alignment to whole recordings.
-"""
+"""Checks whether poses of a head and two wrists can be those of one body, live or recorded."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -116,15 +112,10 @@ def implausible_bodies(
     """The first reason why a head and two wrists cannot be those of one body, None without one.
 
     Heads are upright and look at the hands, a person's hands are within reach, on their own sides,
-    with fingers that point away from the head, and a robot's wrists are where they are commanded.
-    Where that does not hold, but does with another reading of the poses, they are to be read so.
-    Fewer than 60 samples say nothing, and nor do poses without one of the three bodies.
-
-    Args:
-        poses: of the trackers as they were sent, x y z (m) qw qx qy qz, at common times, by stream;
-            those that are commanded, too.
-        to_body: mounts of trackers on their bodies, by stream.
-        of_robot: whether they are a robot's.
+    with fingers that point away from the head, and wrists of a robot (`of_robot`) are where they
+    are commanded. Fewer than 60 samples say nothing, nor do poses without one of the three bodies.
+    `poses` are of the trackers as they were sent, x y z (m) qw qx qy qz, at common times, by
+    stream, with those that are commanded; `to_body` the mounts of trackers on their bodies.
     """
     if min((len(poses.get(name, ())) for name in BODIES), default=0) < MIN_BODY_SAMPLES:
         return None
@@ -170,10 +161,7 @@ class _Bodies:
         return float((sees & (head[:, 2, 1] < -np.cos(MAX_VIEW_RAD))).mean())
 
     def crossed(self) -> float:
-        """By how much (m) the left wrist is right of the right one all the time; 0 if it is not.
-
-        x of the head points to the right.
-        """
+        """How far (m) the left wrist always is right, by the head's x, of the other; or 0."""
         apart_m = self.at_m(WRISTS[0]) - self.at_m(WRISTS[1])
         aside_m = (apart_m * self.transforms("head")[:, :3, 0]).sum(axis=1)
         always = float((aside_m > MIN_ASIDE_M).mean()) >= ALWAYS_SHARE
@@ -254,7 +242,6 @@ def _check_wrists(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
-    """A person's wrists are within reach of the head, but not in the same place."""
     apart_m = {name: bodies.apart_m(name, "head") for name in WRISTS}
     hands_m = bodies.apart_m(*WRISTS)
     near = min(*apart_m.values(), hands_m)
@@ -285,7 +272,6 @@ def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_sides(bodies: _Bodies) -> ImplausibleBody | None:
-    """Hands cross now and then, hardly all the time."""
     if bodies.upright() < RIGHT_SHARE or not (aside_m := bodies.crossed()):
         return None
     text = (

@@ -34,10 +34,7 @@ C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Serialize JSON-like fields and arrays (little endian, C order).
-
-    Raises InvalidInputError for an unsupported dtype, or an integer beyond 64 bits.
-    """
+    """Serialize JSON-like fields and arrays (little endian, C order); raises InvalidInputError."""
     packed = {}
     for name, array in arrays.items():
         ordered = np.ascontiguousarray(array)
@@ -57,9 +54,8 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
 def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Deserialize and validate bytes of an untrusted source; arrays are read-only views into them.
 
-    Raises:
-        LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
-        InvalidInputError: not msgpack, or not of this layout.
+    Raises LimitExceededError: more bytes, arrays, or items of lists and maps than allowed;
+    InvalidInputError: not msgpack, or not of this layout.
     """
     message = unpack_bounded(data, max_bytes=max_bytes, what="body")
     if (
@@ -148,10 +144,7 @@ def array_of(
 
 
 def pack_openpi(message: Mapping[str, Any]) -> bytes:
-    """Serialize nested maps and lists of plain values and arrays.
-
-    Raises InvalidInputError for a value that msgpack does not hold.
-    """
+    """Serialize nested maps and lists of plain values and arrays; raises InvalidInputError."""
     try:
         return msgpack.packb(dict(message), default=_encoded)
     except (TypeError, OverflowError) as error:
@@ -161,9 +154,8 @@ def pack_openpi(message: Mapping[str, Any]) -> bytes:
 def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
     """Deserialize a message of an untrusted source; arrays are read-only views into it.
 
-    Raises:
-        LimitExceededError: more bytes or items than allowed.
-        InvalidInputError: not msgpack, not a map with text keys, or an invalid array.
+    Raises LimitExceededError: more bytes or items than allowed; InvalidInputError: not msgpack, not
+    a map with text keys, or an invalid array.
     """
 
     def of_map(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - a map, an array or a number

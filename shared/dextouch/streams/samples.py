@@ -173,11 +173,8 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
     """Check that a batch matches its stream, and that `t_host_ns` never decreases.
 
     Values have the descriptor's dtype and shape; for the units `jpeg` and `h264` they are an object
-    array of bytes.
-
-    Raises:
-        ShapeError: another dtype or shape.
-        InvalidInputError: stamps that go back, or invalid image data.
+    array of bytes. Raises ShapeError: another dtype or shape; InvalidInputError: stamps that go
+    back, or invalid image data.
     """
     values, name = batch.values, descriptor.name
     for stamp in ("t_host_ns", "t_device_ns", "sequence"):
@@ -225,9 +222,8 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
 def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
     """Check an encoded image of a stream with the unit `jpeg`, or `h264` (its start code alone).
 
-    Raises:
-        ShapeError: not bytes, or a JPEG image of another size.
-        InvalidInputError: another format.
+    Raises ShapeError: not bytes, or a JPEG image of another size; InvalidInputError: another
+    format.
     """
     if not isinstance(data, bytes):
         raise ShapeError(f"{where} is {type(data).__name__}, expected bytes")
@@ -260,10 +256,7 @@ RESIDUAL_SHARES: Final = (0.25, 0.5)
 
 
 def residual_limits_s(counted_period_s: float | None) -> tuple[float, float]:
-    """From where on the scatter of arrivals is a warning and an error.
-
-    `counted_period_s` is that of a stream that is dated by counting its samples; None of others.
-    """
+    """Scatter of arrivals that is a warning and an error; of counted streams by their period."""
     warn_s, error_s = RESIDUAL_WARN_S, RESIDUAL_ERROR_S
     if counted_period_s is None:
         return warn_s, error_s

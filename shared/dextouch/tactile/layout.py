@@ -2,11 +2,7 @@
 
 Anatomical order of the taxels, the same for both hands: pad by pad, the fingers from the thumb to
 the little one, then the palm. Inside every pad axis 0 runs from distal to proximal and axis 1 from
-radial (thumb side) to ulnar, so that a left and a right hand doing the same thing give the same
-numbers.
-
-How many taxels there are, and where, is a fact of the glove: a `TactileLayout`. `DEXTOUCH_V1` is
-that of streams and episodes that name no other; `read_layout` reads another one from a file.
+radial (thumb side) to ulnar. `DEXTOUCH_V1` is that of streams and episodes that name no other.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from pydantic import ValidationError
 
-from dextouch.errors import (
-    InvalidInputError,
-    LimitExceededError,
-    NonFiniteError,
-    NotFoundError,
-    ShapeError,
-    StorageError,
-    UnknownNameError,
-)
+from dextouch.data_folder import read_bounded
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.frozen_model import first_problem
 from dextouch.tactile.description import (
     KPA_PER_UNIT,
     NEWTON,
@@ -62,10 +52,7 @@ _EMPTY = np.array((247, 247, 245), dtype=np.uint8)
 
 
 class TactileLayout(LayoutDescription):
-    """Layout of a tactile glove, with what it means for arrays of readings.
-
-    Taxels are those of one hand in anatomical order, the last axis of arrays.
-    """
+    """Layout of a tactile glove for arrays whose last axis are taxels in anatomical order."""
 
     @classmethod
     def of(cls, description: LayoutDescription | None) -> "TactileLayout | None":
@@ -80,10 +67,7 @@ class TactileLayout(LayoutDescription):
 
     @cached_property
     def nominal_kpa_per_unit(self) -> Float64[np.ndarray, " taxels"] | None:
-        """Pressure of one unit of each taxel's reading; None where only calibration knows it.
-
-        Read-only.
-        """
+        """Pressure of a unit of each taxel, None if only calibration knows it; read-only."""
         if self.unit == NEWTON:
             return _read_only(1.0 / (_PASCAL_PER_KPA * self.areas_m2))
         scale = KPA_PER_UNIT.get(self.unit, self.kpa_per_unit)
@@ -97,21 +81,13 @@ class TactileLayout(LayoutDescription):
         }
 
     def raw_indices(self, side: Side) -> Int64[np.ndarray, " taxels"]:
-        """Raw cell of each taxel; read-only.
-
-        Raises:
-            UnknownNameError: unknown side.
-        """
+        """Raw cell of each taxel, read-only; raises UnknownNameError for another side."""
         if side not in SIDES:
             raise UnknownNameError("side", side, list(SIDES))
         return self._indices[side]
 
     def check(self, taxels: np.ndarray, *, what: str = "taxels") -> np.ndarray:
-        """The array, whose last axis must be the taxels of one hand.
-
-        Raises:
-            ShapeError: it is not.
-        """
+        """The array; raises ShapeError unless its last axis is the taxels of one hand."""
         taxels = np.asarray(taxels)
         if taxels.shape[-1:] != (self.num_taxels,):
             raise ShapeError(
@@ -121,12 +97,7 @@ class TactileLayout(LayoutDescription):
         return taxels
 
     def select(self, raw: np.ndarray, *, side: Side) -> np.ndarray:
-        """Taxels in anatomical order of raw readings [..., cells]; dtype is kept.
-
-        Raises:
-            ShapeError: another number of cells.
-            UnknownNameError: unknown side.
-        """
+        """Taxels, dtype kept, of raw readings [..., cells]; raises ShapeError, UnknownNameError."""
         raw = np.asarray(raw)
         if raw.shape[-1:] != (self.num_raw_cells,):
             raise ShapeError(
@@ -135,12 +106,7 @@ class TactileLayout(LayoutDescription):
         return raw[..., self.raw_indices(side)]
 
     def expand(self, taxels: np.ndarray, *, side: Side) -> np.ndarray:
-        """Raw readings [..., cells] from taxels; cells without a taxel are zero.
-
-        Raises:
-            ShapeError: another number of taxels.
-            UnknownNameError: unknown side.
-        """
+        """Raw readings of taxels, other cells zero; raises ShapeError, UnknownNameError."""
         taxels = self.check(taxels)
         raw = np.zeros((*taxels.shape[:-1], self.num_raw_cells), dtype=taxels.dtype)
         raw[..., self.raw_indices(side)] = taxels
@@ -160,11 +126,7 @@ class TactileLayout(LayoutDescription):
         return stacks
 
     def join(self, stacks: Sequence[np.ndarray]) -> np.ndarray:
-        """Taxels from stacks as of `split`.
-
-        Raises:
-            ShapeError: stacks of other pads.
-        """
+        """Taxels from stacks as of `split`; raises ShapeError for stacks of other pads."""
         expected = [(count, *shape) for count, shape in self._stacks]
         if [stack.shape[-3:] for stack in stacks] != expected:
             raise ShapeError(
@@ -175,12 +137,7 @@ class TactileLayout(LayoutDescription):
         return np.concatenate(flat, axis=-1)
 
     def by_part(self, taxels: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
-        """One value for each of `PADS` [..., 6]; 0 of a part without taxels.
-
-        Args:
-            taxels: [..., taxels].
-            reduce: takes pads [..., rows, columns] and the axes to reduce, such as `np.mean`.
-        """
+        """`reduce`, such as `np.mean`, of each of `PADS` [..., 6]; 0 of a part without taxels."""
         stacks = self.split(taxels)
         pads = np.concatenate([reduce(stack, axis=(-2, -1)) for stack in stacks], axis=-1)
         if len(self.pads) == len(PADS):
@@ -201,17 +158,10 @@ class TactileLayout(LayoutDescription):
         return stacks
 
     def pad_forces_n(self, tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
-        """Normal force (N) on thumb … little finger and palm: pressure times area.
+        """Normal force (N) on thumb … little finger and palm: pressure [T, taxels] times area.
 
-        Only taxels in contact count (`in_contact`), so that noise of the others does not add up.
-        The force of a part without taxels is 0.
-
-        Args:
-            tactile_kpa: [T, taxels], anatomical order.
-
-        Raises:
-            ShapeError: not [T, taxels].
-            NonFiniteError: NaN or infinity; a taxel that was not measured is zero.
+        Only taxels in contact count (`in_contact`), so that noise of the others does not add up. It
+        raises ShapeError for other shapes, NonFiniteError for NaN or infinity.
         """
         kpa = np.asarray(tactile_kpa, dtype=np.float64)
         if kpa.ndim != 2 or kpa.shape[1] != self.num_taxels:
@@ -241,11 +191,10 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _dextouch_v1() -> TactileLayout:
-    """Layout of our own glove.
+    """Layout of our own glove, which scans 18 rows × 20 columns.
 
-    It scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side, rows 4–15 the
-    palm row by row, rows 16–17 are unused (40 cells). The left glove is wired as the mirror image:
-    its columns run the other way.
+    Rows 0–3 hold the five fingertips side by side, rows 4–15 the palm, rows 16–17 are unused. The
+    left glove is wired as the mirror image: its columns run the other way.
     """
     scan = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
 
@@ -293,49 +242,19 @@ DEXTOUCH_V1: Final = _dextouch_v1()
 def read_layout(path: Path | str) -> TactileLayout:
     """The layout of a glove from a JSON file (docs/stations.md#layout-of-a-glove).
 
-    Raises:
-        NotFoundError, StorageError: a missing or unreadable file.
-        LimitExceededError: more than 256 KiB.
-        InvalidInputError: no JSON, or no valid layout; the message names file, field, what it
-            holds and what was expected.
+    Raises NotFoundError, StorageError: a missing or unreadable file; LimitExceededError: more than
+    256 KiB; InvalidInputError: no valid layout; the message names file, field, found and expected.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_LAYOUT_BYTES + 1)
-    except FileNotFoundError as error:
-        raise NotFoundError(f"layout {path}: no such file") from error
-    except OSError as error:
-        raise StorageError(f"layout {path}: cannot be read: {error.strerror}") from error
-    if len(data) > MAX_LAYOUT_BYTES:
-        raise LimitExceededError(
-            f"layout {path}: got more than {MAX_LAYOUT_BYTES} bytes, expected at most that"
-        )
+    data = read_bounded(path, MAX_LAYOUT_BYTES)
     try:
         return TactileLayout.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        where = ".".join(map(str, problem["loc"]))
-        message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "missing":
-            message = "got nothing, expected a value"
-        elif problem["type"] != "value_error":
-            message = f"got {problem['input']!r:.80}, expected: {message}"
-        raise InvalidInputError(
-            f"layout {path}: {where}{': ' if where else ''}{message}"
-        ) from error
+        raise InvalidInputError(f"layout {path}: {first_problem(error)}") from error
 
 
 def common_layout(layouts: Sequence[TactileLayout], *, what: str) -> TactileLayout:
-    """The one layout of several streams; `DEXTOUCH_V1` of none.
-
-    Args:
-        layouts: of gloves, streams or episodes.
-        what: they belong to, for the message.
-
-    Raises:
-        InvalidInputError: they are not all the same.
-    """
+    """The one layout of several streams, `DEXTOUCH_V1` of none; raises InvalidInputError."""
     kinds = {layout.fingerprint: layout for layout in layouts}
     if len(kinds) > 1:
         raise InvalidInputError(
@@ -352,25 +271,13 @@ def described(layouts: Sequence[TactileLayout]) -> str:
     )
 
 
-# The same of `dextouch_v1`.
-
-
-def taxel_areas_m2() -> np.ndarray:
-    """Sensing area of each of the 320 taxels in m² (force = pressure × area); read-only."""
-    return DEXTOUCH_V1.areas_m2
-
-
-def raw_indices(*, side: Side, glove_model: str = _V1_NAME) -> Int64[np.ndarray, "320"]:
-    """Raw cell of each taxel; read-only."""
-    return _layout_named(glove_model).raw_indices(side)
+# The promised functions of `dextouch_v1`.
 
 
 def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
 
-    Raises:
-        ShapeError: the last axis is not 360.
-        UnknownNameError: unknown side or glove model.
+    Raises ShapeError: the last axis is not 360; UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).select(raw, side=side)
 
@@ -378,9 +285,7 @@ def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -
 def expand_taxels(taxels: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
 
-    Raises:
-        ShapeError: the last axis is not 320.
-        UnknownNameError: unknown side or glove model.
+    Raises ShapeError: the last axis is not 320; UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).expand(taxels, side=side)
 
@@ -392,25 +297,11 @@ def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
-    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16].
-
-    Raises:
-        ShapeError: other shapes.
-    """
+    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16]; or ShapeError."""
     palm = np.asarray(palm)
     if palm.shape[-2:] != PALM_SHAPE:
         raise ShapeError(f"palm: got shape {palm.shape}, expected [..., 15, 16]")
     return DEXTOUCH_V1.join([np.asarray(fingertips), palm[..., None, :, :]])
-
-
-def pad_forces_n(tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
-    """Normal forces of `TactileLayout.pad_forces_n` for taxels [T, 320]."""
-    return DEXTOUCH_V1.pad_forces_n(tactile_kpa)
-
-
-def hand_canvas(taxels: np.ndarray, *, side: Side) -> Float32[np.ndarray, "28 26"]:
-    """Taxels [320] laid out as a hand on a 28×26 grid; cells without a taxel are NaN."""
-    return DEXTOUCH_V1.hand_canvas(taxels, side=side)
 
 
 def _layout_named(glove_model: str) -> TactileLayout:
