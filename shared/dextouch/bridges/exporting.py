@@ -136,8 +136,12 @@ def heat_map(
 ) -> UInt8[np.ndarray, "*batch rows columns 3"]:
     """Readings of a glove as small RGB pictures of the hand, on the square-root scale of `colour`.
 
-    `values` have taxels, or raw cells, on the last axis; `full_scale` is the reading shown at full
-    brightness, in their unit.
+    Args:
+        values: taxels, or the raw cells, on the last axis.
+        side: of the hand.
+        full_scale: reading shown at full brightness, in the unit of the values.
+        layout: of the glove.
+        is_raw: whether the values are raw cells.
     """
     taxels = layout.select(values, side=side) if is_raw else layout.check(np.asarray(values))
     # Which taxel is in each cell of the canvas, -1 of none; whole numbers are exact in float32.
@@ -183,8 +187,9 @@ class TouchPictures:
 def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Context manager with a temporary path, renamed to `path` when the block succeeds.
 
-    Raises ConflictError: `path` exists, and is a folder or not to be overwritten; StorageError: the
-    write failed.
+    Raises:
+        ConflictError: `path` exists, and is a folder or not to be overwritten.
+        StorageError: the write failed.
     """
     if path.is_dir() or (path.exists() and not overwrite):
         raise ConflictError(

@@ -200,9 +200,11 @@ def stream_names(sources: Sequence[str], mapping: Mapping[str, str]) -> dict[str
     In lower case, every run of other characters than letters and digits becomes one `_`, without
     those at the ends (`/camera/head/image_raw` becomes `camera_head_image_raw`); a name that does
     not begin with a letter gets `s_` before it, and one that is taken `_2`, `_3`, … after it.
-    `mapping` has the sources of chosen names, which come first. Raises UnknownNameError: a mapping
-    to a source that the file does not have; InvalidInputError: a mapping of a name that no stream
-    may have, or of one source twice.
+    `mapping` has the sources of chosen names, which come first.
+
+    Raises:
+        UnknownNameError: a mapping to a source that the file does not have.
+        InvalidInputError: a mapping of a name that no stream may have, or of one source twice.
     """
     names: dict[str, str] = {}
     for name, source in mapping.items():
@@ -310,10 +312,12 @@ def write_recording(
 
     `blocks` are those of all streams with the stream's name, for files in which streams are
     interleaved; without it each stream's own are taken in turn. `refused` is read at the end, when
-    the blocks are taken. Samples out of order within a block are sorted, and both these and
-    repeated stamps are counted in the report. Raises ConflictError if the store has a recording of
-    this id, InvalidInputError without a stream, or for a block that begins before the end of the
-    one before.
+    the blocks are taken. Samples out of order within a block
+    are sorted, and both these and repeated stamps are counted in the report.
+
+    Raises:
+        ConflictError: the store has a recording of this id.
+        InvalidInputError: no stream; or a block that begins before the end of the one before.
     """
     if store.exists(attributes.recording_id, kind="recording"):
         raise ConflictError(

@@ -160,10 +160,12 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
     """Fit a clock model to a whole take by the lower convex hull, non-causally.
 
     Unwrapped device stamps and arrivals on the host's monotonic clock [n] are in order of arrival.
-    Steps and restarts of the device's clock are detected, and segments fitted separately. Raises
-    ClockFitError: `details["cause"]` is "too_few" (below 10 samples), "not_finite" (no integers),
-    "not_increasing" (arrivals go back, or device stamps go back more often than clock steps
-    explain) or "length" (unequal lengths).
+    Steps and restarts of the device's clock are detected, and segments fitted separately.
+
+    Raises:
+        ClockFitError: `details["cause"]` is "too_few" (below 10 samples), "not_finite" (no
+            integers), "not_increasing" (arrivals go back, or device stamps go back more often than
+            clock steps explain) or "length" (unequal lengths).
     """
     device, host = _checked(t_device_ns, t_host_ns)
     device = corrected_stamps(device, host)

@@ -57,8 +57,11 @@ def unwrap_counter(
 
     `hint` is another clock in the same unit [n] (arrival times). It gives the number of wraps in a
     gap longer than a wrap; without it a step of more than half a modulus counts as one wrap, a
-    smaller step back as a step back. Raises ShapeError: not one axis of integers, or a hint of
-    another length; InvalidInputError: a count outside 0 … modulus - 1, or an invalid modulus.
+    smaller step back as a step back.
+
+    Raises:
+        ShapeError: not one axis of integers, or a hint of another length.
+        InvalidInputError: a count outside 0 … modulus - 1, or an invalid modulus.
     """
     counts = np.asarray(raw)
     if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer):
@@ -220,7 +223,12 @@ class DeviceCounter:
 
 
 class CountedSample(NamedTuple):
-    """A counted sample: its number, from 0, and when it left the device, on the host's clock."""
+    """A counted sample.
+
+    Attributes:
+        number: inferred sample number, 0 for the first.
+        t_host_ns: time at which it left the device, on the host's clock.
+    """
 
     number: int
     t_host_ns: int

@@ -101,7 +101,9 @@ class GopEncoder:
     """Persistent encoder of one camera with images of even sides, in groups of pictures.
 
     `rate_hz` is nominal, for players of the stream; the store takes only its own `group_images`.
-    Raises InvalidInputError: an invalid size or invalid settings.
+
+    Raises:
+        InvalidInputError: an invalid size or invalid settings.
     """
 
     def __init__(
@@ -191,8 +193,9 @@ class GopDecoder:
     def frames(self, access_units: Sequence[bytes]) -> Iterator["VideoFrame"]:
         """Decode a group, or its first images, one by one; ends with an error at damage.
 
-        Raises CorruptDataError: an image is damaged or missing, or has another size; `place` in its
-        details is the first image that cannot be trusted.
+        Raises:
+            CorruptDataError: an image is damaged or missing, or has another size; `place` in its
+                details is the first image that cannot be trusted.
         """
         import av
 

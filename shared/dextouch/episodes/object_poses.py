@@ -233,9 +233,11 @@ def clicked_poses(
 
     Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away. If
     they `may_lack_headings`, an object whose second click is missing is unknown, and not refused.
-    Raises UnknownNameError: a task or an object that the file of objects does not have;
-    InvalidInputError: a click outside the image or beside the table, or a missing or too near
-    second click.
+
+    Raises:
+        UnknownNameError: a task or an object that the file of objects does not have.
+        InvalidInputError: a click outside the image or beside the table, or a missing or too near
+            second click.
     """
     listed = listed_objects(about, objects)
     names = [one.name for one in listed]

@@ -161,7 +161,9 @@ def encode_window(window: Window) -> bytes:
 def decode_window(data: bytes, *, max_bytes: int) -> Window:
     """Deserialize and validate a window from an untrusted source; arrays are read-only.
 
-    Raises LimitExceededError: more bytes than allowed; InvalidInputError: not a valid window.
+    Raises:
+        LimitExceededError: more bytes than allowed.
+        InvalidInputError: not a valid window.
     """
     fields, arrays = unpack(data, max_bytes=max_bytes)
     cameras = [name.removeprefix(_IMAGES) for name in arrays if name.startswith(_IMAGES)]
@@ -289,7 +291,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def tactile_layout(self) -> TactileLayout:
         """Layout of the taxels of both hands; `dextouch_v1` where no stream names another one.
 
-        Raises InvalidInputError: the two hands have different ones.
+        Raises:
+            InvalidInputError: the two hands have different ones.
         """
         named = [self.streams.get(f"tactile_{side}") for side in SIDES]
         layouts = [stream.tactile_layout for stream in named if stream is not None]

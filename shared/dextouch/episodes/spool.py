@@ -229,9 +229,11 @@ class SpoolWriter:
 
     After `append` returns, the samples survive a crash of the process; after `flush` with `sync`,
     also a power loss. `attributes.streams` names all streams; `notes` are further small files of a
-    new folder, by name. Raises ConflictError if the folder exists (continue it with
-    `SpoolWriter.resume`), InvalidInputError for a recording without a stream, or with more than
-    MAX_STREAMS.
+    new folder, by name.
+
+    Raises:
+        ConflictError: the folder exists; continue it with `SpoolWriter.resume`.
+        InvalidInputError: a recording without a stream, or with more than MAX_STREAMS.
     """
 
     def __init__(

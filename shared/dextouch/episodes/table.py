@@ -71,9 +71,11 @@ def select_episodes(
 
     Those that were rejected in review and those that lack what is needed, beside actions, are left
     out, counted and logged by reason. A domain of None is people and robots; tasks, splits of their
-    scenes and origins that are empty are all. Raises NotFoundError for an empty store, or without
-    such an episode (what those that there are lack is named), ConflictError for an id in two
-    stores, two episodes of one recording, or other model rates.
+    scenes and origins that are empty are all.
+
+    Raises:
+        NotFoundError: an empty store, or no such episode; what those that there are lack is named.
+        ConflictError: an id in two stores, two episodes of one recording, or other model rates.
     """
     passed_over: Counter[str] = Counter()
     unfit: Counter[str] = Counter()
@@ -188,8 +190,14 @@ class EpisodeGrid:
     """One episode on the model grid, read when it is asked for.
 
     Touch and images, which take the memory, are read anew by each call; only the images that are
-    asked for are decoded. `image_px` is the side that the middle square of larger images is scaled
-    to, None for no scaling; `about` has domain, origin, outcome, event times and so on.
+    asked for are decoded.
+
+    Args:
+        reader: the episode.
+        image_px: side that the middle square of larger images is scaled to; None for no scaling.
+
+    Attributes:
+        about: domain, origin, outcome, event times, names of objects and so on.
     """
 
     def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:

@@ -32,8 +32,11 @@ def _matrices(rows: Sequence[Sequence[npt.ArrayLike]]) -> Float64[np.ndarray, "*
 def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
     """First two columns of rotation matrices [..., 3, 3] (Zhou et al. 2019, CVPR), as [..., 6].
 
-    The identity gives (1, 0, 0, 0, 1, 0). Raises ShapeError: the last two axes are not 3×3;
-    NonFiniteError: NaN or infinity.
+    The identity gives (1, 0, 0, 0, 1, 0).
+
+    Raises:
+        ShapeError: the last two axes are not 3×3.
+        NonFiniteError: NaN or infinity.
     """
     checked = _checked(R, (3, 3), "rotation matrix")
     return np.concatenate([checked[..., :, 0], checked[..., :, 1]], axis=-1)
@@ -42,9 +45,12 @@ def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
 def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
     """Rotation matrices [..., 3, 3] from two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    The columns [..., 6] are linearly independent, of any positive length. Raises
-    DegenerateRotationError: a column is zero or both are parallel; ShapeError: the last axis is not
-    6; NonFiniteError: NaN or infinity.
+    The columns [..., 6] are linearly independent, of any positive length.
+
+    Raises:
+        DegenerateRotationError: a column is zero or both are parallel.
+        ShapeError: the last axis is not 6.
+        NonFiniteError: NaN or infinity.
     """
     checked = _checked(columns, (6,), "6-D rotation")
     first, second = checked[..., :3], checked[..., 3:]

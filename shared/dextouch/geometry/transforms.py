@@ -125,9 +125,14 @@ def bracket(
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Bracket each query time by two sample times (int64 ns, at least two, strictly increasing).
 
-    Returns left index [n] (0 … m-2), weight of the right neighbour [n] in [0, 1], and whether the
-    query lies within the samples and not in a gap above `max_gap_ns`. Raises InvalidInputError:
-    fewer than two samples, or times that do not increase.
+    There is no interpolation between neighbours further apart than `max_gap_ns`.
+
+    Returns:
+        Left index [n] (0 … m-2), weight of the right neighbour [n] in [0, 1], and whether the query
+        lies within the samples and not in a gap.
+
+    Raises:
+        InvalidInputError: fewer than two samples, or times that do not increase.
     """
     t = np.asarray(t_ns, dtype=np.int64)
     at = np.asarray(at_ns, dtype=np.int64)
@@ -220,8 +225,11 @@ def points_on_level(
     """Points [n, 3] of the plane at height z (m) in the world that a camera shows at pixels [n, 2].
 
     The camera is K [3, 3] in pixels, and the distortion [5]; its pose that of the optical frame (x
-    right, y down, z forward). Returns also whether the ray of each pixel meets the plane in front
-    of the camera; others, or pixels to which the lens maps nothing, have NaN.
+    right, y down, z forward).
+
+    Returns:
+        The points, and whether the ray of each pixel meets the plane in front of the camera; rays
+        that do not, or that the lens maps nowhere, have NaN.
     """
     K, distortion = camera
     seen = (np.asarray(pixels, dtype=np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]

@@ -195,8 +195,11 @@ def poses_from_actions(
 ) -> HandTrajectory:
     """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`.
 
-    Messages begin with `where`; `validated` actions come from `check_actions`. Raises ShapeError,
-    NonFiniteError: as `check_actions`; DegenerateRotationError: a 6-D rotation that is none.
+    Messages begin with `where`; `validated` actions come from `check_actions`.
+
+    Raises:
+        ShapeError, NonFiniteError: as `check_actions`.
+        DegenerateRotationError: a 6-D rotation that is none.
     """
     checked = actions if validated else check_actions(actions, where=where)
     Ts_world_x = np.stack(anchor.as_tuple()) @ _poses(checked)

@@ -118,9 +118,17 @@ class _Chains:
 class HandModel:
     """A hand of 1 to 5 fingers with 1 to 6 hinges each, whose name is for messages.
 
-    `joint_names` and joint limits [joints] are finger by finger, from the wrist out. Raises
-    UnknownNameError: a side other than "left" and "right", or an unknown chain; NonFiniteError: NaN
-    or infinity; InvalidInputError: any other invalid table, of the joint that the message names.
+    Attributes:
+        fingers: the tables, which do not change: others are another hand.
+        joint_names: in the order of the joint vector: finger by finger, from the wrist out.
+        lower_rad, upper_rad: joint limits [joints].
+
+    Raises:
+        UnknownNameError: a side other than "left" and "right", or an unknown chain.
+        InvalidInputError: no finger, a chain or name given twice, too few or many hinges, limits
+            that are not an interval, an axis that is not a unit vector, points out of order; the
+            message names the joint.
+        NonFiniteError: NaN or infinity in a table.
     """
 
     def __init__(self, side: str, fingers: Sequence[FingerTable], *, name: str) -> None:
@@ -141,7 +149,11 @@ class HandModel:
         """T_wrist_joint of every hinge after its rotation; [T, 5, 4, 4, 4] for the Wuji hand.
 
         A finger with fewer hinges than another repeats its last frame. Angles [T, J] are in the
-        order of `joint_names`. Raises ShapeError: not [T, J]; NonFiniteError: NaN or infinity.
+        order of `joint_names`.
+
+        Raises:
+            ShapeError: not [T, J].
+            NonFiniteError: NaN or infinity.
         """
         q = np.asarray(joints_rad, dtype=np.float64)
         count = len(self.joint_names)

@@ -58,9 +58,11 @@ def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean structural similarity of images [..., h, w, 3] in 0 … 255, 1 for equal images.
 
     Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255, each
-    channel separately, only where the whole window lies inside the image. Raises ShapeError:
-    different shapes, not [..., h, w, 3], or images smaller than the window; NonFiniteError: NaN or
-    infinity.
+    channel separately, only where the whole window lies inside the image.
+
+    Raises:
+        ShapeError: different shapes, not [..., h, w, 3], or images smaller than the window.
+        NonFiniteError: NaN or infinity.
     """
     a, b = checked_pair(predicted, true, what="SSIM of images", tail=(None, None, 3))
     if min(a.shape[-3:-1]) < SSIM_WINDOW_PX:
@@ -106,8 +108,11 @@ def depth_error(*, predicted_m: np.ndarray, true_m: np.ndarray) -> float:
     """AbsRel after alignment of the scale: mean of abs(s p - t) / t, s = median(t) / median(p).
 
     One scale for all depths [..., h, w] together. Pixels without depth on either side (infinite) do
-    not count. Raises ShapeError: different shapes; InvalidInputError: no pixel with two positive
-    depths.
+    not count.
+
+    Raises:
+        ShapeError: different shapes.
+        InvalidInputError: no pixel with two positive depths.
     """
     p, t = np.asarray(predicted_m, dtype=np.float64), np.asarray(true_m, dtype=np.float64)
     if p.shape != t.shape:

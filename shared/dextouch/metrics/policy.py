@@ -55,7 +55,10 @@ def mmrv(*, real: np.ndarray, imagined: np.ndarray, ties: str = "paper") -> floa
     policies. Both rules count a pair in opposite order; they differ when one side ties. "paper":
     v_ij = 1 only if the differences have opposite signs, so a tie never counts. "simpler": as in
     SimplerEnv, v_ij = 1 if `imagined_i > imagined_j` and `real_i > real_j` differ, so a tie on the
-    imagined side does. Raises UnknownNameError: another tie rule.
+    imagined side does.
+
+    Raises:
+        UnknownNameError: another tie rule.
     """
     a, b = _scores(real, imagined, "MMRV")
     if ties not in TIE_RULES:

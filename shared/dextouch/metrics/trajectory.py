@@ -31,9 +31,11 @@ def trajectory_accuracy(
     nDTW of Ilharco et al. 2019 (arXiv:1907.05446). Unlike path length / DTW it is bounded, also for
     perfect predictions. Missing points of the prediction (NaN) are interpolated, and repeated at
     the ends; with fewer than a tenth of the points the accuracy is 0. `tolerance` is the mean
-    distance at which the accuracy falls to 1/e, in the unit of the points. Raises ShapeError:
-    different shapes; InvalidInputError: missing points of the truth, or a tolerance that is not
-    positive.
+    distance at which the accuracy falls to 1/e, in the unit of the points.
+
+    Raises:
+        ShapeError: different shapes.
+        InvalidInputError: missing points of the truth, or a tolerance that is not positive.
     """
     a, b = np.asarray(predicted, dtype=np.float64), np.asarray(true, dtype=np.float64)
     if a.shape != b.shape or a.ndim != 2:

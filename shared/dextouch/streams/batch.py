@@ -71,8 +71,10 @@ def decode_body(
 ) -> SampleBatch:
     """The batch in a body, whose stamps and images are not checked; arrays may be read-only.
 
-    `body` is of `encode_body`, or several end to end; `where` says in errors where it lies. Raises
-    CorruptDataError: the size of the body is not that of so many samples of the stream.
+    `body` is of `encode_body`, or several end to end; `where` says in errors where it lies.
+
+    Raises:
+        CorruptDataError: the size of the body is not that of so many samples of the stream.
     """
     if descriptor.unit in ENCODED_UNITS:
         ends = sample_ends(descriptor, body, num_samples, where=where)
@@ -131,8 +133,11 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
     """Encode 1 … MAX_BATCH_SAMPLES samples for the wire; equal batches give equal bytes.
 
     Values of `jpeg` and `h264` streams are bytes. `number` is that of the batch within its stream,
-    from 0. Raises InvalidInputError: an empty batch, or one of another stream; LimitExceededError:
-    more samples or bytes than one batch may hold.
+    from 0.
+
+    Raises:
+        InvalidInputError: an empty batch, or one of another stream.
+        LimitExceededError: more samples or bytes than one batch may hold.
     """
     check_batch(descriptor, batch)
     return frame_body(descriptor.name, encode_body(descriptor, batch), len(batch), number=number)
@@ -163,8 +168,10 @@ def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> S
 def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> EncodedBatch:
     """Validate bytes of an untrusted source as the expected batch of a stream.
 
-    Raises PacketError: not a batch of this version, or damaged; LimitExceededError: too large;
-    InvalidInputError: a batch of another stream or number, or with wrong contents.
+    Raises:
+        PacketError: not a batch of this version, or damaged in transit.
+        LimitExceededError: larger than allowed.
+        InvalidInputError: a batch of another stream or number, or with wrong contents.
     """
     if len(data) > MAX_BATCH_BYTES:
         raise LimitExceededError(

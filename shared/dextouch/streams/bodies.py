@@ -112,10 +112,15 @@ def implausible_bodies(
     """The first reason why a head and two wrists cannot be those of one body, None without one.
 
     Heads are upright and look at the hands, a person's hands are within reach, on their own sides,
-    with fingers that point away from the head, and wrists of a robot (`of_robot`) are where they
-    are commanded. Fewer than 60 samples say nothing, nor do poses without one of the three bodies.
-    `poses` are of the trackers as they were sent, x y z (m) qw qx qy qz, at common times, by
-    stream, with those that are commanded; `to_body` the mounts of trackers on their bodies.
+    with fingers that point away from the head, and a robot's wrists are where they are commanded.
+    Where that does not hold, but does with another reading of the poses, they are to be read so.
+    Fewer than 60 samples say nothing, and nor do poses without one of the three bodies.
+
+    Args:
+        poses: of the trackers as they were sent, x y z (m) qw qx qy qz, at common times, by stream;
+            those that are commanded, too.
+        to_body: mounts of trackers on their bodies, by stream.
+        of_robot: whether they are a robot's.
     """
     if min((len(poses.get(name, ())) for name in BODIES), default=0) < MIN_BODY_SAMPLES:
         return None

@@ -54,8 +54,9 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
 def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Deserialize and validate bytes of an untrusted source; arrays are read-only views into them.
 
-    Raises LimitExceededError: more bytes, arrays, or items of lists and maps than allowed;
-    InvalidInputError: not msgpack, or not of this layout.
+    Raises:
+        LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
+        InvalidInputError: not msgpack, or not of this layout.
     """
     message = unpack_bounded(data, max_bytes=max_bytes, what="body")
     if (
@@ -154,8 +155,9 @@ def pack_openpi(message: Mapping[str, Any]) -> bytes:
 def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
     """Deserialize a message of an untrusted source; arrays are read-only views into it.
 
-    Raises LimitExceededError: more bytes or items than allowed; InvalidInputError: not msgpack, not
-    a map with text keys, or an invalid array.
+    Raises:
+        LimitExceededError: more bytes or items than allowed.
+        InvalidInputError: not msgpack, not a map with text keys, or an invalid array.
     """
 
     def of_map(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - a map, an array or a number

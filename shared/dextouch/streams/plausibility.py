@@ -280,8 +280,9 @@ def check_camera_matrix(
 ) -> None:
     """Refuse a camera matrix (px) that no lens before images of width and height `size_px` has.
 
-    Raises InvalidInputError: not finite, not of this form, a principal point far from the middle,
-    or focal lengths below 0.1 or above 20 of its width, or unlike each other.
+    Raises:
+        InvalidInputError: not finite, not of this form, a principal point far from the middle, or
+            focal lengths below 0.1 or above 20 of its width, or unlike each other.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     width, height = size_px

@@ -173,8 +173,11 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
     """Check that a batch matches its stream, and that `t_host_ns` never decreases.
 
     Values have the descriptor's dtype and shape; for the units `jpeg` and `h264` they are an object
-    array of bytes. Raises ShapeError: another dtype or shape; InvalidInputError: stamps that go
-    back, or invalid image data.
+    array of bytes.
+
+    Raises:
+        ShapeError: another dtype or shape.
+        InvalidInputError: stamps that go back, or invalid image data.
     """
     values, name = batch.values, descriptor.name
     for stamp in ("t_host_ns", "t_device_ns", "sequence"):
@@ -222,8 +225,9 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
 def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
     """Check an encoded image of a stream with the unit `jpeg`, or `h264` (its start code alone).
 
-    Raises ShapeError: not bytes, or a JPEG image of another size; InvalidInputError: another
-    format.
+    Raises:
+        ShapeError: not bytes, or a JPEG image of another size.
+        InvalidInputError: another format.
     """
     if not isinstance(data, bytes):
         raise ShapeError(f"{where} is {type(data).__name__}, expected bytes")

@@ -66,8 +66,12 @@ def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
 class TaxelFaults:
     """Sums over readings of a glove, from which faults of its taxels follow.
 
-    Of each taxel there is a tare and a gain; `usable` are those to judge, None of all; `step` is
-    the smallest difference of two readings.
+    Args:
+        tare_counts: of each taxel.
+        gain_counts_per_kpa: of each taxel.
+        usable: taxels that are judged at all; None of all.
+        step: smallest difference of two readings.
+        layout: of the taxels.
     """
 
     def __init__(

@@ -81,13 +81,21 @@ class TactileLayout(LayoutDescription):
         }
 
     def raw_indices(self, side: Side) -> Int64[np.ndarray, " taxels"]:
-        """Raw cell of each taxel, read-only; raises UnknownNameError for another side."""
+        """Raw cell of each taxel; read-only.
+
+        Raises:
+            UnknownNameError: unknown side.
+        """
         if side not in SIDES:
             raise UnknownNameError("side", side, list(SIDES))
         return self._indices[side]
 
     def check(self, taxels: np.ndarray, *, what: str = "taxels") -> np.ndarray:
-        """The array; raises ShapeError unless its last axis is the taxels of one hand."""
+        """The array, whose last axis must be the taxels of one hand.
+
+        Raises:
+            ShapeError: it is not.
+        """
         taxels = np.asarray(taxels)
         if taxels.shape[-1:] != (self.num_taxels,):
             raise ShapeError(
@@ -97,7 +105,12 @@ class TactileLayout(LayoutDescription):
         return taxels
 
     def select(self, raw: np.ndarray, *, side: Side) -> np.ndarray:
-        """Taxels, dtype kept, of raw readings [..., cells]; raises ShapeError, UnknownNameError."""
+        """Taxels in anatomical order of raw readings [..., cells]; dtype is kept.
+
+        Raises:
+            ShapeError: another number of cells.
+            UnknownNameError: unknown side.
+        """
         raw = np.asarray(raw)
         if raw.shape[-1:] != (self.num_raw_cells,):
             raise ShapeError(
@@ -106,7 +119,12 @@ class TactileLayout(LayoutDescription):
         return raw[..., self.raw_indices(side)]
 
     def expand(self, taxels: np.ndarray, *, side: Side) -> np.ndarray:
-        """Raw readings of taxels, other cells zero; raises ShapeError, UnknownNameError."""
+        """Raw readings [..., cells] from taxels; cells without a taxel are zero.
+
+        Raises:
+            ShapeError: another number of taxels.
+            UnknownNameError: unknown side.
+        """
         taxels = self.check(taxels)
         raw = np.zeros((*taxels.shape[:-1], self.num_raw_cells), dtype=taxels.dtype)
         raw[..., self.raw_indices(side)] = taxels
@@ -126,7 +144,11 @@ class TactileLayout(LayoutDescription):
         return stacks
 
     def join(self, stacks: Sequence[np.ndarray]) -> np.ndarray:
-        """Taxels from stacks as of `split`; raises ShapeError for stacks of other pads."""
+        """Taxels from stacks as of `split`.
+
+        Raises:
+            ShapeError: stacks of other pads.
+        """
         expected = [(count, *shape) for count, shape in self._stacks]
         if [stack.shape[-3:] for stack in stacks] != expected:
             raise ShapeError(
@@ -137,7 +159,12 @@ class TactileLayout(LayoutDescription):
         return np.concatenate(flat, axis=-1)
 
     def by_part(self, taxels: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
-        """`reduce`, such as `np.mean`, of each of `PADS` [..., 6]; 0 of a part without taxels."""
+        """One value for each of `PADS` [..., 6]; 0 of a part without taxels.
+
+        Args:
+            taxels: [..., taxels].
+            reduce: takes pads [..., rows, columns] and the axes to reduce, such as `np.mean`.
+        """
         stacks = self.split(taxels)
         pads = np.concatenate([reduce(stack, axis=(-2, -1)) for stack in stacks], axis=-1)
         if len(self.pads) == len(PADS):
@@ -158,10 +185,17 @@ class TactileLayout(LayoutDescription):
         return stacks
 
     def pad_forces_n(self, tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
-        """Normal force (N) on thumb … little finger and palm: pressure [T, taxels] times area.
+        """Normal force (N) on thumb … little finger and palm: pressure times area.
 
-        Only taxels in contact count (`in_contact`), so that noise of the others does not add up. It
-        raises ShapeError for other shapes, NonFiniteError for NaN or infinity.
+        Only taxels in contact count (`in_contact`), so that noise of the others does not add up.
+        The force of a part without taxels is 0.
+
+        Args:
+            tactile_kpa: [T, taxels], anatomical order.
+
+        Raises:
+            ShapeError: not [T, taxels].
+            NonFiniteError: NaN or infinity; a taxel that was not measured is zero.
         """
         kpa = np.asarray(tactile_kpa, dtype=np.float64)
         if kpa.ndim != 2 or kpa.shape[1] != self.num_taxels:
@@ -242,8 +276,11 @@ DEXTOUCH_V1: Final = _dextouch_v1()
 def read_layout(path: Path | str) -> TactileLayout:
     """The layout of a glove from a JSON file (docs/stations.md#layout-of-a-glove).
 
-    Raises NotFoundError, StorageError: a missing or unreadable file; LimitExceededError: more than
-    256 KiB; InvalidInputError: no valid layout; the message names file, field, found and expected.
+    Raises:
+        NotFoundError, StorageError: a missing or unreadable file.
+        LimitExceededError: more than 256 KiB.
+        InvalidInputError: no JSON, or no valid layout; the message names file, field, what it
+            holds and what was expected.
     """
     path = Path(path)
     data = read_bounded(path, MAX_LAYOUT_BYTES)
@@ -254,7 +291,15 @@ def read_layout(path: Path | str) -> TactileLayout:
 
 
 def common_layout(layouts: Sequence[TactileLayout], *, what: str) -> TactileLayout:
-    """The one layout of several streams, `DEXTOUCH_V1` of none; raises InvalidInputError."""
+    """The one layout of several streams; `DEXTOUCH_V1` of none.
+
+    Args:
+        layouts: of gloves, streams or episodes.
+        what: they belong to, for the message.
+
+    Raises:
+        InvalidInputError: they are not all the same.
+    """
     kinds = {layout.fingerprint: layout for layout in layouts}
     if len(kinds) > 1:
         raise InvalidInputError(
@@ -277,7 +322,9 @@ def described(layouts: Sequence[TactileLayout]) -> str:
 def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
 
-    Raises ShapeError: the last axis is not 360; UnknownNameError: unknown side or glove model.
+    Raises:
+        ShapeError: the last axis is not 360.
+        UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).select(raw, side=side)
 
@@ -285,7 +332,9 @@ def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -
 def expand_taxels(taxels: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
     """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
 
-    Raises ShapeError: the last axis is not 320; UnknownNameError: unknown side or glove model.
+    Raises:
+        ShapeError: the last axis is not 320.
+        UnknownNameError: unknown side or glove model.
     """
     return _layout_named(glove_model).expand(taxels, side=side)
 
@@ -297,7 +346,11 @@ def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
-    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16]; or ShapeError."""
+    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16].
+
+    Raises:
+        ShapeError: other shapes.
+    """
     palm = np.asarray(palm)
     if palm.shape[-2:] != PALM_SHAPE:
         raise ShapeError(f"palm: got shape {palm.shape}, expected [..., 15, 16]")

@@ -214,8 +214,11 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     On the model grid when `fps` is the model rate; at the first camera's own stamps when `fps` is
     its rate; otherwise evenly spaced from step 0. Images are the nearest ones that can be decoded,
     tactile values the mean since the frame before; off the model grid poses and joints are
-    interpolated between its steps. Raises InvalidInputError: an episode without steps or with fewer
-    than one frame; NotFoundError: a camera without images.
+    interpolated between its steps.
+
+    Raises:
+        InvalidInputError: an episode without steps or with fewer than one frame.
+        NotFoundError: a camera without images.
     """
     steps = reader.read("action") if reader.num_steps else None
     if steps is None or steps.values.shape[1:] != (ACTION_DIM,):

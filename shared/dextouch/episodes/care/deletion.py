@@ -300,8 +300,9 @@ def delete_for_good(
     whose models may have been trained on the deleted data, are only searched. With `unsent` an
     operator is deleted of whom the store holds nothing, but a station may.
 
-    Raises NotFoundError if nothing in the store matches, and the operator reviewed nothing,
-    InvalidInputError for a receipt path inside the store, where the search would find it.
+    Raises:
+        NotFoundError: nothing in the store matches, and the operator reviewed nothing.
+        InvalidInputError: a receipt path inside the store, where the search would find it.
     """
     if receipt_path.resolve().is_relative_to(root.resolve()):
         raise InvalidInputError(

@@ -64,8 +64,11 @@ OUTCOMES: Mapping[str, bool | None] = {"success": True, "failure": False, "unkno
 class EditOptions:
     """Options that all edits have.
 
-    `new_id` is that of the result, by default `ID-trimmed-1` and so on. With `keep` the source
-    stays where it is, as superseded; otherwise it goes to the trash, if the store has one.
+    Args:
+        new_id: of the result; by default `ID-trimmed-1` and so on.
+        keep: the source stays where it is, as superseded; otherwise it goes to the trash, if the
+            store has one.
+        dry_run: nothing is written.
     """
 
     new_id: str | None = None
@@ -80,9 +83,13 @@ DEFAULTS = EditOptions()
 class Edit:
     """One edit of one item: its name, its lineage, and what it cannot keep.
 
-    `reader` is the source, `word` what the result is, such as `trimmed`, in its id, `operation` has
-    the parameters, as on the command line, and `changes` are attributes that tell the result from
-    that of another edit of this operation.
+    Args:
+        store: of the source and of the result.
+        reader: the source.
+        word: what the result is, such as `trimmed`, in its id.
+        operation: with parameters, as on the command line.
+        options: that all edits have.
+        changes: attributes that tell the result from that of another edit of this operation.
     """
 
     store: EpisodeStore
@@ -309,9 +316,15 @@ def relabel_item(
 ) -> EditedItem:
     """Write an item with other attributes, and the same arrays, as a new one, which supersedes it.
 
-    The files of the arrays are shared with the source where the file system can. `changes` are new
-    values of some of `task`, `instruction` and `operator`; with another task an item that was
-    judged must be given an `outcome`.
+    The files of the arrays are shared with the source where the file system can.
+
+    Args:
+        store: where the item is.
+        item_id: of the source.
+        changes: new values of some of `task`, `instruction` and `operator`.
+        kind: of the item.
+        outcome: new outcome; another task must be given one, if the item was judged.
+        options: of all edits.
 
     Raises:
         InvalidInputError: nothing changes, a value is invalid, or the outcome is lacking.

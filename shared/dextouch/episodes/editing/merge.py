@@ -43,8 +43,10 @@ OnItem = Callable[["MergeReport"], None]
 class MergeOptions:
     """Options of a merge.
 
-    With `rename` an item whose id other content has gets a new one, `ID-merged-1`; otherwise it is
-    refused.
+    Args:
+        rename: give an item whose id other content has a new id, `ID-merged-1`; otherwise it is
+            refused.
+        dry_run: nothing is written.
     """
 
     rename: bool = False
@@ -78,8 +80,11 @@ def merge_stores(
 
     What is damaged, or was permanently deleted from the target, is refused, and the rest is copied.
     Reviews, clicks and notes come along, and go to an equal item in the target that has none. What
-    was edited or put into the trash in the target since an earlier merge is there. Raises
-    InvalidInputError: the target is one of the sources; NotFoundError: a source without any item.
+    was edited or put into the trash in the target since an earlier merge is there.
+
+    Raises:
+        InvalidInputError: the target is one of the sources.
+        NotFoundError: a source without any item.
     """
     reports, origins = [], _Origins(target)
     for source in sources:

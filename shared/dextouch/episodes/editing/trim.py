@@ -71,8 +71,13 @@ def trim_episode(
 ) -> EditedItem:
     """Write the steps first … stop − 1 of an episode as a new one, which supersedes it.
 
-    The outcome stays if none is given, which the end of a judged episode must not lack; `exact`
-    encodes H.264 images anew from the cut on.
+    Args:
+        store: where the episode is.
+        episode_id: of the source.
+        steps: first step, and the one after the last.
+        outcome: of the result; None keeps it, which the end of a judged episode must not lack.
+        exact: encode H.264 images anew from the cut on.
+        options: of all edits.
 
     Raises:
         InvalidInputError: steps outside the episode, or no outcome where one must be given.

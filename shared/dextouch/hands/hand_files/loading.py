@@ -146,10 +146,16 @@ def read_mapping(path: Path) -> HandMapping:
 def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
     """Load a hand from a URDF or MJCF file, without meshes, and a mapping file (docs/hands.md).
 
-    Joints are in the mapping's order with the model's angles, the wrist frame is ours: fingers
-    along -z, thumb side +x. Raises NotFoundError, StorageError: a missing or unreadable file;
-    LimitExceededError: one above the size limit; UnknownNameError: a name that is not in the model;
-    InvalidInputError: other invalid content; the message names file, element, found and expected.
+    Returns:
+        The hand with joints in the mapping's order, the model's joint angles, and our wrist frame:
+        fingers along -z, thumb side +x.
+
+    Raises:
+        NotFoundError, StorageError: a missing or unreadable file.
+        LimitExceededError: a file above the size limit.
+        UnknownNameError: a name that is not in the model; the valid ones are listed.
+        InvalidInputError: any other invalid content; the message names file, element, found and
+            expected value.
     """
     root = read_elements(Path(model_path))
     mapping, where = read_mapping(Path(mapping_path)), Path(mapping_path).name

@@ -156,10 +156,16 @@ def unit_axis(axis: np.ndarray, joint: Element) -> Vector3:
 
 
 class Joint(NamedTuple):
-    """A joint in the frame of its link; `limits_rad` is None without limits.
+    """A joint in the frame of its link.
 
-    `where` begins messages, `zero_rad` is the angle of the file's reference pose, `refusal` says
-    why a finger cannot contain this joint, None if it can.
+    Attributes:
+        name: in the model.
+        where: prefix of error messages.
+        anchor_m: a point of its axis in the link's frame.
+        axis: unit vector in the link's frame.
+        limits_rad: lower and upper limit; None if it is not a limited hinge.
+        zero_rad: joint angle of the file's reference pose.
+        refusal: why a finger cannot contain this joint; None if it can.
     """
 
     name: str
